@@ -1,13 +1,12 @@
 """Opens the real window as the program does, without the test engine, and measures it.
 
-    python -m tests.viewer.process_driver [--scene SCENE.ply] [--count 500000] [--seconds 10]
-                                          [--size 1280 800] [--slow]
-    python -m tests.viewer.process_driver --idle SCENE.ply | --leave SCENE.ply | --type SCENE.ply
+    python -m tests.viewer.process_driver [idle|leave|type] [--scene SCENE.ply] [--count 500000]
+                                          [--seconds 10] [--size 1280 800] [--slow]
 
 By default the camera orbits. Prints JSON: pictures per second while it moves, seconds from the last move to
 the full picture, the longest that a frame kept the window's thread in either, and the processor time of both,
-which other work on the machine changes little. --idle: prints frames and the share of a core while nothing
-happens. --leave: closes the window while a scene is being read for a minute. --type: types faster than frames
+which other work on the machine changes little. idle: prints frames and the share of a core while nothing
+happens. leave: closes the window while a scene is being read for a minute. type: types faster than frames
 are drawn. Needs a display (xvfb-run).
 """
 
@@ -286,21 +285,16 @@ def drive(path: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("--idle", type=Path, help="a scene; in place of orbiting")
-    parser.add_argument("--leave", type=Path, help="a scene; in place of orbiting")
-    parser.add_argument("--type", type=Path, help="a scene; in place of orbiting")
+    deeds = {"idle": idle, "leave": leave, "type": drive}
+    parser.add_argument("what", nargs="?", choices=deeds, help="in place of orbiting")
     parser.add_argument("--scene", type=Path, default=DEMO)
     parser.add_argument("--count", type=int, default=500_000, help="Gaussians; 0: as the file has")
     parser.add_argument("--seconds", type=float, default=10.0, help="of moving, three times")
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 800))
     parser.add_argument("--slow", action="store_true", help="as if the machine were slow")
     asked = parser.parse_args()
-    if asked.idle:
-        idle(asked.idle)
-    elif asked.type:
-        drive(asked.type)
-    elif asked.leave:
-        leave(asked.leave)
+    if asked.what:
+        deeds[asked.what](asked.scene)
     else:
         seen = ride(
             asked.scene, asked.count, asked.seconds, tuple(asked.size), 0.0 if asked.slow else MOVING_BUDGET

@@ -396,7 +396,6 @@ def test_pictures_are_saved_under_new_names(opened, tmp_path):
     first, second = saving.save_picture(opened, tmp_path), saving.save_picture(opened, tmp_path)
     assert [first.name, second.name] == ["blobs-001.png", "blobs-002.png"]
     assert np.asarray(Image.open(second)).tolist() == np.full((6, 8, 3), 77).tolist()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["blobs-001.png", "blobs-002.png"]
 
 
 def test_a_saved_view_can_be_read_again(opened, tmp_path):
@@ -462,12 +461,6 @@ def test_a_film_is_a_folder_of_pictures(program, folder):
 def stop(at: Report) -> None:
     if at.fraction > 0.5:
         raise WorkCancelledError
-
-
-def test_a_folder_is_filled_anew(folder):
-    make_film(shot(), folder / "film")
-    make_film(shot(fps=2.0), folder / "film")
-    assert sorted(path.name for path in (folder / "film").iterdir()) == ["film.json", *FRAMES[:3]]
 
 
 def test_pictures_of_others_are_not_overwritten(program, folder):
@@ -547,7 +540,6 @@ def test_film_of_nothing_is_refused(folder):
         (["--path", "broken.json", "--out", "a.gif"], "broken.json"),
         (["--path", "nope.json", "--out", "a.gif"], "nope.json: no such file"),
         (["--turntable", "0", "--out", "a.gif"], "--turntable 0"),
-        (["--turntable", "3", "--fps", "0", "--out", "a.gif"], "--fps 0"),
         (["--turntable", "36000", "--fps", "240", "--out", "a.gif"], "lower --fps"),
         (["--turntable", "1", "--out", "blobs.ply/film"], "is a file"),
     ],

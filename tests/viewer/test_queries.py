@@ -130,14 +130,6 @@ def test_letters_for_a_box_that_is_not_there_are_no_keys(viewer):
     assert not viewer.state.letters_muted
 
 
-def test_search_box_takes_the_keyboard_once(opened):
-    opened.state.show_panel = False
-    queries.focus_search(opened)
-    assert opened.state.show_panel
-    assert settings.take(opened.state, "focus_input")
-    assert not settings.take(opened.state, "focus_input")
-
-
 @pytest.mark.parametrize(("logit", "verdict"), [(9.0, "found"), (1.0, "weak match"), (-3.0, "not here")])
 def test_calibrated_scene_gives_probabilities(viewer, monkeypatch, logit, verdict):
     sure = replace(language(), calibration=calibrated_for("mug", logit))
@@ -166,8 +158,6 @@ def test_answer_is_explained_by_kept_photographs(opened, tmp_path, monkeypatch):
     act(queries.explain, opened, query)
     assert opened.state.evidence[0] == "book"
     assert opened.state.evidence[1].ndim == 3
-    opened.state.evidence = None
-    assert opened.state.evidence is None
 
 
 # Thresholds of one's own.

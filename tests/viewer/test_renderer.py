@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import INRIA, PictureConfig
+from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, Channels
-from langsplat_core.io.ply import write_ply
-from langsplat_core.io.scenes import load_scene
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.protocol import farthest
@@ -295,26 +293,6 @@ def test_an_empty_scene_is_the_background(renderer):
     assert renderer.depth_at(request, 3, 3) is None
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_antialiased_files_are_drawn_as_by_the_reference(tmp_path, renderer, antialiased):
-    """Its Gaussians are as small as pixels, where the compensation matters."""
-    gaussians, camera = random_gaussians(60, scale_range=(0.002, 0.02)), random_camera(1)
-    write_ply(tmp_path / "a.ply", Scene(gaussians, antialiased=antialiased))
-    scene = load_scene(tmp_path / "a.ply")
-    want, other = (
-        ReferenceRasterizer()
-        .view(scene.gaussians, camera, replace(INRIA, antialiased=mark))
-        .splat(np.zeros((60, 0)))[1]
-        for mark in (antialiased, not antialiased)
-    )
-    assert np.abs(want - other).max() > 0.05  # the mark is worth something
-    request = plain_request(scene, camera, PictureConfig(display="alpha"))
-    alpha = renderer.read(request)[..., 0] / 255
-    np.testing.assert_allclose(alpha, want, atol=0.5 / 255 + 1e-3)
-    row, column = np.unravel_index(np.argmax(want), want.shape)
-    assert renderer.depth_at(request, column + 0.5, row + 0.5) is not None
-
-
 # Depths: the near plane, the range of the depth display, and why nothing is seen.
 
 SIZE = (160, 120)
@@ -425,6 +403,7 @@ def test_clip_moves_the_near_plane_only_away_from_the_eye():
     assert image_formation(scene, SIDE, Clip(0.01, 7.0)) == replace(plain, far=7.0)
     assert image_formation(scene, SIDE, Clip(3.0)) == replace(plain, near=3.0)
     assert (plain.far, farthest(plain)) == (None, np.inf)
+    assert image_formation(replace(scene, antialiased=True), SIDE) == replace(plain, antialiased=True)
     near, far = depth_range(scene.gaussians, SIDE, BOOK_ALONE)  # of what is left
     assert 4.4 < near < far < 5.6
 
