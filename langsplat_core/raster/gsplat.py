@@ -148,9 +148,10 @@ class GsplatView(LiftingView):
         if len(self._rows) == 0:
             shape = (self.camera.height, self.camera.width)
             return np.zeros((*shape, channels), np.float32), np.zeros(shape, np.float32)
+        drawn = values[self._rows] if channels else np.zeros((len(self._rows), 1))  # gsplat needs one
         with torch.no_grad():
-            image, alpha = self._draw(to_device(values[self._rows]))
-        return image.cpu().numpy(), alpha.cpu().numpy()
+            image, alpha = self._draw(to_device(drawn))
+        return image[..., :channels].cpu().numpy(), alpha.cpu().numpy()
 
     def gather(self, image: Array) -> Array:
         """Return W^T image as the derivative of <splat(values), image> by values; (N, C) float32."""
