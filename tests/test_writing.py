@@ -178,7 +178,7 @@ WRITERS: dict[str, Write] = {
     "Gaussians": lambda folder: write_ply(folder / "s.ply", GAUSSIANS),
     "sidecar": lambda folder: write_language(folder / "s.safetensors", FIELD, GAUSSIANS.means),
     "cameras": lambda folder: write_cameras(folder / "cameras.json", SCENE.cameras),
-    "points": lambda folder: write_points(folder / "points.ply", GAUSSIANS),
+    "points": lambda folder: write_points(folder / "points.ply", SCENE),
     "feature store": features,
     "checkpoint": checkpoint,
     "stage": stage,

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import EncoderOption, Level, TrainedScene
-from langsplat_core.cli.query import Unit, basis_fields, camera_of, unit_of
+from langsplat_core.cli.query import Unit, basis_fields, camera_of, in_world, unit_of
 from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.config import CountOrZero, PictureConfig
 from langsplat_core.errors import EncoderError, InputError
@@ -74,13 +74,14 @@ class Describe:
                 if self.outline
                 else [_plain(entry, sure) for entry in scene_inventory(describer, progress)]
             )
+        found = in_world(found, scene.origin)
         asked, left_out = len(describer.words[0].phrases), describer.left_out
         if self.json:
             counts = {"asked": asked, "left_out": len(left_out)}
             print_json(counts | {"outline" if self.outline else "inventory": found} | basis_fields(engine))
             return
         if self.outline:
-            print(*outline_lines(found, unit_of(scene.metres_per_unit)), sep="\n")
+            print(*outline_lines(found, unit_of(scene.metres_per_unit, scene.origin)), sep="\n")
         else:
             _print_inventory(found)
         print(f"answers: {engine.basis.long}")
@@ -245,7 +246,8 @@ class Teach:
             files.write_words(self.into, files.Words(field.encoder_id, field.canonical, tuple(taught)))
         else:
             path = companion_path(self.scene, files.SUFFIX)
-            files.write_language(path, replace(field, taught=tuple(taught)), scene.gaussians.means)
+            learned = replace(field, taught=tuple(taught))
+            files.write_language(path, learned, scene.gaussians.means, scene.origin)
 
 
 def _pointed(engine: QueryEngine, camera: int, at: str, level: Level) -> Array:

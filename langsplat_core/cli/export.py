@@ -36,10 +36,10 @@ from langsplat_core.scene.transform import (
     IDENTITY,
     Similarity,
     moving,
+    place_scene,
     rotating,
     scaling,
     similarity,
-    transform_scene,
     turning,
 )
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -146,7 +146,7 @@ class Convert:
         if self.rematch is None:
             return load_scene(self.source)
         scene = load_without_language(self.source)
-        return replace(scene, language=rematch_language(self.rematch, scene.gaussians.means))
+        return replace(scene, language=rematch_language(self.rematch, scene.in_world(scene.gaussians.means)))
 
     def _importer(self) -> Importer | None:
         """Return what reads the sources where they are no scene of a known format."""
@@ -207,7 +207,7 @@ class Transform:
         check_keeps(self.out, self.scene)
         scene = load_scene(self.scene)
         to = self._similarity(scene)
-        save_scene(self.out, replace(transform_scene(scene, to), path=self.out))
+        save_scene(self.out, replace(place_scene(scene, to), path=self.out))
         rows = "; ".join(" ".join(f"{number:.9g}" for number in row) for row in to.matrix)
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {len(scene.cameras)} cameras; matrix {rows}")
 
@@ -233,7 +233,7 @@ class Crop:
         check_writable(self.out)
         check_keeps(self.out, self.scene)
         scene, corners = load_scene(self.scene), np.array(self.box).reshape(2, 3)
-        keep = in_box(scene.gaussians.means, corners.min(0), corners.max(0))
+        keep = in_box(scene.gaussians.means, corners.min(0) - scene.origin, corners.max(0) - scene.origin)
         if not keep.any():
             raise InputError(f"the crop holds none of the {len(keep)} Gaussians; {_extent(scene)}")
         save_scene(self.out, replace(scene.take(keep), path=self.out))
@@ -245,7 +245,8 @@ def _extent(scene: Scene) -> str:
     means = scene.gaussians.means[np.isfinite(scene.gaussians.means).all(1)]
     if not len(means):
         return "the scene holds none that lies anywhere"
-    low, high = (" ".join(f"{number:.4g}" for number in corner) for corner in (means.min(0), means.max(0)))
+    ends = scene.in_world(np.stack([means.min(0), means.max(0)]))
+    low, high = (" ".join(f"{number:.9g}" for number in corner) for corner in ends.round(3))
     return f"they lie between {low} and {high}"
 
 

@@ -43,12 +43,13 @@ from langsplat_core.semantics.encoders import load_text_encoder
 # Answers in lines and as JSON, and places in images as users give them; other commands print so too.
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Unit:
-    """The unit that lengths are printed and given in."""
+    """The unit that lengths are printed and given in, and what places are relative to."""
 
     name: str  # "m" or "units"
     length: float  # world units -> this
+    origin: Array  # (3,) world units, of the scene
 
     @property
     def metres(self) -> float | None:
@@ -59,10 +60,29 @@ class Unit:
         """Lengths in world units as numbers of this unit, joined by `between`."""
         return between.join(f"{self.length * value:.3f}" for value in values)
 
+    def place(self, place: Array) -> str:
+        """Return a place in the scene as numbers of this unit, in the world."""
+        return self.format(self.origin + place)
 
-def unit_of(metres_per_unit: float | None) -> Unit:
+
+def unit_of(metres_per_unit: float | None, origin: Array) -> Unit:
     """Return the unit of lengths in a scene: metres where a scale is known, else world units."""
-    return Unit("units", 1.0) if metres_per_unit is None else Unit("m", metres_per_unit)
+    return Unit("units", 1.0, origin) if metres_per_unit is None else Unit("m", metres_per_unit, origin)
+
+
+PLACES = ("place", "centre", "box")  # keys of positions
+
+
+def in_world(content: Any, origin: Array) -> Any:
+    """Return what is ready for JSON, with its places in the world in place of relative to `origin` (3,)."""
+    if isinstance(content, list | tuple):
+        return [in_world(item, origin) for item in content]
+    if not isinstance(content, dict) or not origin.any():
+        return content
+    return {
+        key: origin + value if key in PLACES and value is not None else in_world(value, origin)
+        for key, value in content.items()
+    }
 
 
 def instance_lines(instances: Sequence[Instance], unit: Unit) -> list[str]:
@@ -76,7 +96,7 @@ def instance_lines(instances: Sequence[Instance], unit: Unit) -> list[str]:
             f"{instance.score:.3f}",
             f"{100 * instance.share:.0f} %",
             f"{instance.count}",
-            unit.format(instance.centre),
+            unit.place(instance.centre),
             unit.format(instance.size, " x "),
         )
         for number, instance in enumerate(instances, 1)
@@ -178,7 +198,7 @@ class QueryScene:
         explain = _Explainer(self, scene) if self.why is not None else None
         camera = camera_of(scene, self.camera) if scene.cameras else None
         engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
-        unit = unit_of(self.scale or scene.metres_per_unit)
+        unit = unit_of(self.scale or scene.metres_per_unit, scene.origin)
         found = [self._ask(engine, text, camera) for text in self._askable(engine, camera)]
         answers, tables = [], []
         for result, tree, of in found:
@@ -195,7 +215,7 @@ class QueryScene:
         if explain is not None:
             explain.write()
         if self.json:
-            print_json(answers)
+            print_json(in_world(answers, scene.origin))
             return
         for answer, table in zip(answers, tables, strict=True):
             print(*_lines(answer, unit), *table, sep="\n")
@@ -359,7 +379,7 @@ def _lines(answer: dict[str, Any], unit: Unit) -> list[str]:
         verdict += f" ({100 * answer['probability']:.0f} %)"
     if most > 1 or (most and not answer["found"]):
         verdict += f", {best} of them" + ("" if least == most else f" ({least} to {most})")
-    place = "-" if answer["place"] is None else f"{unit.format(answer['place'])} {unit.name}"
+    place = "-" if answer["place"] is None else f"{unit.place(answer['place'])} {unit.name}"
     said = (
         f"{answer['phrase']}: {verdict}, score {answer['score']:.3f} at level {answer['level']}, "
         f"place {place}, pixel {answer['pixel']}"
@@ -394,7 +414,7 @@ class Select:
         """Select, write the file, and print what is in it."""
         self._check()
         scene = searchable(self.scene)
-        unit = unit_of(self.scale or scene.metres_per_unit)
+        unit = unit_of(self.scale or scene.metres_per_unit, scene.origin)
         engine = _engine(scene, load_text_encoder, self.encoder, self.taught)
         answers = [found_answer(engine, text, self.level) for text in self.texts]
         answer = answers[0] if len(answers) == 1 else joined(answers, all_needed=True)
@@ -431,7 +451,7 @@ class Select:
                 "written": written,
                 "out": str(self.out),
             }
-            print_json(content)
+            print_json(in_world(content, unit.origin))
             return
         print("\n".join(instance_lines(found, unit)))
         of = f"all but the {selected} selected" if self.remove else f"of {selected} selected Gaussians"

@@ -57,12 +57,14 @@ class Inspect:
 def _lines(a: SceneSummary) -> list[tuple[str, str]]:
     """Rows of the report: a name, and a value for people."""
     reasons = "".join(f"; {count} {reason}" for reason, count in a.invalid.items())
-    low, high = (" ".join(f"{value:.3g}" for value in corner) for corner in a.bounds)
+    digits = 10 if any(a.origin) else 3
+    low, high = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in a.bounds)
     lines = [
         ("in memory", f"{a.memory_bytes / 1e6:.2f} MB"),
         ("Gaussians", f"{a.gaussians:,}"),
         ("invalid rows", f"{a.invalid_rows}{reasons}"),
         ("bounds (1-99 %)", f"{low}  to  {high}"),
+        ("origin", " ".join(f"{value:.10g}" for value in a.origin)),
         ("SH degree", f"{a.sh_degree}"),
         ("antialiased", "yes (Mip-Splatting)" if a.antialiased else "no"),
         ("scale", f"{a.metres_per_unit:g} m per unit" if a.metres_per_unit else "unknown: `langsplat scale`"),

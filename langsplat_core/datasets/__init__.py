@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.config import DatasetConfig, check_settings
-from langsplat_core.datasets.capture import Capture, metres_of, split_views
+from langsplat_core.datasets.capture import Capture, centred, metres_of, split_views
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import photo_folder
@@ -30,9 +30,10 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     Recognises, in this order, a nerfstudio ``transforms.json``, a COLMAP model, and plain photographs,
     whose cameras are then found by structure from motion. A dataset with cameras but without points gets
     ones that are triangulated from its training views. Whatever had to be computed is kept in ``work/sfm-*``
-    and not computed again for the same photographs. The world is the dataset's own; `config`, the dataset, or
-    the places (GPS) of the photographs tell how long its unit is. What had to be left out is reported once,
-    by a warning of the logger "langsplat". Raises InputError where nothing usable remains.
+    and not computed again for the same photographs. The world is the dataset's own, about `Capture.origin`
+    where it is far from zero; `config`, the dataset, or the places (GPS) of the photographs tell how long its
+    unit is. What had to be left out is reported once, by a warning of the logger "langsplat". Raises
+    InputError where nothing usable remains.
     """
     capture = load_photographs(path, config, work, progress)
     metres = config.metres_per_unit or capture.metres_per_unit or metres_of(capture)
@@ -51,10 +52,10 @@ def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Pr
     try:
         frames = path if path.is_file() and path.suffix.lower() == ".json" else path / "transforms.json"
         if frames.is_file():
-            return load_nerfstudio(frames, config.max_side, progress)
+            return centred(load_nerfstudio(frames, config.max_side, progress))
         model = find_model(path)
         if model is not None:
-            return load_colmap(path, model, config.max_side, progress)
+            return centred(load_colmap(path, model, config.max_side, progress))
         if is_video(path):
             path = kept_frames(path, config.frames, work, progress)
         photos = photo_folder(path)

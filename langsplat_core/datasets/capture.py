@@ -9,7 +9,7 @@ import logging
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from PIL import Image
@@ -21,7 +21,7 @@ from langsplat_core.datasets.photos import WORKERS, Photo, View, developer, plac
 from langsplat_core.datasets.workspace import Matches
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import PictureError
-from langsplat_core.scene import Camera
+from langsplat_core.scene import NO_ORIGIN, Camera, moved_pose, origin_of
 
 DECIMALS = 9  # of world units: what a digest tells apart, far above rounding and far below a pixel
 
@@ -41,6 +41,7 @@ class Capture:
     drawn: bool = False  # by `assets.making`, where encoders are calibrated
     masks: tuple[Array | None, ...] = ()  # (H, W) bool each, pixels that count; None: all; (): no masks
     matches: Matches | None = None  # of all photographs, where cameras came from structure from motion
+    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) what cameras and points are relative to
 
     def __post_init__(self) -> None:
         lists = {"photographs": self.images, "files": self.photos, "masks": self.masks}
@@ -127,6 +128,24 @@ class Capture:
         """Return INRIA's scene scale: 1.1 times the largest distance of a camera from their mean, > 0."""
         centres = np.array([camera.position for camera in self.cameras])
         return max(1.1 * float(np.linalg.norm(centres - centres.mean(0), axis=1).max()), 1e-6)
+
+
+def centred(capture: Capture) -> Capture:
+    """Return the capture about the origin that its cameras and points need."""
+    eyes = np.array([camera.position for camera in capture.cameras])
+    origin = origin_of(np.concatenate([eyes, capture.points]))
+    if not origin.any():
+        return capture
+    return replace(
+        capture,
+        cameras=tuple(camera.moved(-origin) for camera in capture.cameras),
+        points=capture.points - origin,
+        photos=tuple(
+            replace(photo, world_to_camera=moved_pose(photo.world_to_camera, -origin))
+            for photo in capture.photos
+        ),
+        origin=origin,
+    )
 
 
 def shrunk_view(camera: Camera, image: Array, mask: Array | None, size: tuple[int, int]) -> View:

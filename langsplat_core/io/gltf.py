@@ -14,6 +14,7 @@ import base64
 import json
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import unquote
@@ -27,9 +28,9 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import FREE, SMALL_RATIO, Allowance, decode_json, is_plain_name, read_file
 from langsplat_core.io.quantised import mirrored, to_bytes
 from langsplat_core.io.spz import decode_spz
-from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+from langsplat_core.scene import SH_COUNTS, Gaussians, Scene, about_origin
 from langsplat_core.scene.gaussians import join_gaussians
-from langsplat_core.scene.transform import C0, similarity, transform_gaussians
+from langsplat_core.scene.transform import C0, moving, similarity, transform_gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 PACKED = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
@@ -127,16 +128,25 @@ def read_gltf_scene(path: Path | str) -> Scene:
     path = Path(path)
     file = _File(path)
     try:
-        parts = list(_parts(file))
+        # Positions about the first node's: in the world float32 may be too coarse.
+        middle = next((matrix[:3, 3] for matrix, _ in _placed(file)), np.zeros(3))
+        parts = list(_parts(file, middle))
     except LookupError as error:
         raise malformed(path, f"names what it lacks ({str(error)[:80]})", "export it again") from None
     if not parts and EXTENSION not in file.content.extensions_used:
         raise malformed(path, f"holds no Gaussians ({EXTENSION}); meshes are not read")
-    return Scene(mirrored(join_gaussians(parts), SIGNS))
+    gaussians = mirrored(join_gaussians(parts), SIGNS)
+    if not middle.any():
+        return Scene(gaussians)
+    means, origin = about_origin(gaussians.means + SIGNS * middle)
+    return Scene(replace(gaussians, means=means), origin=origin)
 
 
-def _parts(file: "_File") -> Iterator[Gaussians]:
-    """Yield the Gaussians of every primitive that has some, placed by their nodes, along glTF's axes."""
+def _parts(file: "_File", middle: Array) -> Iterator[Gaussians]:
+    """Yield the Gaussians of every primitive that has some, placed by their nodes, along glTF's axes.
+
+    middle: (3,), what they become relative to.
+    """
     for matrix, primitive in _placed(file):
         splatting = primitive.extensions[EXTENSION]
         if primitive.mode != POINTS:
@@ -153,7 +163,7 @@ def _parts(file: "_File") -> Iterator[Gaussians]:
         else:
             gaussians = _gaussians(file, primitive.attributes)
         try:
-            place = similarity(matrix)
+            place = similarity(matrix).then(moving(-middle))
             yield gaussians if place.is_identity else transform_gaussians(gaussians, place)
         except InputError as error:
             raise malformed(file.path, str(error)) from None
@@ -282,20 +292,25 @@ class _File:
         return self._buffers[index]
 
 
-def write_gltf(path: Path | str, gaussians: Gaussians) -> None:
+def write_gltf(path: Path | str, content: Scene | Gaussians) -> None:
     """Write a .glb, or a .gltf with its buffer inside, atomically; rows keep their order.
+
+    The origin of a scene is the translation of its node.
 
     Positions and colours are exact, scales, quaternions (normalised) and opacities to float32. COLOR_0 shows
     points of the base colour in programs that do not know the extension. A row that cannot be drawn is
     written with opacity 0. Raises InputError for more than a .glb can hold, 4 GiB.
     """
-    file = GltfWriter(EXTENSION)
+    scene = Scene(content) if isinstance(content, Gaussians) else content
+    file, gaussians = GltfWriter(EXTENSION), scene.gaussians
     if len(gaussians):
         says = {"kernel": "ellipse", "colorSpace": SRGB}
         says |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
         columns = _columns(gaussians).items()
         attributes = {name: file.add(values, name == "POSITION") for name, values in columns}
-        file.add_mesh({"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: says}})
+        primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: says}}
+        moved = {"translation": (SIGNS * scene.origin).tolist()} if scene.origin.any() else {}
+        file.add_mesh(primitive, **moved)
     file.write(Path(path))
 
 

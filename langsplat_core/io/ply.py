@@ -7,7 +7,8 @@ INRIA's layout is read in all its variants and written in its plain form: one el
 Gaussian, binary little endian, float32, in order ``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2
 rot_0..3``. Opacities are logits, scales natural logarithms, rotations quaternions w x y z. There are 0, 9, 24
 or 45 `f_rest` (SH degree 0 to 3), channel after channel: all coefficients of red, then of green, then of
-blue. Normals are zeros that nobody reads.
+blue. Normals are zeros that nobody reads. Of a scene with an origin ``x y z`` are double, positions in the
+world.
 
 As read: the properties in any order and of any scalar type, any byte order, ascii, LF or CR LF in the
 header, without normals, with further elements (ignored) and properties (kept as `Scene.extras`). Rows are
@@ -27,7 +28,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from threading import Lock
@@ -41,7 +42,7 @@ from langsplat_core.errors import InputError, malformed, printable_line, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
 from langsplat_core.io.quantised import smallest_three
-from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+from langsplat_core.scene import SH_COUNTS, Gaussians, Scene, about_origin
 from langsplat_core.scene.transform import C0
 
 # ---- tables ----
@@ -129,6 +130,11 @@ class PlyFile:
             case _:
                 return False
         return True
+
+    @property
+    def is_binary(self) -> bool:
+        """True if numbers are stored as their types say, and not as text."""
+        return bool(self._order)
 
     @property
     def vertex(self) -> PlyElement:
@@ -321,8 +327,11 @@ METRES = "metres_per_unit"
 
 
 def read_ply(path: Path | str) -> Gaussians:
-    """Return the Gaussians of a 3DGS PLY file, plain or compressed. Raises as `read_ply_scene` does."""
-    return read_ply_scene(path).gaussians
+    """Return the Gaussians of a 3DGS PLY file, plain or compressed, where they lie in the world.
+
+    Raises as `read_ply_scene` does.
+    """
+    return read_ply_scene(path).world_gaussians()
 
 
 def read_ply_scene(path: Path | str) -> Scene:
@@ -335,14 +344,15 @@ def read_ply_scene(path: Path | str) -> Scene:
     with open_ply(Path(path)) as ply:
         extras: dict[str, Array] = {}
         if "chunk" in ply.elements and not ply.vertex.numbers.keys().isdisjoint(PACKED):
-            gaussians = _read_compressed(ply, ply.vertex)
+            gaussians, origin = _read_compressed(ply, ply.vertex)
         else:
-            gaussians, extras = _read_plain(ply, ply.vertex)
+            gaussians, origin, extras = _read_plain(ply, ply.vertex)
     antialiased, metres = _said(ply.comments)
-    return Scene(gaussians, antialiased=antialiased, extras=extras, metres_per_unit=metres)
+    about = Scene(gaussians, antialiased=antialiased, extras=extras, metres_per_unit=metres)
+    return replace(about, origin=origin)
 
 
-def _read_plain(ply: PlyFile, vertex: PlyElement) -> tuple[Gaussians, dict[str, Array]]:
+def _read_plain(ply: PlyFile, vertex: PlyElement) -> tuple[Gaussians, Array, dict[str, Array]]:
     needed = (*BASE_COLOUR, "opacity", *SCALE, *ROTATION)
     if vertex.numbers.keys().isdisjoint(needed):
         what = "a mesh or point cloud, not a 3D Gaussian scene: it has no f_dc, opacity, scale and rot"
@@ -352,17 +362,20 @@ def _read_plain(ply: PlyFile, vertex: PlyElement) -> tuple[Gaussians, dict[str, 
         raise malformed(ply.path, f"{count} properties f_rest_*; expected 0, 9, 24 or 45 (SH degree 0-3)")
     higher = count // 3  # coefficients of a channel beside the constant one
     by_coefficient = [f"f_rest_{k + channel * higher}" for k in range(higher) for channel in range(3)]
-    layout = (POSITION, SCALE, ROTATION, ("opacity",), (*BASE_COLOUR, *by_coefficient))
-    others = [name for name in vertex.numbers if name not in {*NORMAL}.union(*layout)]
+    layout = (SCALE, ROTATION, ("opacity",), (*BASE_COLOUR, *by_coefficient))
+    others = [name for name in vertex.numbers if name not in {*POSITION, *NORMAL}.union(*layout)]
+    single = ply.is_binary and all(vertex.numbers.get(axis) == "f4" for axis in POSITION)
     tables = ply.read(
         vertex,
+        (POSITION, "f4" if single else "f8"),
         *((names, "f4") for names in layout),
         *(((name,), vertex.numbers[name]) for name in others),
     )
     means, log_scales, quats_wxyz, opacities, sh, *kept = tables
+    means, origin = about_origin(means)
     sh = sh.reshape(vertex.count, 1 + higher, 3)
     extras = {name: table[:, 0] for name, table in zip(others, kept, strict=True)}
-    return Gaussians(means, log_scales, quats_wxyz, opacities[:, 0], sh), extras
+    return Gaussians(means, log_scales, quats_wxyz, opacities[:, 0], sh), origin, extras
 
 
 def write_ply(path: Path | str, content: Scene | Gaussians) -> None:
@@ -376,8 +389,8 @@ def write_ply(path: Path | str, content: Scene | Gaussians) -> None:
     comments = ["SplatRenderMode: mip"] if scene.antialiased else []  # the commonest spelling of four
     if scene.metres_per_unit is not None:
         comments.append(f"{METRES} {float(scene.metres_per_unit)!r}")
-    sh = gaussians.sh
-    columns = dict(zip(POSITION, gaussians.means.T, strict=True))
+    sh, means = gaussians.sh, gaussians.means if not scene.origin.any() else scene.in_world(gaussians.means)
+    columns = dict(zip(POSITION, means.T, strict=True))
     columns |= dict.fromkeys(NORMAL, np.zeros(len(gaussians), np.float32))
     columns |= dict(zip(BASE_COLOUR, sh[:, 0].T, strict=True))
     rest = [sh[:, k, channel] for channel in range(3) for k in range(1, sh.shape[1])]
@@ -464,7 +477,7 @@ _SH_VALUES = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
 _SH_VALUES[[0, 255]] = -4, 4
 
 
-def _read_compressed(ply: PlyFile, vertex: PlyElement) -> Gaussians:
+def _read_compressed(ply: PlyFile, vertex: PlyElement) -> tuple[Gaussians, Array]:
     chunk = ply.elements["chunk"]
     if chunk.count * CHUNK_SIZE < vertex.count:
         what = f"{chunk.count} chunks for {vertex.count} Gaussians; expected one for every {CHUNK_SIZE}"
@@ -491,13 +504,15 @@ def _read_compressed(ply: PlyFile, vertex: PlyElement) -> Gaussians:
     with np.errstate(invalid="ignore", over="ignore"):  # infinite bounds make rows that are dropped later
         rgb = between(bounds[2], rgba[:, :3]) if coloured else rgba[:, :3]
         base = ((rgb - 0.5) / C0)[:, None]
-        return Gaussians(
-            means=between(bounds[0], _fractions(position, 11, 10, 11)),
+        means, origin = about_origin(between(bounds[0], _fractions(position, 11, 10, 11)))
+        gaussians = Gaussians(
+            means=means,
             log_scales=between(bounds[1], _fractions(scale, 11, 10, 11)),
             quats_wxyz=smallest_three((three - 0.5) * np.sqrt(2), rotation >> 30),
             opacity_logits=logit(rgba[:, 3]),
             sh=np.concatenate([base, rest.transpose(0, 2, 1)], axis=1),
         )
+    return gaussians, origin
 
 
 def _codes(ply: PlyFile, element: PlyElement, names: Sequence[str], kind: str) -> Array:

@@ -16,26 +16,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
 
 from langsplat_core import registry
 from langsplat_core.config import CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import sidecar as language_files
-from langsplat_core.io.files import atomic_path, check_output_file, locked, shown
+from langsplat_core.io.files import atomic_path, check_output_file, locked, shown, write_json
 from langsplat_core.io.gltf import read_gltf_scene, write_gltf
-from langsplat_core.io.hostile import exists
+from langsplat_core.io.hostile import decode_json, exists, read_file
 from langsplat_core.io.ply import read_ply_scene, write_ply
 from langsplat_core.io.quantised import read_splat, write_splat
 from langsplat_core.io.sog import META_NAME, read_sog_scene, write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.progress import Progress
-from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene import Gaussians, Scene, about_origin
 
 log = logging.getLogger("langsplat")
 
 # Parts of a scene that a format may be unable to hold; without "precision" numbers are rounded
-LOSSES = ("precision", "view dependence", "antialiasing", "metres per unit", "extra properties")
+LOSSES = ("precision", "view dependence", "antialiasing", "metres per unit", "extra properties", "origin")
+ORIGIN_SUFFIX = ".origin.json"  # of the companion with the origin of a scene whose format has no room for it
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ def _gltf(suffix: str, mime: str) -> SceneFormat:
     return SceneFormat(
         suffix,
         read_gltf_scene,
-        lambda path, scene: write_gltf(path, scene.gaussians),
+        write_gltf,
         loses=("precision", "antialiasing", "metres per unit", "extra properties"),
         own_companions=True,
         mime=mime,
@@ -68,7 +70,7 @@ CORE_FORMATS = (
         ".spz",
         read_spz_scene,
         lambda path, scene: write_spz(path, scene.gaussians, scene.antialiased),
-        loses=("precision", "metres per unit", "extra properties"),
+        loses=("precision", "metres per unit", "extra properties", "origin"),
         own_companions=True,
     ),
     SceneFormat(
@@ -82,7 +84,7 @@ CORE_FORMATS = (
         ".sog",
         read_sog_scene,
         lambda path, scene: write_sog(path, scene.gaussians, scene.antialiased),
-        loses=("precision", "metres per unit", "extra properties"),
+        loses=("precision", "metres per unit", "extra properties", "origin"),
         own_companions=True,
         folder_file=META_NAME,
     ),
@@ -115,13 +117,17 @@ def format_of(path: Path) -> SceneFormat | None:
 # ---- reading ----
 
 
-def load_gaussians(path: Path | str) -> Gaussians:
-    """Return the Gaussians of a scene in any supported format, without its companions.
+class _Origin(Struct):
+    origin: tuple[camera_files.Coordinate, camera_files.Coordinate, camera_files.Coordinate]
 
-    Raises InputError for what cannot be opened or is of no supported kind, FormatError for what breaks
-    the rules of its format.
+
+def load_gaussians(path: Path | str) -> Gaussians:
+    """Return the Gaussians of a scene in any supported format where they lie in the world.
+
+    Far from zero float32 is coarse; `load_scene` keeps an origin instead. Raises InputError for what cannot
+    be opened or is of no supported kind, FormatError for what breaks the rules of its format.
     """
-    return _read(Path(path)).gaussians
+    return _read(Path(path)).world_gaussians()
 
 
 def load_scene(path: Path | str) -> Scene:
@@ -137,7 +143,9 @@ def load_scene(path: Path | str) -> Scene:
     if not exists(sidecar):
         return scene
     try:
-        return replace(scene, language=language_files.read_language(sidecar, scene.gaussians.means))
+        return replace(
+            scene, language=language_files.read_language(sidecar, scene.gaussians.means, scene.origin)
+        )
     except InputError as error:
         return replace(scene, unread=(*scene.unread, str(error)))
 
@@ -149,10 +157,11 @@ def load_without_language(path: Path | str) -> Scene:
     if not exists(cameras):
         return scene
     try:
-        return replace(scene, cameras=camera_files.read_cameras(cameras))
+        read = camera_files.read_cameras(cameras)
+        return replace(scene, cameras=tuple(camera.moved(-scene.origin) for camera in read))
     except InputError as error:
         log.warning("opened without its cameras: %s", error)
-        return replace(scene, unread=(str(error),))
+        return replace(scene, unread=(*scene.unread, str(error)))
 
 
 def _read(path: Path) -> Scene:
@@ -167,9 +176,39 @@ def _read(path: Path) -> Scene:
     if row is None:
         kinds = ", ".join(row.suffix for row in formats())
         raise InputError(f"{path}: not a scene of a known kind; supported: {kinds}, {META_NAME}")
-    scene = row.read(path)
+    scene = _about_origin(path, row.read(path))
     log.debug("%s: %d Gaussians", path, len(scene.gaussians))
     warn_of_undrawable(path, scene.gaussians)
+    return scene
+
+
+def _about_origin(path: Path, scene: Scene) -> Scene:
+    """Return the scene as read, with the origin that its companion names, or that it needs.
+
+    Logs a warning where positions were rounded to float32 far from zero before they were written.
+    """
+    beside = companion_path(path, ORIGIN_SUFFIX)
+    if exists(beside):
+        try:
+            named = decode_json(read_file(beside, 1 << 16), _Origin, beside).origin
+        except InputError as error:
+            return replace(scene, unread=(str(error),))
+        return replace(scene, origin=np.array(named))
+    if not scene.origin.any():
+        means, origin = about_origin(scene.gaussians.means)
+        if not origin.any():
+            return scene
+        scene = replace(scene, gaussians=replace(scene.gaussians, means=means), origin=origin)
+    world = scene.in_world(scene.gaussians.means[:: len(scene.gaussians) // 4096 + 1])
+    with np.errstate(over="ignore"):
+        single = world.astype(np.float32)
+    if ((single == world) | ~np.isfinite(world)).all():
+        step = np.spacing(np.abs(scene.origin).max(), dtype=np.float32)
+        log.warning(
+            "%s: positions were rounded to steps of %g units, as float32 holds them so far from zero; export "
+            "them as double, or about an origin near them",
+            *(path, step),
+        )
     return scene
 
 
@@ -209,7 +248,7 @@ def check_keeps(out: Path, *sources: Path) -> None:
         raise InputError(f"{shown(out)}: would replace the original scene; choose another name")
 
 
-def save_scene(path: Path | str, scene: Scene) -> None:
+def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
     """Write `scene` in the format of its name, with its companions; those it lacks are removed.
 
     Only the PLY keeps everything: see `SceneFormat.loses`. All formats keep the rows' order. All files are
@@ -217,6 +256,7 @@ def save_scene(path: Path | str, scene: Scene) -> None:
     into place, and last the new companions. Interrupted anywhere, there is the old scene or the new one,
     perhaps without companions, but never a scene beside companions of another. A scene with companions that
     could not be read is not written: that would remove them. Raises InputError then, and as `check_writable`.
+    `tell`: log a warning where the origin lies in a companion.
     """
     path = Path(path)
     if scene.unread:
@@ -225,23 +265,31 @@ def save_scene(path: Path | str, scene: Scene) -> None:
         )
     row = check_writable(path)
     assert row.write is not None
-    sidecar, cameras = _companions(path)
+    sidecar, cameras, origin = _companions(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as lock, ExitStack() as renames:  # made in the reverse order of these lines
         if scene.cameras:
-            camera_files.write_cameras(renames.enter_context(atomic_path(cameras)), scene.cameras)
+            in_world = tuple(camera.moved(scene.origin) for camera in scene.cameras)
+            camera_files.write_cameras(renames.enter_context(atomic_path(cameras)), in_world)
+        if beside := "origin" in row.loses and bool(scene.origin.any()):
+            write_json(renames.enter_context(atomic_path(origin)), {"origin": scene.origin.tolist()})
         new_sidecar = None if scene.language is None else renames.enter_context(atomic_path(sidecar))
         new_file = renames.enter_context(atomic_path(path))
         row.write(new_file, scene)
         if scene.language is not None and new_sidecar is not None:
-            # The sidecar belongs to the positions as a reader finds them, rounded in some formats.
-            rounded = "precision" in row.loses
-            means = load_gaussians(new_file).means if rounded else scene.gaussians.means
-            language_files.write_language(new_sidecar, scene.language, means)
+            # The sidecar belongs to the positions as a reader finds them: rounded, or about another origin.
+            again = row.read(new_file) if "precision" in row.loses or scene.origin.any() else scene
+            if beside:
+                again = replace(again, origin=scene.origin)
+            language_files.write_language(new_sidecar, scene.language, again.gaussians.means, again.origin)
         # Locked, else the files of two who write one scene at once could end up side by side.
         lock.enter_context(locked(path.parent))
-        for companion in (sidecar, cameras):
+        for companion in (sidecar, cameras, origin):
             companion.unlink(missing_ok=True)
+    if beside and tell:
+        where = " ".join(f"{value:.10g}" for value in scene.origin)
+        log.warning("%s: %s files have no room for the origin %s, which %s keeps",
+                    shown(path), row.suffix, where, origin.name)  # fmt: skip
 
 
 # ---- the files of a scene ----
@@ -273,12 +321,15 @@ def scene_files(path: Path | str) -> tuple[Path, ...]:
     if os.path.isdir(path) or path.name == META_NAME:  # which a name too long is not
         folder = path if os.path.isdir(path) else path.parent
         own = (folder / META_NAME, *sorted(folder.glob("*.webp")))
-    return (*own, companion_path(path, language_files.SUFFIX), _cameras_path(path))
+    beside = (companion_path(path, ORIGIN_SUFFIX),) if exists(companion_path(path, ORIGIN_SUFFIX)) else ()
+    return (*own, companion_path(path, language_files.SUFFIX), _cameras_path(path), *beside)
 
 
-def _companions(path: Path) -> tuple[Path, Path]:
-    """Sidecar and cameras of a scene."""
-    return companion_path(path, language_files.SUFFIX), companion_path(path, camera_files.SUFFIX)
+def _companions(path: Path) -> tuple[Path, Path, Path]:
+    """Sidecar, cameras and origin of a scene."""
+    suffixes = (language_files.SUFFIX, camera_files.SUFFIX, ORIGIN_SUFFIX)
+    sidecar, cameras, origin = (companion_path(path, suffix) for suffix in suffixes)
+    return sidecar, cameras, origin
 
 
 def _cameras_path(scene: Path) -> Path:

@@ -12,7 +12,7 @@ from langsplat_core.io.gltf import GltfWriter
 from langsplat_core.io.ply import CHANNELS, POSITION, write_table
 from langsplat_core.io.quantised import to_bytes
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_core.scene.transform import AXES, C0, scaling, turning
+from langsplat_core.scene.transform import AXES, C0, moving, scaling, turning
 
 POINT_SUFFIXES = (".ply",)
 MESH_SUFFIXES = (".ply", ".glb")
@@ -42,25 +42,25 @@ def base_colours(gaussians: Gaussians) -> Array:
     return np.clip(np.nan_to_num(colours), 0, 1)
 
 
-def write_points(path: Path | str, gaussians: Gaussians) -> int:
-    """Write the means of the Gaussians that can be drawn as a PLY point cloud, atomically.
+def write_points(path: Path | str, scene: Scene) -> int:
+    """Write the means of the Gaussians that can be drawn, in the world, as a PLY point cloud, atomically.
 
     Red, green and blue are bytes. Return the number of points. InputError for another suffix.
     """
     path = check_suffix(path, POINT_SUFFIXES)
-    valid = gaussians.valid()
-    write_table(path, _coloured(gaussians.means[valid], base_colours(gaussians)[valid]))
+    gaussians, valid = scene.gaussians, scene.gaussians.valid()
+    write_table(path, _coloured(scene, gaussians.means[valid], base_colours(gaussians)[valid]))
     return int(valid.sum())
 
 
-def write_mesh(path: Path | str, mesh: MeshLike, to_gltf: Array) -> None:
-    """Write a mesh as .ply or .glb, atomically. InputError for another suffix.
+def write_mesh(path: Path | str, mesh: MeshLike, scene: Scene) -> None:
+    """Write a mesh of a scene, in the world, as .ply or .glb, atomically. InputError for another suffix.
 
-    to_gltf: (4, 4) from world units to the axes of a .glb; a .ply is not moved.
+    A .glb is y up, in metres where the scale is known.
     """
     path = check_suffix(path, MESH_SUFFIXES)
     if path.suffix.lower() == ".ply":
-        write_table(path, _coloured(mesh.vertices.astype(np.float32), mesh.colour), mesh.triangles)
+        write_table(path, _coloured(scene, mesh.vertices, mesh.colour), mesh.triangles)
         return
     # Colours are light as it was photographed, so the material is unlit, and linear.
     file = GltfWriter("KHR_materials_unlit")
@@ -73,13 +73,14 @@ def write_mesh(path: Path | str, mesh: MeshLike, to_gltf: Array) -> None:
     }
     corners = file.add(mesh.triangles.reshape(-1).astype("<u4"))
     primitive = {"attributes": attributes, "indices": corners, "material": 0}
-    file.add_mesh(primitive, name=mesh.name, matrix=to_gltf.T.reshape(-1).tolist())
+    file.add_mesh(primitive, name=mesh.name, matrix=gltf_axes(scene).T.reshape(-1).tolist())
     file.write(path, materials=[{"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}])
 
 
 def gltf_axes(scene: Scene) -> Array:
-    """Return (4, 4) from world units to the axes of glTF: y up, in metres where the scale is known."""
-    return turning(scene.up(), AXES["y"]).then(scaling(scene.metres_per_unit or 1.0)).matrix
+    """Return (4, 4) from the scene to the axes of glTF: y up, in metres where the scale is known."""
+    upright = turning(scene.up(), AXES["y"]).then(scaling(scene.metres_per_unit or 1.0))
+    return moving(scene.origin).then(upright).matrix
 
 
 def check_suffix(path: Path | str, suffixes: Sequence[str]) -> Path:
@@ -92,7 +93,8 @@ def check_suffix(path: Path | str, suffixes: Sequence[str]) -> Path:
     return path
 
 
-def _coloured(places: Array, colours: Array) -> dict[str, Array]:
-    """Columns of a PLY."""
+def _coloured(scene: Scene, places: Array, colours: Array) -> dict[str, Array]:
+    """Columns of a PLY; places are float64 where the scene lies far away."""
+    places = scene.in_world(places) if scene.origin.any() else places.astype(np.float32)
     columns = dict(zip(POSITION, places.T, strict=True))
     return columns | dict(zip(CHANNELS, to_bytes(255 * colours).T, strict=True))

@@ -34,12 +34,13 @@ executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and 
     codec            "codebook", "autoencoder" or "linear"
     d                latent dimension, decimal
     gaussians        N, decimal
-    means_blake2b    BLAKE2b-128 of the means of the PLY, as float32 little endian, hexadecimal
+    means_blake2b    BLAKE2b-128 of the means of the scene, as float32 little endian, hexadecimal
     phrases          JSON list of the P phrases
     temperature      of the softmax that reads this encoder's cosines, decimal
     found            relevancy from which a phrase counts as present, decimal
     odds             JSON: a list of numbers for each `PlattScaling` of `scene.Calibration`; absent where
                      there is none ("calibration" of older files is of another scale, and is not read)
+    origin           JSON: three numbers, where the positions are relative to, see `Scene`; absent for zero
     taught           JSON: of each taught word a list of its name, its level (0, 1, 2) and the number of its
                      examples; absent where there are none
 
@@ -79,6 +80,7 @@ from langsplat_core.scene import (
     CANONICAL_PHRASES,
     LEVELS,
     NO_NODE,
+    NO_ORIGIN,
     Calibration,
     LanguageField,
     PlattScaling,
@@ -104,6 +106,7 @@ _PARSED: Mapping[str, Any] = {  # metadata that are JSON
     "temperature": float,
     "found": float,
     "odds": tuple[_Odds, _Odds, _Odds],
+    "origin": tuple[float, float, float],
     "taught": list[tuple[str, int, _Count]],
 }
 _KINDS = {  # types of tensors that hold no floating-point numbers
@@ -124,9 +127,9 @@ class Stored:
     """Content of a sidecar."""
 
     field: LanguageField
-    means: Array  # (N, 3) positions of the Gaussians it was made for, world units; NaN for those not finite
+    means: Array  # (N, 3) positions of the Gaussians it was made for, in the world; NaN for those not finite
     precision: float  # of these positions, world units
-    checksum: str  # of the means of the PLY
+    checksum: str  # of the means of the scene
 
 
 def read_stored(path: Path) -> Stored:
@@ -150,7 +153,8 @@ def read_stored(path: Path) -> Stored:
         positions, corners = tensors["positions"], tensors["corners"]
         check_array("positions", positions, (len(field),))
         check_array("corners", corners, (2, 3))
-        return Stored(field, *unpack_positions(positions, corners), about["means_blake2b"])
+        means, precision = unpack_positions(positions, corners)
+        return Stored(field, means + about.get("origin", 0.0), precision, about["means_blake2b"])
 
 
 @contextmanager
@@ -301,8 +305,8 @@ def means_checksum(means: Array) -> str:
     return hashlib.blake2b(data.tobytes(), digest_size=16).hexdigest()
 
 
-def write_language(path: Path | str, field: LanguageField, means: Array) -> None:
-    """Write `field` for the Gaussians at `means` (N, 3), atomically."""
+def write_language(path: Path | str, field: LanguageField, means: Array, origin: Array = NO_ORIGIN) -> None:
+    """Write `field` for the Gaussians at `means` (N, 3) of a scene with an `origin` (3,), atomically."""
     check_array("means", means, (len(field), 3), dtype=np.float32)
     positions, corners = pack_positions(means)
     floats = {
@@ -330,6 +334,8 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         "found": repr(field.found),
         **stated,
     }
+    if origin.any():
+        about["origin"] = json.dumps(origin.tolist())
     if field.calibration is not None:
         about["odds"] = json.dumps(astuple(field.calibration), default=float)
     _save(path, FIELD, tensors, about)
@@ -373,18 +379,19 @@ def _narrow(tensor: Array) -> Array:
     return half if np.array_equal(half.astype(np.float32), tensor) else tensor
 
 
-def read_language(path: Path | str, means: Array) -> LanguageField:
+def read_language(path: Path | str, means: Array, origin: Array = NO_ORIGIN) -> LanguageField:
     """Return the field in the sidecar `path`, which must belong to the Gaussians at `means` (N, 3) float32.
 
-    Raises InputError when it cannot be opened and FormatError when it breaks a rule of the layout or was
-    made for other Gaussians.
+    origin: (3,), of their scene; sidecars of before there were any have the checksum of positions in the
+    world. Raises InputError when it cannot be opened and FormatError when it breaks a rule of the layout or
+    was made for other Gaussians.
     """
     path = Path(path)
     stored = read_stored(path)
     mend = f"if the PLY was edited, run 'langsplat convert EDITED.ply NEW.ply --rematch {path}'"
     if len(stored.field) != len(means):
         raise malformed(path, f"made for {len(stored.field)} Gaussians, the scene has {len(means)}", mend)
-    if stored.checksum != means_checksum(means):
+    if stored.checksum not in (means_checksum(means), means_checksum(means.astype(np.float64) + origin)):
         raise malformed(path, "made for Gaussians at other positions than the scene's", mend)
     return stored.field
 
@@ -392,6 +399,7 @@ def read_language(path: Path | str, means: Array) -> LanguageField:
 def rematch_language(sidecar: Path | str, new_means: Array) -> LanguageField:
     """Return the field in `sidecar`, carried over to Gaussians at `new_means` (N, 3) by nearest position.
 
+    new_means: in the world, float64 where that is far from zero.
     Partners lie no farther apart than the old Gaussians from their nearest neighbours, in the median, so that
     positions may have been rounded (a compressed PLY does) but what was added or moved far gets no meaning.
     A Gaussian without a partner has confidence 0 and zero latents.

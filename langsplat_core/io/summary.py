@@ -34,7 +34,8 @@ class SceneSummary:
     gaussians: int
     invalid: Mapping[str, int]  # reason -> rows, each under its first
     invalid_rows: int
-    bounds: tuple[tuple[float, ...], tuple[float, ...]]  # 1 % and 99 % quantiles of the means, world units
+    bounds: tuple[tuple[float, ...], tuple[float, ...]]  # 1 % and 99 % quantiles of the means, in the world
+    origin: tuple[float, ...]  # what the means in memory are relative to, in the world
     sh_degree: int
     antialiased: bool
     metres_per_unit: float | None
@@ -49,12 +50,13 @@ def summarise(scene: Scene) -> SceneSummary:
     gaussians = scene.gaussians
     valid = gaussians.valid()
     means = gaussians.means[valid] if valid.any() else np.zeros((1, 3))
-    low, high = np.quantile(means, [0.01, 0.99], axis=0).astype(float).tolist()
+    low, high = scene.in_world(np.quantile(means, [0.01, 0.99], axis=0)).tolist()
     return SceneSummary(
         gaussians=len(gaussians),
         invalid=gaussians.invalid_rows(),
         invalid_rows=int((~valid).sum()),
         bounds=(tuple(low), tuple(high)),
+        origin=tuple(scene.origin.tolist()),
         sh_degree=gaussians.sh_degree,
         antialiased=scene.antialiased,
         metres_per_unit=scene.metres_per_unit,

@@ -40,6 +40,7 @@ from langsplat_core.pipeline.stages import ProcessGroup, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene.transform import place_scene
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, Encoder, load_encoder
 from langsplat_core.semantics.features import FeatureStore, StoredFeatures, describe_capture
 from langsplat_core.semantics.masks import MaskSource
@@ -132,7 +133,10 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
         check_masks(views.features)  # before the Gaussians, which may cost hours
 
     with run.timed("radiance"):
-        gaussians, rehearsed = _gaussians(run, capture, train) if given is None else (given.gaussians, {})
+        if given is None:
+            gaussians, rehearsed = _gaussians(run, capture, train)
+        else:
+            gaussians, rehearsed = place_scene(given, origin=capture.origin).gaussians, {}
 
     if not mask_source.agrees:
         with run.timed("masks that agree"):
@@ -150,7 +154,8 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
         with run.timed("saving and held-out views"):
             said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
             metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
-            save_scene(run.out, Scene(gaussians, language, views.cameras, metres_per_unit=metres))
+            scene = Scene(gaussians, language, views.cameras, metres_per_unit=metres, origin=capture.origin)
+            save_scene(run.out, scene)
             small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
             near = config.radiance.near
             scores = evaluate_views(gaussians, capture, held_out, small=small, near=near) if held_out else []

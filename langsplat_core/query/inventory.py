@@ -281,8 +281,8 @@ def export_labels(describer: Describer, path: Path) -> Path:
         node |= {"word": None if word is None else word.phrase, "class": number}
         if word is not None and describer.engine.basis.calibration is not None:
             node["probability"] = word.probability
-        positions = scene.gaussians.means[rows].astype(np.float64)
-        node |= {"gaussians": outline.count, "centre": outline.centre.tolist()}
+        positions = scene.in_world(scene.gaussians.means[rows])
+        node |= {"gaussians": outline.count, "centre": scene.in_world(outline.centre).tolist()}
         nodes.append(node | {"box": axis_aligned_box(positions).tolist(), "votes": list(outline.votes)})
         for part in outline.parts:  # whose Gaussians are among these, and take their own number
             place(part, outline.node)

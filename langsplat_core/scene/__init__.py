@@ -13,11 +13,22 @@ from langsplat_core.scene.language import (
     TaughtWord,
     Tree,
 )
-from langsplat_core.scene.scene import FARTHEST, Camera, Intrinsics, Scene, look_at, near_plane
+from langsplat_core.scene.scene import (
+    FARTHEST,
+    NO_ORIGIN,
+    Camera,
+    Intrinsics,
+    Scene,
+    about_origin,
+    look_at,
+    moved_pose,
+    near_plane,
+    origin_of,
+)
 
 __all__ = [
-    "CANONICAL_PHRASES", "FARTHEST", "LEVELS", "NO_NODE", "SH_COUNTS", "AutoencoderCodec", "Calibration",
-    "Camera", "CodebookCodec", "Codec", "Fits", "Gaussians", "Intrinsics", "LanguageField", "LinearCodec",
-    "PlattScaling", "Scene", "TaughtWord", "Tree", "codec_from_tensors", "look_at",
-    "near_plane",
+    "CANONICAL_PHRASES", "FARTHEST", "LEVELS", "NO_NODE", "NO_ORIGIN", "SH_COUNTS", "AutoencoderCodec",
+    "Calibration", "Camera", "CodebookCodec", "Codec", "Fits", "Gaussians", "Intrinsics", "LanguageField",
+    "LinearCodec", "PlattScaling", "Scene", "TaughtWord", "Tree", "about_origin", "codec_from_tensors",
+    "look_at", "moved_pose", "near_plane", "origin_of",
 ]  # fmt: skip

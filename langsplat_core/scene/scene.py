@@ -91,6 +91,10 @@ class Camera:
         """(3, 3) world-to-camera rotation; its rows are the camera's right, down and forward axes."""
         return self.world_to_camera[:3, :3]
 
+    def moved(self, offset: Array) -> "Camera":
+        """Return the camera moved by `offset` (3,), world units."""
+        return replace(self, world_to_camera=moved_pose(self.world_to_camera, offset))
+
     @property
     def intrinsics(self) -> Intrinsics:
         """Focal lengths and principal point on the camera's own pixel grid."""
@@ -135,6 +139,13 @@ class Camera:
         with np.errstate(invalid="ignore"):
             inside: Array = (depths > 0) & ((pixels >= 0) & (pixels < (self.width, self.height))).all(1)
         return inside
+
+
+def moved_pose(world_to_camera: Array, offset: Array) -> Array:
+    """Return the (4, 4) pose of a camera that was moved by `offset` (3,)."""
+    pose = world_to_camera.copy()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    return pose
 
 
 def look_at(
@@ -200,6 +211,40 @@ def bounds_of(gaussians: Gaussians) -> tuple[Array, float]:
     return centre, max(radius, size, 1e-6 * float(np.abs(centre).max()))
 
 
+# Far from zero float32 is coarse: at a northing of 5 400 000 m positions lie half a metre apart. So what is
+# far is kept relative to an origin in float64, which is subtracted where files are read.
+
+NO_ORIGIN = np.zeros(3)
+NO_ORIGIN.flags.writeable = False
+FAR = 100.0  # radii from zero, from which on steps of float32 are more than 1e-5 of a radius
+LOOKED_AT = 4096  # positions, evenly taken: enough for a median
+
+
+def origin_of(points: Array) -> Array:
+    """Return the (3,) float64 origin about which float32 holds (N, 3) positions: zero unless they are far.
+
+    Along the axes on which they are, it is their middle, to a power of two below their radius, so that what
+    float32 held already is subtracted without rounding.
+    """
+    some = points[:: len(points) // LOOKED_AT + 1].astype(np.float64)
+    some = some[np.isfinite(some).all(1)]
+    if not len(some):
+        return NO_ORIGIN
+    centre = np.median(some, axis=0)
+    distance = float(np.abs(centre).max())
+    radius = float(np.quantile(np.linalg.norm(some - centre, axis=1), 0.7)) or 1.0  # of a single place
+    if not FAR * radius < distance <= FARTHEST:
+        return NO_ORIGIN
+    grid = 2.0 ** math.floor(math.log2(max(radius, 1e-12 * distance)))
+    return np.where(np.abs(centre) > FAR * radius, np.round(centre / grid) * grid, 0.0)
+
+
+def about_origin(points: Array) -> tuple[Array, Array]:
+    """(N, 3) positions in the world -> (N, 3) positions about their origin, and that origin (3,)."""
+    origin = origin_of(points)
+    return (points - origin if origin.any() else points), origin
+
+
 # The opening view of a scene without cameras is from where it covers the most of a grid; lengths in radii.
 SAMPLES, TURNS, REACH, CELL = 20_000, 12, 3.0, 0.06
 WIDEST = 0.2  # of an image's width: shorter focal lengths, 136 degrees, are of no lens
@@ -208,7 +253,10 @@ MORE = 1.25  # how many times as much another side has to cover, to be better
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Gaussians with all that is known of them: `load_scene` returns one, renderers and queries take one."""
+    """Gaussians with all that is known of them: `load_scene` returns one, renderers and queries take one.
+
+    Everything in it is relative to `origin`: position in the world = `origin` + position.
+    """
 
     gaussians: Gaussians
     language: LanguageField | None = None
@@ -218,8 +266,12 @@ class Scene:
     extras: Mapping[str, Array] = field(default_factory=dict)  # (N,) properties not read here
     metres_per_unit: float | None = None  # > 0; None: nobody said how long a world unit is
     unread: tuple[str, ...] = ()  # why files that lie beside it could not be read, a line each
+    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) float64, zero unless it lies far away
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "origin", np.asarray(self.origin, np.float64))
+        if self.origin.shape != (3,) or not (np.abs(self.origin) <= FARTHEST).all():
+            raise ValueError(f"an origin of {self.origin}: expected three numbers up to {FARTHEST:g}")
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < np.inf:
             raise ValueError(f"metres_per_unit of {self.metres_per_unit}: must be above 0 and finite")
         for name, values in self.extras.items():
@@ -229,6 +281,16 @@ class Scene:
             raise ValueError(
                 f"language field of {len(self.language)} Gaussians on a scene of {len(self.gaussians)}"
             )
+
+    def in_world(self, points: Array) -> Array:
+        """(..., 3) positions in this scene -> (..., 3) float64 positions in the world."""
+        return np.asarray(points, np.float64) + self.origin
+
+    def world_gaussians(self) -> Gaussians:
+        """Return the Gaussians where they lie in the world, as near as float32 has it."""
+        if not self.origin.any():
+            return self.gaussians
+        return replace(self.gaussians, means=self.in_world(self.gaussians.means))
 
     def take(self, rows: Array) -> "Scene":
         """Return the scene of the Gaussians at `rows` (indices or a boolean mask), without a path."""

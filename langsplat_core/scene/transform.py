@@ -8,7 +8,7 @@ import numpy as np
 from langsplat_core.arrays import Array, across, unit
 from langsplat_core.errors import InputError
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
-from langsplat_core.scene.scene import FARTHEST, Camera, Scene
+from langsplat_core.scene.scene import FARTHEST, Camera, Scene, origin_of
 
 SHEAR = 1e-4  # of a matrix over its scale, against a rotation: more is another shape, not another place
 AXES = {name: np.eye(3)[place] for place, name in enumerate("xyz")}
@@ -184,6 +184,23 @@ def transform_scene(scene: Scene, to: Similarity, selected: Array | None = None)
         cameras=tuple(to.camera(camera) for camera in scene.cameras),
         metres_per_unit=None if metres is None else metres / to.scale,
     )
+
+
+def between_worlds(to: Similarity, origin: Array, target: Array) -> Similarity:
+    """Return in the world what maps from a scene with an `origin` (3,) into one whose origin is `target`."""
+    return moving(-origin).then(to).then(moving(target))
+
+
+def place_scene(scene: Scene, to: Similarity = IDENTITY, origin: Array | None = None) -> Scene:
+    """Return the scene transformed by a map of positions in the world, relative to another `origin` (3,).
+
+    Without one it becomes that which `origin_of` finds for the result.
+    """
+    centre, radius = scene.bounds()
+    if origin is None:
+        axes = np.concatenate([np.eye(3), -np.eye(3)])
+        origin = origin_of(to.points(scene.in_world(centre + radius * axes)))
+    return replace(transform_scene(scene, between_worlds(to, -scene.origin, -origin)), origin=origin)
 
 
 # View-dependent colour: real spherical harmonics up to degree 3, as 3D Gaussian Splatting uses them.

@@ -29,6 +29,7 @@ from langsplat_core.datasets.intrinsics import (
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Progress, silent
+from langsplat_core.scene import NO_ORIGIN, moved_pose
 from tests.support.photographs import (
     CONFIG,
     colmap_reconstruction,
@@ -49,15 +50,22 @@ LENS = PhotoIntrinsics(200, 150, *PARAMS[:4], BrownDistortion(*PARAMS[4:]))
 WHOLE = DatasetConfig(max_side=200)
 
 
-def write_dataset(folder: Path, form: str = "bin", subfolder: str = "sparse/0", views: int = 3) -> None:
-    """Photographs of the room through an OPENCV lens, and a model with ten points on its floor."""
+def write_dataset(
+    folder: Path, form: str = "bin", subfolder: str = "sparse/0", views: int = 3, at: Array = NO_ORIGIN
+) -> None:
+    """Photographs of the room through an OPENCV lens, and a model with ten points on its floor.
+
+    at: where in the world its zero is.
+    """
     matrices = poses(views)
     names = write_photos(folder / "images", LENS, matrices)
+    matrices = [moved_pose(matrix, at) for matrix in matrices]
     # Listed backwards: the order of the file must not matter.
     model = colmap_reconstruction("OPENCV", (200, 150), PARAMS, names[::-1], matrices[::-1])
     track = pycolmap.Track()
     for index in range(10):
-        model.add_point3D(np.array([3.0, 0.2 * index + 1.5, 0.0]), track, np.array([index, 2, 3], np.uint8))
+        point = at + np.array([3.0, 0.2 * index + 1.5, 0.0])
+        model.add_point3D(point, track, np.array([index, 2, 3], np.uint8))
     out = folder / subfolder
     out.mkdir(parents=True)
     (model.write_binary if form == "bin" else model.write_text)(out)
@@ -89,6 +97,37 @@ def test_a_capture_shows_what_its_cameras_see(tmp_path: Path, form: str, subfold
     assert capture.points.shape == (10, 3)
     assert set(labels) == {"reading photographs"}
     assert not (tmp_path / "work").exists()  # nothing had to be computed
+
+
+@pytest.mark.parametrize("at", [(500_123.25, 5_412_345.5, 0.0), (4.0e6, 7.0e5, 4.9e6)], ids=["UTM", "ECEF"])
+@pytest.mark.parametrize("form", ["bin", "txt", "json"])
+def test_a_far_capture_is_one_at_zero_about_its_origin(tmp_path: Path, form: str, at: Any) -> None:
+    place = np.array(at)
+    write_dataset(tmp_path, "bin" if form == "json" else form, at=place)
+    if form == "json":  # the same photographs as nerfstudio lists them
+        model, flip = read_model(tmp_path / "sparse/0"), np.diag([1.0, -1, -1, 1])
+        frames = []
+        for image in model.images:
+            pose = np.linalg.inv(moved_pose(image.world_to_camera, -place)) @ flip
+            pose[:3, 3] += place
+            frames.append({"file_path": f"images/{image.name}", "transform_matrix": pose.tolist()})
+        keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+        content = dict(zip(keys, PARAMS, strict=True)) | {"frames": frames, "ply_file_path": "points.ply"}
+        points = np.zeros(10, [(axis, "f8") for axis in "xyz"])
+        for number, axis in enumerate("xyz"):
+            points[axis] = model.points["position"][:, number]
+        PlyData([PlyElement.describe(points, "vertex")]).write(tmp_path / "points.ply")
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+    capture = load_capture(tmp_path, WHOLE, tmp_path / "work")
+    assert np.abs(capture.origin - place).max() < 20
+    for camera, image, matrix in zip(capture.cameras, capture.images, poses(3), strict=True):
+        back = camera.moved(capture.origin - place)
+        np.testing.assert_allclose(back.world_to_camera, matrix, atol=1e-8)
+        assert psnr(image, pinhole_picture(back, 3)) > 35
+    again = capture.read_at([0], 100)
+    np.testing.assert_array_equal(again.cameras[0].world_to_camera, capture.cameras[0].world_to_camera)
+    want = [[3.0, 0.2 * index + 1.5, 0.0] for index in range(10)]
+    np.testing.assert_allclose(capture.points + (capture.origin - place), want, atol=1e-8)
 
 
 def test_the_model_with_most_photographs_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -20,7 +20,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
 from langsplat_core.io.quantised import read_splat, write_splat
 from langsplat_core.io.scenes import load_gaussians, load_scene, save_scene, writable_suffixes
-from langsplat_core.io.shapes import gltf_axes, write_mesh, write_points
+from langsplat_core.io.shapes import write_mesh, write_points
 from langsplat_core.io.sog import write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.raster.reference import colours
@@ -557,7 +557,7 @@ def test_points_have_places_and_colours(tmp_path):
     gaussians = random_gaussians(40, sh_degree=1)
     gaussians.means[7] = np.nan
     gaussians.sh[8, 0] = 9, -9, 0
-    assert write_points(tmp_path / "a.ply", gaussians) == 39
+    assert write_points(tmp_path / "a.ply", Scene(gaussians)) == 39
     vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
     kept = np.delete(np.arange(40), 7)
     np.testing.assert_array_equal(np.stack([vertex[k] for k in "xyz"], 1), gaussians.means[kept])
@@ -567,7 +567,7 @@ def test_points_have_places_and_colours(tmp_path):
 
 
 def test_a_ply_holds_a_mesh(tmp_path):
-    write_mesh(tmp_path / "a.ply", MESH, np.eye(4))
+    write_mesh(tmp_path / "a.ply", MESH, Scene(random_gaussians(3)))
     data = PlyData.read(tmp_path / "a.ply")
     np.testing.assert_array_equal(np.stack([data["vertex"][k] for k in "xyz"], 1), TETRAHEDRON)
     np.testing.assert_array_equal(np.stack(data["face"]["vertex_indices"]), FACES)
@@ -576,7 +576,7 @@ def test_a_ply_holds_a_mesh(tmp_path):
 
 def test_a_glb_mesh_has_linear_colours_and_y_up(tmp_path):
     scene = Scene(random_gaussians(3), metres_per_unit=2.0)
-    write_mesh(tmp_path / "a.glb", MESH, gltf_axes(scene))
+    write_mesh(tmp_path / "a.glb", MESH, scene)
     content, binary = parts((tmp_path / "a.glb").read_bytes())
     assert content["buffers"][0]["byteLength"] == len(binary)
     np.testing.assert_array_equal(np.frombuffer(binary[:48], "<f4").reshape(4, 3), TETRAHEDRON)

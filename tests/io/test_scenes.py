@@ -29,6 +29,7 @@ from langsplat_core.io.summary import summarise
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, Calibration, PlattScaling, Scene
 from langsplat_core.scene.language import tree_of_wholes
+from langsplat_core.scene.transform import moving, place_scene
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import (
     assert_refused,
@@ -71,7 +72,7 @@ def spoilt(got: Scene, want: Scene) -> set[str]:
         "metres per unit": got.metres_per_unit != want.metres_per_unit,
         "extra properties": not got.extras,
     }
-    assert tuple(changed) == LOSSES
+    assert (*changed, "origin") == LOSSES
     if got.extras:
         assert_same_extras(got.extras, want.extras)
     return {name for name, lost in changed.items() if lost}
@@ -86,12 +87,54 @@ def test_a_scene_keeps_what_its_format_holds(tmp_path, row, degree):
     save_scene(path, want)
     got = load_scene(path)
     assert got.path == path
-    assert spoilt(got, want) == set(row.loses)
+    assert spoilt(got, want) == set(row.loses) - {"origin"}
     stem = path.name if row.own_companions else path.stem
     names = {path.name, f"{stem}.cameras.json", f"{stem}.langsplat.safetensors"}
     assert {p.name for p in path.parent.iterdir()} == names == {p.name for p in scene_files(path)}
     save_scene(tmp_path / f"again{row.suffix}", got)  # a second turn loses nothing more
     np.testing.assert_array_equal(load_gaussians(tmp_path / f"again{row.suffix}").means, got.gaussians.means)
+
+
+FAR = [(500_123.25, 5_412_345.5, 0.0), (4.0e6, 7.0e5, 4.9e6)]  # UTM, and from the earth's centre
+
+
+@pytest.mark.parametrize("at", FAR, ids=["UTM", "ECEF"])
+@pytest.mark.parametrize("row", [row for row in formats() if row.write], ids=lambda row: row.suffix)
+def test_a_far_scene_is_kept_like_one_at_zero(tmp_path, row, at, caplog):
+    near = full_scene()
+    save_scene(tmp_path / f"near{row.suffix}", near)
+    save_scene(tmp_path / f"far{row.suffix}", place_scene(near, moving(np.array(at))))
+    loses = "origin" in row.loses
+    assert len(caplog.records) == loses
+    assert (tmp_path / f"far{row.suffix}.origin.json").exists() == loses
+    caplog.clear()
+    want, got = (load_scene(tmp_path / f"{name}{row.suffix}") for name in ("near", "far"))
+    assert not caplog.records
+    assert np.abs(got.origin).max() > 1e5
+    rounding = 2e-8 if "precision" not in row.loses or "origin" not in row.loses else 1e-4
+    world = got.in_world(got.gaussians.means)
+    np.testing.assert_allclose(world - at, want.gaussians.means, rtol=2e-7, atol=4 * rounding)
+    for a, b in zip(got.cameras, want.cameras, strict=True):
+        np.testing.assert_allclose(got.in_world(a.position) - at, b.position, atol=4e-9)
+    assert_same_field(got.language, want.language)
+    save_scene(tmp_path / f"again{row.suffix}", got)
+    again = load_scene(tmp_path / f"again{row.suffix}")
+    assert again.language is not None
+    np.testing.assert_array_equal(again.in_world(again.gaussians.means), world)
+
+
+def test_rounded_positions_are_drawn_and_told_of_once(tmp_path, caplog):
+    gaussians = random_gaussians(N)
+    rounded = (gaussians.means + np.array(FAR[0])).astype(np.float32)
+    write_ply(tmp_path / "a.ply", replace(gaussians, means=rounded))
+    write_language(
+        tmp_path / "a.langsplat.safetensors", random_field(N), rounded
+    )  # of before there were origins
+    got = load_scene(tmp_path / "a.ply")
+    assert got.language is not None
+    assert ["steps of 0.5 units" in record.getMessage() for record in caplog.records] == [True]
+    np.testing.assert_array_equal(got.in_world(got.gaussians.means), rounded)
+    assert np.abs(got.gaussians.means).max() < 20
 
 
 @pytest.mark.parametrize("row", [row for row in formats() if not row.write], ids=lambda row: row.suffix)
@@ -146,7 +189,7 @@ def test_an_interruption_never_leaves_a_mixture(tmp_path, monkeypatch, after):
         assert got.language is not None
         assert got.cameras
     assert not list(tmp_path.glob(".*"))
-    assert after < 8 or finished  # the parameters cover every step
+    assert after < 9 or finished  # the parameters cover every step
 
 
 def test_companions_lie_beside_every_kind_of_scene(tmp_path):

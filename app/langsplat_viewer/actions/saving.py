@@ -181,7 +181,7 @@ def export(
 def _write(scene: Scene, rows: Array, folder: Path, stem: str, as_points: bool) -> tuple[Path, int]:
     path = output.free_name(folder, stem, ".ply", () if as_points else COMPANIONS)
     if as_points:
-        return path, write_points(path, scene.gaussians.take(rows))
+        return path, write_points(path, scene.take(rows))
     save_scene(path, replace(scene.take(rows), path=path))
     return path, len(rows)
 

@@ -15,7 +15,7 @@ from PIL import Image
 from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import EncoderOption
 from langsplat_core.cli.describe import outline_lines, outline_of
-from langsplat_core.cli.query import camera_of, unit_of
+from langsplat_core.cli.query import Unit, camera_of, unit_of
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.extensions.library.index import scenes_in
 from langsplat_core.progress import silent
@@ -93,15 +93,15 @@ class Door:
         """
         engine = self._engine(scene)
         composed = run_phrase(engine, phrase, viewpoint=_first(engine.scene))
-        answer, unit = composed.answer, unit_of(engine.scene.metres_per_unit)
+        answer, unit = composed.answer, _unit(engine.scene)
         there = answer.found or answer.verdict == "weak match"
         return {
             "verdict": answer.verdict,
             "probability": answer.probability,
             "read_as": composed.reading,
             "level": LEVELS[answer.level],
-            "place": _lengths(answer.place, unit.length) if there else None,
-            "box": _lengths(answer.box, unit.length) if there else None,
+            "place": _places(answer.place, unit) if there else None,
+            "box": _places(answer.box, unit) if there else None,
             "unit": unit.name,
             "answers_stand_on": engine.basis.long,
         }
@@ -117,7 +117,7 @@ class Door:
     def distance(self, first: str, second: str, scene: str = "") -> dict[str, Any]:
         """How far apart the nearest points of two things are, each named by a phrase."""
         engine = self._engine(scene)
-        frame, unit = upright(engine.scene.up()), unit_of(engine.scene.metres_per_unit)
+        frame, unit = upright(engine.scene.up()), _unit(engine.scene)
         bodies = []
         for phrase in (first, second):
             answer = self._found(engine, phrase)
@@ -131,9 +131,7 @@ class Door:
     def describe(self, scene: str = "") -> str:
         """Return what is in a scene: an outline of its things with their parts, sizes and counts."""
         engine = self._engine(scene)
-        lines = outline_lines(
-            outline_of(Describer(engine, None, silent)), unit_of(engine.scene.metres_per_unit)
-        )
+        lines = outline_lines(outline_of(Describer(engine, None, silent)), _unit(engine.scene))
         return "\n".join([*lines, f"answers: {engine.basis.long}"])
 
     def look(self, phrase: str = "", camera: int = 0, scene: str = "") -> Array:
@@ -172,8 +170,12 @@ def _first(scene: Scene) -> Camera | None:
     return scene.cameras[0] if scene.cameras else None
 
 
-def _lengths(values: Array | None, length: float) -> Any:
-    return None if values is None else np.round(length * values, 4).tolist()
+def _unit(scene: Scene) -> Unit:
+    return unit_of(scene.metres_per_unit, scene.origin)
+
+
+def _places(values: Array | None, unit: Unit) -> Any:
+    return None if values is None else np.round(unit.length * (unit.origin + values), 4).tolist()
 
 
 def towards(scene: Scene, answer: QueryResult) -> Camera:

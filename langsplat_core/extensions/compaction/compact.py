@@ -49,6 +49,7 @@ from langsplat_core.io.summary import disk_bytes, memory_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import colours_seen, render, view_of
 from langsplat_core.scene import SH_COUNTS, Camera, Scene
+from langsplat_core.scene.transform import place_scene
 
 T = TypeVar("T")
 
@@ -139,9 +140,10 @@ def _photographed(scene: Scene, photos: Path, config: BudgetConfig, progress: Pr
         origin = "photographs, of which the scene may know all"
     if not ranking or not measuring:
         raise InputError(f"{photos}: {len(capture)} photographs; at least 2 are needed")
+    cameras = [camera.moved(capture.origin - scene.origin) for camera in capture.cameras]
     return Views(
-        tuple(capture.cameras[i] for i in ranking),
-        tuple(capture.cameras[i] for i in measuring),
+        tuple(cameras[i] for i in ranking),
+        tuple(cameras[i] for i in measuring),
         tuple(capture.images[i] for i in measuring),
         origin,
     )
@@ -286,8 +288,8 @@ def _stored(scene: Scene, out: Path) -> tuple[Scene, int]:
     """Return the scene after a journey through a file named like `out`, and the bytes that it took."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / out.name
-        save_scene(path, replace(scene, path=path))
-        return load_scene(path), disk_bytes(path)
+        save_scene(path, replace(scene, path=path), tell=False)
+        return place_scene(load_scene(path), origin=scene.origin), disk_bytes(path)
 
 
 def _reduced(scene: Scene, rows: Array, sh_degree: int) -> Scene:

@@ -27,7 +27,7 @@ from langsplat_core.extensions.geometry.registration import TRUSTED, Registratio
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
-from langsplat_core.io.shapes import MESH_SUFFIXES, check_suffix, gltf_axes, write_mesh
+from langsplat_core.io.shapes import MESH_SUFFIXES, check_suffix, write_mesh
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.describe import Describer
@@ -35,7 +35,14 @@ from langsplat_core.query.engine import QueryEngine, searchable
 from langsplat_core.query.inventory import scene_outline
 from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.surface import surface_weights
-from langsplat_core.scene.transform import Similarity, similarity, transform_scene
+from langsplat_core.scene.transform import (
+    Similarity,
+    between_worlds,
+    moving,
+    place_scene,
+    similarity,
+    transform_scene,
+)
 from langsplat_core.semantics.encoders import load_text_encoder
 
 TRANSFORM_LIMIT = 1 << 20  # bytes of a file with a matrix
@@ -72,7 +79,7 @@ class WriteMesh:
         check_suffix(self.out, MESH_SUFFIXES)
         check_keeps(self.out, self.scene)
         scene = searchable(self.scene) if self.phrase else load_scene(self.scene)
-        unit = unit_of(scene.metres_per_unit)
+        unit = unit_of(scene.metres_per_unit, scene.origin)
         if self.phrase:
             engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
             scene = scene.take(found_answer(engine, self.phrase, self.level).members)
@@ -86,7 +93,7 @@ class WriteMesh:
                 left = "" if mesh.holes() == 0 else f", {mesh.holes()} left at the border of the scene"
                 made = f" closed{left}; made up: {area * unit.length**2:.3g} {unit.name}^2 ({share:.0f} %)"
             mesh = replace(mesh, name=self.phrase or self.scene.stem)
-            write_mesh(self.out, mesh, gltf_axes(scene))
+            write_mesh(self.out, mesh, scene)
         print(
             f"{self.out}: {len(mesh.triangles)} triangles, {len(mesh.vertices)} vertices, voxels of "
             f"{side * unit.length:.3g} {unit.name}; {holes} holes{made}"
@@ -111,11 +118,13 @@ class Register:
 
     @optional_imports()
     def run(self) -> None:
+        scene, fixed = load_scene(self.moving), load_scene(self.fixed)
         with TerminalProgress() as progress:
-            found = registered(load_scene(self.moving), load_scene(self.fixed), self.scaled, progress)
+            found = registered(scene, fixed, self.scaled, progress)
+        matrix = between_worlds(similarity(found.transform), scene.origin, fixed.origin).matrix
         if self.out is not None:
-            write_json(self.out, {"matrix": found.transform.tolist()})
-        rows = "; ".join(" ".join(f"{number:.9g}" for number in row) for row in found.transform)
+            write_json(self.out, {"matrix": matrix.tolist()})
+        rows = "; ".join(" ".join(f"{number:.9g}" for number in row) for row in matrix)
         print(
             f"{100 * found.agreement:.0f} % of the surfaces agree, {found.rmse:.3g} units apart; scale "
             f"{found.scale:.4g}; matrix {rows}"
@@ -151,11 +160,11 @@ class Merge:
         first, second = load_scene(self.first), load_scene(self.second)
         said = "as they were"
         if self.transform is not None:
-            second, said = transform_scene(second, read_transform(self.transform)), "as told"
+            second, said = place_scene(second, read_transform(self.transform), first.origin), "as told"
         elif not self.as_is:
             with TerminalProgress() as progress:
                 found = registered(second, first, self.scaled, progress)
-            second = transform_scene(second, similarity(found.transform))
+            second = replace(transform_scene(second, similarity(found.transform)), origin=first.origin)
             said = f"registered, {100 * found.agreement:.0f} % of the surfaces agree"
         scene = merge(first, second)
         save_scene(self.out, replace(scene, path=self.out))
@@ -238,7 +247,7 @@ class Map:
                 check_phrase(engine, phrase, scene.cameras[0] if scene.cameras else None)
         with TerminalProgress() as progress:
             room = find_room(scene)
-            occupancy = find_occupancy(scene, map_axes(room, metres), self.resolution, progress)
+            occupancy = find_occupancy(scene, map_axes(room, metres, scene.origin), self.resolution, progress)
             plan = floor_map(occupancy, self.step, self.robot_height)
             self.out.mkdir(parents=True, exist_ok=True)
             write_grid(self.out, plan)
@@ -317,7 +326,7 @@ def write_voxels(
     with atomic_path(path) as temporary:
         np.savez_compressed(
             temporary, cells=cells.astype(np.int32), origin=occupancy.origin, resolution=occupancy.resolution,
-            to_map=occupancy.to_map, nodes=nodes.astype(np.int32), words=names,
+            to_map=occupancy.to_map @ moving(-scene.origin).matrix, nodes=nodes.astype(np.int32), words=names,
             hits=occupancy.hits[tuple(cells.T)], passes=occupancy.passes[tuple(cells.T)],
         )  # fmt: skip
 

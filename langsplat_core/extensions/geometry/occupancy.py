@@ -16,7 +16,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.extensions.geometry.planes import Room
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
-from langsplat_core.scene import Scene
+from langsplat_core.scene import NO_ORIGIN, Scene
 
 MOST_CELLS = 60_000_000  # of a grid
 SIDE = 240  # pixels of the longer side of the depth images
@@ -32,7 +32,7 @@ STAGE = "measuring what is free"
 class Occupancy:
     """X x Y x Z voxels in the axes of a map: metres, z up, the ground at z = 0."""
 
-    to_map: Array  # (4, 4) similarity, from world units to the map's metres
+    to_map: Array  # (4, 4) similarity, from the scene to the map's metres
     origin: Array  # (3,) lower corner of the first voxel, metres
     resolution: float  # metres
     hits: Array  # (X, Y, Z) uint16 rays that end in each voxel
@@ -49,11 +49,11 @@ class Occupancy:
         return np.asarray((self.hits > 0) | (self.passes > 0))
 
     def metres(self, points: Array) -> Array:
-        """(P, 3) world points -> (P, 3) in the axes of the map."""
+        """(P, 3) points of the scene -> (P, 3) in the axes of the map."""
         return _moved(points, self.to_map)
 
     def voxels(self, points: Array) -> Array:
-        """(P, 3) world points -> (P, 3) int64 voxels, perhaps outside of the grid."""
+        """(P, 3) points of the scene -> (P, 3) int64 voxels, perhaps outside of the grid."""
         return np.floor((self.metres(points) - self.origin) / self.resolution).astype(np.int64)
 
 
@@ -81,8 +81,8 @@ class Goal:
     distance: float  # metres from the robot's middle to the thing's nearest point
 
 
-def map_axes(room: Room, metres: float) -> Array:
-    """Return the (4, 4) similarity from world units to the axes of a map.
+def map_axes(room: Room, metres: float, origin: Array = NO_ORIGIN) -> Array:
+    """Return the (4, 4) similarity from a scene with an `origin` (3,) to the axes of a map.
 
     z is up, the ground at 0, and x as near to the world's x axis, or its y axis where that is nearly up, as a
     level axis can be. metres: of a unit.
@@ -92,6 +92,7 @@ def map_axes(room: Room, metres: float) -> Array:
     first /= np.linalg.norm(first)
     made = np.eye(4)
     made[:3, :3] = metres * np.stack([first, np.cross(room.up, first), room.up])
+    made[:3, 3] = made[:3, :3] @ origin
     made[2, 3] = -metres * room.ground
     return made
 

@@ -16,7 +16,7 @@ from langsplat_core.scene import Camera, LanguageField, Scene, Tree
 from langsplat_core.scene.codec import LARGEST, CodebookCodec, Codec, principal_colours
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.language import NO_NODE
-from langsplat_core.scene.transform import similarity
+from langsplat_core.scene.transform import place_scene, similarity
 
 SAMPLES = 40_000  # points of each surface
 ROUGH, FINE = 0.06, 0.03  # of the fixed scene's radius: spacing of points for features, and for ICP
@@ -173,7 +173,7 @@ def _some(scene: Scene) -> list[Camera]:
 
 
 def merge(first: Scene, second: Scene) -> Scene:
-    """Return the Gaussians of both, those of `first` first, and all that belongs to them.
+    """Return the Gaussians of both, those of `first` first, and all that belongs to them, about its origin.
 
     Gaussians of a scene without a language field get no meaning. Where both say something of the whole scene
     or of one word, `first` counts; properties that only one has are left out. Raises InputError where one
@@ -184,6 +184,7 @@ def merge(first: Scene, second: Scene) -> Scene:
             "one scene was trained with antialiasing (Mip-Splatting) and the other without, so that no image "
             "is right for both; train one of them again"
         )
+    second = place_scene(second, origin=first.origin)
     shared = [
         name for name, values in first.extras.items()
         if name in second.extras and second.extras[name].dtype == values.dtype
@@ -196,6 +197,7 @@ def merge(first: Scene, second: Scene) -> Scene:
         extras={name: np.concatenate([first.extras[name], second.extras[name]]) for name in shared},
         metres_per_unit=first.metres_per_unit or second.metres_per_unit,
         unread=first.unread + second.unread,
+        origin=first.origin,
     )
 
 

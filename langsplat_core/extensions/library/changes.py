@@ -26,7 +26,7 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.surface import surface_areas
-from langsplat_core.scene.transform import similarity
+from langsplat_core.scene.transform import moving, similarity
 
 Kind = Literal["gone", "appeared", "moved", "recoloured"]
 KINDS: tuple[Kind, ...] = ("gone", "appeared", "moved", "recoloured")
@@ -101,11 +101,13 @@ def changes(
 ) -> tuple[Change, ...]:
     """Return what changed from the first scene to the second, the largest first of each of `KINDS`.
 
-    placed: (4, 4) similarity from the second scene's frame into the first one's; None: they are one.
+    placed: (4, 4) similarity from the second scene's frame into the first one's; None: both lie in one world.
     describers: of both, for names. Raises InputError for a scene without cameras or language field, and for a
     matrix that is no similarity.
     """
-    into = np.eye(4) if placed is None else similarity(placed).matrix
+    if placed is None:
+        placed = moving(second.scene.origin - first.scene.origin).matrix
+    into = similarity(placed).matrix
     before, after = _evidence(first.scene, second.scene, into, rasterizer, progress)
     home = (first, before, np.eye(4)), (second, after, into)
     gone, appeared = (_pieces(*each) for each in home)

@@ -13,7 +13,7 @@ import tyro
 from PIL import Image
 
 from langsplat_core.cli.arguments import EncoderOption, JsonOption, OutFile, TrainedScene
-from langsplat_core.cli.query import Unit, once, unit_of
+from langsplat_core.cli.query import Unit, in_world, once, unit_of
 from langsplat_core.cli.run import print_json
 from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError
@@ -27,6 +27,7 @@ from langsplat_core.query.engine import QueryEngine, searchable
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LEVELS
 from langsplat_core.scene.language import split_phrases
+from langsplat_core.scene.transform import IDENTITY, between_worlds
 from langsplat_core.semantics.encoders import load_text_encoder
 
 
@@ -85,8 +86,8 @@ def _said(hit: Hit) -> str:
     sure = "" if hit.probability is None else f" ({100 * hit.probability:.0f} %)"
     place = "place not looked for" if hit.answer is None else "place -"
     if hit.answer is not None and hit.answer.place is not None:
-        unit = unit_of(hit.metres_per_unit)
-        place = f"place {unit.format(hit.answer.place)} {unit.name}"
+        unit = unit_of(hit.metres_per_unit, hit.origin)
+        place = f"place {unit.place(hit.answer.place)} {unit.name}"
     return f"{hit.verdict}{sure}, {place}"
 
 
@@ -118,7 +119,7 @@ def _fields(answered: Answered, hits: Sequence[Hit], library: Library) -> dict[s
 def _hit_fields(hit: Hit, library: Library) -> dict[str, Any]:
     own = ("verdict", "probability", "margin", "metres_per_unit")
     answer = hit.answer
-    return {
+    fields = {
         "scene": _name(hit, library),
         **{name: getattr(hit, name) for name in own},
         "exact": answer is not None,
@@ -126,6 +127,7 @@ def _hit_fields(hit: Hit, library: Library) -> dict[str, Any]:
         "place": None if answer is None else answer.place,
         "box": None if answer is None else answer.box,
     }
+    return {**in_world(fields, hit.origin)}
 
 
 def _html(listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> str:
@@ -171,9 +173,11 @@ class Changes:
     def run(self) -> None:
         if self.register and self.transform is not None:
             raise InputError("--register finds what --transform gives; leave one of them out")
-        placed = None if self.transform is None else read_transform(self.transform).matrix
+        told = IDENTITY if self.transform is None else read_transform(self.transform)
         scenes = searchable(self.before), searchable(self.after)
-        unit = unit_of(self.scale or scenes[0].metres_per_unit)
+        origin = scenes[0].origin
+        placed = between_worlds(told, -scenes[1].origin, -origin).matrix
+        unit = unit_of(self.scale or scenes[0].metres_per_unit, origin)
         unsure = None in [scene.metres_per_unit for scene in scenes]
         first, second = (QueryEngine(scene, load_text_encoder, encoder_id=self.encoder) for scene in scenes)
         with TerminalProgress() as progress:
@@ -186,14 +190,15 @@ class Changes:
                 placed = registered(scenes[1], scenes[0], scaled=unsure, progress=progress).transform
             found = changes(first, second, load_lifting_rasterizer("cpu"), placed, describers, progress)
         if self.json:
-            print_json({"metres_per_unit": unit.metres, "changes": [_change_fields(c) for c in found]})
+            listed = [_change_fields(change) for change in found]
+            print_json({"metres_per_unit": unit.metres, "changes": in_world(listed, origin)})
             return
         print("\n".join(_in_words(change, unit) for change in found) or "nothing changed")
 
 
 def _in_words(change: Change, unit: Unit) -> str:
     name = change.name or "something"
-    at = f"{unit.format(change.centre)} {unit.name}"
+    at = f"{unit.place(change.centre)} {unit.name}"
     if change.kind == "moved":
         assert change.moved is not None
         by = f"{unit.length * change.distance:.2f} {unit.name} ({unit.format(change.moved)})"

@@ -14,7 +14,7 @@ import logging
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import accumulate, chain
 from pathlib import Path
@@ -53,7 +53,7 @@ from langsplat_core.query.rule import (
     triple,
 )
 from langsplat_core.raster.render import render
-from langsplat_core.scene import LEVELS, Calibration, Camera, LanguageField, Scene
+from langsplat_core.scene import LEVELS, NO_ORIGIN, Calibration, Camera, LanguageField, Scene
 from langsplat_core.scene.codec import LinearCodec
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.language import phrase_key
@@ -469,6 +469,7 @@ class Hit:
     judgement: Verdict
     answer: QueryResult | None = None  # None where only the index was asked
     metres_per_unit: float | None = None
+    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) that places are relative to
     picture: Array | None = None  # (H, W, 3) uint8, the answer as a heat map
 
     @property
@@ -551,7 +552,8 @@ def _ask_group(
             unread.append((name, str(error)))
             del hits[name]
             continue
-        exact[name] = Hit(hits[name].path, answer.judgement, answer, scene.metres_per_unit, picture)
+        about = answer, scene.metres_per_unit, scene.origin, picture
+        exact[name] = Hit(hits[name].path, answer.judgement, *about)
     found = [hit for hit in exact.values() if hit.verdict != "not here"]
     others = [hit for hit in (hits | exact).values() if hit not in found]
     ordered = (sorted(some, key=lambda hit: -hit.margin) for some in (found, others))
