@@ -11,7 +11,7 @@ is CLIP's byte-pair encoding (Sennrich et al. 2016) of words of the letters a to
 
 import json
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -98,6 +98,7 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
         rows = len(tensors[TOKENS]), len(tensors[POSITIONS])
         # What a later phrase would meet, and what the first word shows.
         fits = set(tokenizer.numbers.values()) <= set(range(rows[0])) and tokenizer.end == config.eos_token_id
+        fits = fits and config.hidden_act == "quick_gelu"
         plain = rows[1] == config.max_position_embeddings and all(re.fullmatch("[a-z]+", w) for w in words)
         return tower if fits and plain and tower.encode(words[:1]).shape == (1, tower.dim) else None
     except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
@@ -125,8 +126,7 @@ def _tensors(folder: Path, config: TextConfig) -> dict[str, Array]:
 
 def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) -> Array:
     """(B, L) token numbers, and (B,) where the end token of each row is -> (B, D) float32, of any length."""
-    eps, activate = config.layer_norm_eps, _ACTIVATIONS[config.hidden_act]
-    length = ids.shape[1]
+    eps, length = config.layer_norm_eps, ids.shape[1]
     later = np.triu(np.full((length, length), -np.inf, np.float32), 1)
     x = tensors[TOKENS][ids] + tensors[POSITIONS][:length]
     for number in range(config.num_hidden_layers):
@@ -134,7 +134,7 @@ def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) 
         before = _norm(tensors, f"{layer}layer_norm1", x, eps)
         x = x + _attention(tensors, f"{layer}self_attn.", before, later, config.num_attention_heads)
         inner = _linear(tensors, f"{layer}mlp.fc1", _norm(tensors, f"{layer}layer_norm2", x, eps))
-        x = x + _linear(tensors, f"{layer}mlp.fc2", activate(inner))
+        x = x + _linear(tensors, f"{layer}mlp.fc2", _quick_gelu(inner))
     last = _norm(tensors, f"{PREFIX}final_layer_norm", x[np.arange(len(ids)), ends], eps)
     return last @ tensors[PROJECTION].T
 
@@ -169,15 +169,6 @@ def _quick_gelu(x: Array) -> Array:
     with np.errstate(over="ignore"):  # of a large negative number: 0
         gelu: Array = x / (1 + np.exp(np.float32(-1.702) * x))
     return gelu
-
-
-def _gelu(x: Array) -> Array:
-    from scipy.special import erf
-
-    return np.float32(0.5) * x * (1 + erf(x * np.float32(0.5**0.5)))
-
-
-_ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"quick_gelu": _quick_gelu, "gelu": _gelu}
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ class ClipText {
       );
       states = states.map((value, i) => value + attended[i]);
       const inner = this.linear(layer("mlp.fc1"), this.normed(layer("layer_norm2"), states), width);
-      const outer = this.linear(layer("mlp.fc2"), inner.map(this.activation()), config.intermediate_size);
+      const outer = this.linear(layer("mlp.fc2"), inner.map(quickGelu), config.intermediate_size);
       states = states.map((value, i) => value + outer[i]);
     }
     const end = states.subarray((ids.length - 1) * width);
@@ -81,13 +81,6 @@ class ClipText {
       }
     });
     return states;
-  }
-
-  activation() {
-    if (this.config.hidden_act === "quick_gelu") {
-      return (value) => value * sigmoid(1.702 * value);
-    }
-    return (value) => 0.5 * value * (1 + errorFunction(value * Math.SQRT1_2));
   }
 
   linear(name, states, width) {
@@ -148,13 +141,7 @@ class ClipText {
   }
 }
 
-// Error function to 1.5e-7 (Abramowitz and Stegun 1964, formula 7.1.26).
-function errorFunction(x) {
-  const t = 1 / (1 + 0.3275911 * Math.abs(x));
-  const tail =
-    t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))));
-  return Math.sign(x) * (1 - tail * Math.exp(-x * x));
-}
+const quickGelu = (value) => value * sigmoid(1.702 * value);
 // [/page]
 
 export { PhraseError, ClipText, dot };

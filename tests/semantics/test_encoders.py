@@ -267,11 +267,9 @@ def test_bundled_encoder_in_numpy_agrees_with_torch(measured) -> None:
     assert error < CLOSE
 
 
-@pytest.mark.parametrize("activation", ["quick_gelu", "gelu"])
 @pytest.mark.parametrize("half", [False, True])
-def test_random_weights_agree_with_float64(tmp_path: Path, activation: str, half: bool) -> None:
+def test_random_weights_agree_with_float64(tmp_path: Path, half: bool) -> None:
     tiny_clip(tmp_path, half)
-    text_setting(hidden_act=activation)(tmp_path)
     teach(tmp_path, "red", "mug", "a", "handle")
     tower = clip_text(Weights("tiny", tmp_path, "cpu"))
     assert isinstance(tower, PlainClipText)
@@ -288,7 +286,7 @@ NOT_PLAIN: dict[str, Callable[[Path], object]] = {
     "no tokenizer": lambda folder: (folder / "tokenizer.json").unlink(),
     "tokens that have no vector": tokenizer_of(lambda stated: stated["model"]["vocab"].update(rare=10**6)),
     "longer phrases than positions": text_setting(max_position_embeddings=10**6),
-    "another activation": text_setting(hidden_act="relu"),
+    "another activation": text_setting(hidden_act="gelu"),
     "fewer layers": text_setting(num_hidden_layers=1),
     "open words": lambda folder: (folder / "vocabulary.txt").unlink(),
     "words of other letters": lambda folder: teach(folder, "mug", "café"),
