@@ -40,7 +40,7 @@ from langsplat_core.scene import (
     codec_from_tensors,
     near_plane,
 )
-from langsplat_core.scene.codec import KINDS
+from langsplat_core.scene.codec import KINDS, CodebookCodec
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.scene import NEAR_CAMERAS
 from langsplat_core.scene.surface import build_surface, build_tree
@@ -58,8 +58,10 @@ from langsplat_core.semantics.relevancy import everyday_vectors
 from langsplat_core.training.language.codec_fit import (
     CodecReport,
     codec_report,
+    contrasting_colours,
     everyday_vocabulary,
     fit_codec,
+    rounded,
 )
 from langsplat_core.training.language.lift import (
     MaskGroups,
@@ -136,7 +138,11 @@ def language_field(
     latents, confidence = stages.latents(codec)
     confidence = confidence.clip(max=MOST_CONFIDENCE).astype(np.float16).astype(np.float32)
     field = field_of((latents, confidence), codec, encoder, config.phrases)
-    return replace(field, tree=stages.tree(field)), report
+    tree = stages.tree(field)
+    if isinstance(codec, CodebookCodec):
+        colours = contrasting_colours(field, tree, build_surface(gaussians))
+        codec = codec if colours is None else replace(codec, palette=rounded(colours))
+    return replace(field, tree=tree, codec=codec), report
 
 
 def field_of(

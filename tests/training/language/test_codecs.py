@@ -1,4 +1,6 @@
-"""Codecs of every kind: what they answer, fitting, storage; k-means, which finds codewords."""
+"""Codecs of every kind: what they answer, fitting, storage; k-means, which finds codewords; their colours."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,15 +9,21 @@ import torch
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import AutoencoderConfig, CodebookConfig, LinearConfig
 from langsplat_core.scene import (
+    NO_NODE,
     Codec,
+    Gaussians,
+    LanguageField,
     LinearCodec,
     codec_from_tensors,
 )
-from langsplat_core.scene.codec import KINDS
+from langsplat_core.scene.codec import KINDS, CodebookCodec, principal_colours
+from langsplat_core.scene.language import tree_of_wholes
+from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.relevancy import Scale
 from langsplat_core.training.language.codec_fit import (
     Vocabulary,
     codec_report,
+    contrasting_colours,
     fit_codebook,
     fit_codec,
     folded_layers,
@@ -24,6 +32,8 @@ from langsplat_core.training.language.codec_fit import (
     rounded,
     spherical_kmeans,
 )
+from tests.support.file_samples import random_field
+from tests.support.scenes import unturned_gaussians
 
 pytestmark = pytest.mark.long
 
@@ -210,3 +220,64 @@ def test_more_centres_fit_better_and_a_start_is_kept() -> None:
         spreads.append(apart(vectors, start))
     assert spreads == sorted(spreads, reverse=True)
     assert spreads[-1] < 0.6 * spreads[0]
+
+
+# Colours of codewords: neighbours are told apart, whatever else is large.
+
+SIDE, THINGS = 40, 8
+
+
+def sheet() -> Gaussians:
+    """SIDE x SIDE small discs in a plane."""
+    x, y = np.divmod(np.arange(SIDE * SIDE), SIDE)
+    return unturned_gaussians(np.stack([x, y, 0 * x], 1) * 0.1, np.log(0.07), 4.0)
+
+
+def field_of(things: Array, vectors: Array) -> LanguageField:
+    """Of things (N,), each with its own codeword; NO_NODE means nothing."""
+    usage = np.bincount(things[things != NO_NODE], minlength=len(vectors)).astype(float)
+    codec = CodebookCodec(vectors, principal_colours(vectors, usage))
+    codes = np.where(things == NO_NODE, 0, things).astype(np.uint16)
+    return replace(
+        random_field(len(things), "codebook"),
+        codec=codec,
+        canonical=vectors[:4],
+        everyday=None,
+        phrasebook={},
+        latents=np.tile(codes[None, :, None], (3, 1, 1)),
+        confidence=np.tile((things != NO_NODE).astype(np.float32), (3, 1)),
+        tree=tree_of_wholes(things),
+    )
+
+
+def rooms(seed: int) -> tuple[Gaussians, LanguageField]:
+    """Small things in a row on a large wall; things are nearly alike, the wall and the floor are not."""
+    rng = np.random.default_rng(seed)
+    x, y = np.divmod(np.arange(SIDE * SIDE), SIDE)
+    things = np.where(y < 12, 8, 9)
+    on = (y > 8) & (y < 16)
+    things[on] = x[on] * THINGS // SIDE
+    alike = unit(rng.normal(size=32))
+    small = unit(alike + 0.06 * rng.normal(size=(THINGS, 32)))
+    large = unit(rng.normal(size=(2, 32)))
+    return sheet(), field_of(things, np.concatenate([small, large]).astype(np.float32))
+
+
+def least_between_neighbours(colours: Array) -> float:
+    return float(np.linalg.norm(np.diff(colours[:THINGS], axis=0), axis=1).min())
+
+
+def test_neighbours_differ_more_than_by_the_axes_of_everything():
+    for seed in range(5):
+        gaussians, field = rooms(seed)
+        found = contrasting_colours(field, field.tree, build_surface(gaussians))
+        assert found.shape == (THINGS + 2, 3)
+        assert 0 <= found.min() < found.max() <= 1
+        assert least_between_neighbours(found) > 1.5 * least_between_neighbours(field.codec.palette)
+
+
+def test_scenes_without_neighbours_have_no_colours():
+    vectors = unit(np.random.default_rng(0).normal(size=(3, 32))).astype(np.float32)
+    for thing in (NO_NODE, 0):
+        field = field_of(np.full(SIDE * SIDE, thing), vectors)
+        assert contrasting_colours(field, field.tree, build_surface(sheet())) is None
