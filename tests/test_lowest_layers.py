@@ -418,7 +418,14 @@ def test_python_callers_are_refused_alike(tmp_path: Path) -> None:
 WORDS = ("train", "photographs", "--out", "s.ply")
 
 
-def trained(*words: str) -> Train:
+PAGE = Path(__file__).parents[1] / "docs" / "photographs.md"
+
+
+def trained(*words: str, file: Path | None = None, text: str = "") -> Train:
+    """Return what is asked for, with a file that holds `text`."""
+    if file is not None:
+        file.write_text(text)
+        words = (*words, "--config", str(file))
     found = parse([*WORDS, *words])
     assert isinstance(found, Train)
     assert str(found.dataset) == "photographs"
@@ -437,3 +444,47 @@ def test_options_beside_a_preset_win() -> None:
     assert (found.preset, found.config.radiance.steps) == ("good", 8)
     assert (found.config.dataset.max_side, found.config.radiance.max_gaussians) == (480, 60_000)
     assert found.config.phrases == ("red mug", "keyboard")
+
+
+def test_the_example_of_the_docs_is_read(tmp_path: Path) -> None:
+    (example,) = PAGE.read_text().split("```toml\n")[1:]
+    found = trained(file=tmp_path / "train.toml", text="\ufeff" + example.partition("```")[0])
+    config = found.config
+    assert (found.preset, config.radiance.max_gaussians) == ("good", 60_000)  # the preset's
+    assert (config.radiance.steps, config.clip.model) == (3000, "demo")
+    assert (config.codec.max_relevancy_error, config.phrases) == (0.002, ("red mug", "keyboard"))
+
+
+def test_options_beside_a_file_win(tmp_path: Path) -> None:
+    file, text = tmp_path / "f.toml", 'preset = "quick"\nradiance.steps = 7\nphrases = ["a", "b"]'
+    assert trained(file=file, text=text).config.radiance.steps == 7
+    other = trained("--radiance.steps=8", "--preset", "good", "--phrases", "c", file=file, text=text)
+    assert (other.preset, other.config.radiance.steps, other.config.phrases) == ("good", 8, ("c",))
+    flags = "[dataset]\nallow_few_cameras = true"
+    assert trained(file=file, text=flags).config.dataset.allow_few_cameras
+    other = trained("--dataset.no-allow-few-cameras", file=file, text=flags)
+    assert not other.config.dataset.allow_few_cameras
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[radiance]\nstepz = 7", "--radiance.stepz"),
+        ("[radiance]\nsteps = 'many'", "--radiance.steps: invalid literal"),
+        ("[radiance]\nsteps = 0", "--radiance.steps 0: must be 1 to"),
+        ("phrases = ['--out', 'x']", "phrases"),
+        ("config = 'other.toml'", "config"),
+        ("steps = ", "Invalid value"),
+        ("\x01", "cannot be used as --config"),
+        (None, "no such file"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_named_with_its_key(
+    text: str | None, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "train.toml"
+    if text is not None:
+        file.write_text(text)
+    line = refusal(capsys, *WORDS, "--config", file)
+    assert line.startswith(f"langsplat: {file}: ")
+    assert said in line

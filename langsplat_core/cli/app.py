@@ -30,7 +30,8 @@ CORE: Mapping[str, str] = MappingProxyType({
 def parse(args: list[str]) -> Runnable:
     """Return the command that the words of a command line name.
 
-    Raises SystemExit as tyro does, with its message on stderr; InputError for a command that does not exist.
+    Raises SystemExit as tyro does, with its message on stderr; InputError for a command that does not exist,
+    and for an unusable `--config`.
     """
     before = list(takewhile(FLAGS.__contains__, args))
     args = args[len(before) :]
@@ -38,8 +39,9 @@ def parse(args: list[str]) -> Runnable:
     commands: dict[str, Any]
     groups, name = registry.references("groups"), args[0] if args else ""
     if name == "train":
-        from langsplat_core.cli.train import train_command
+        from langsplat_core.cli.train import train_command, with_file
 
+        args = with_file(args)
         commands = {name: train_command(args)}
     elif name in command_names():
         commands = {name: with_codec(load_command(name), args)}

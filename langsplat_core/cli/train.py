@@ -1,21 +1,28 @@
 """`langsplat train`: photographs -> scene.ply with a language field."""
 
-from collections.abc import Sequence
+import contextlib
+import io
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
 from langsplat_core.cli.arguments import OutFile, OutFolder, codec_settings, named
+from langsplat_core.cli.run import one_line
 from langsplat_core.config import (
     PAPER,
     TrainConfig,
     TrainPreset,
     TrainProfile,
+    check_settings,
     with_preset,
 )
+from langsplat_core.errors import InputError
+from langsplat_core.io.hostile import read_text
 from langsplat_core.progress import LineProgress, TerminalProgress, silent
 
 
@@ -41,6 +48,8 @@ class Train:
     progress: Literal["bars", "lines"] = "bars"
     """How progress is shown: as bars, or for other programs as lines of JSON (stage, fraction, note,
     metrics), both on standard error."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
+    """A file of options, `preset = "good"` or `radiance.steps = 7000`; options beside it count more."""
     gaussians: Path | None = None
     """Take the Gaussians of this scene, trained elsewhere from the same cameras, and describe them."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
@@ -102,3 +111,41 @@ def train_command(args: Sequence[str]) -> type[Train]:
 
     ProfiledTrain.__doc__ = Train.__doc__
     return ProfiledTrain
+
+
+def with_file(args: Sequence[str]) -> list[str]:
+    """Return the words of `langsplat train ...` with those of the file that --config names before all others.
+
+    So options beside it win. Raises InputError that names file and key for what is no option, or not of its
+    kind.
+    """
+    name = named(args, "--config")
+    if not name:
+        return list(args)
+    text, complaint = read_text(Path(name)), io.StringIO()
+    try:
+        words = list(_words(tomllib.loads(text)))
+        alone = ["photographs", *words, "--out=s.ply"]  # first, so that the file is blamed for what is in it
+        with contextlib.redirect_stderr(complaint):
+            check_settings(tyro.cli(train_command(words), prog=name, args=alone, add_help=False))
+    except SystemExit:
+        raise InputError(f"{name}: {one_line(complaint.getvalue())}") from None
+    except (ValueError, InputError) as error:  # a TOMLDecodeError is a ValueError
+        raise InputError(f"{name}: cannot be used as --config: {error}") from None
+    return [args[0], *words, "--config", name, *args[1:]]  # an option, so that no list takes the dataset
+
+
+def _words(table: Mapping[str, Any], before: str = "") -> Iterator[str]:
+    """Yield a TOML table as words of a command line; ValueError for what cannot be told from an option."""
+    for key, value in table.items():
+        values = list(map(str, value)) if isinstance(value, list) else []
+        if f"{before}{key}" == "config" or any(text.startswith("-") for text in values):
+            raise ValueError(f"{key}: names another file, or begins with a dash")
+        if isinstance(value, dict):
+            yield from _words(value, f"{before}{key}.")
+        elif isinstance(value, bool):
+            yield f"--{before}{'' if value else 'no-'}{key}"
+        elif isinstance(value, list):
+            yield from (f"--{before}{key}", *values)
+        else:
+            yield f"--{before}{key}={value}"
