@@ -1,7 +1,6 @@
 """Structure from motion and triangulation, in a textured room and in a street, and EXIF focal lengths."""
 
 import logging
-import shutil
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -269,22 +268,6 @@ def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:
     assert camera.focal_length == pytest.approx(35 / np.hypot(36, 24) * np.hypot(60, 90), rel=0.01)
     with Image.open(stage / "images/00002.jpg") as copy:
         assert copy.getexif().get(0x0112, 1) == 1
-
-
-def test_messages_say_why_a_photograph_has_no_camera(tmp_path: Path) -> None:
-    """Black, tiny, alone, and one view taken three times."""
-    (name,) = write_photos(tmp_path, LENS, poses(1))
-    for copy in ("b.png", "c.png"):
-        shutil.copy(tmp_path / name, tmp_path / copy)
-    (tmp_path / name).rename(tmp_path / "a.png")
-    Image.new("RGB", (400, 300)).save(tmp_path / "black.png")
-    Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "tiny.png")
-    with pytest.raises(InputError, match="0 of 5 photographs could be located") as caught:
-        load_capture(tmp_path, CONFIG, tmp_path / "work")
-    message = str(caught.value)
-    assert "from one and the same place, or without enough overlap: a.png" in message
-    assert "the same picture as a.png: b.png, c.png" in message
-    assert "too few features (plain, dark, blurred or tiny): black.png, tiny.png" in message
 
 
 # Structure from motion that has to try several ways, and what is done where it finds too little.

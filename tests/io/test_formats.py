@@ -80,12 +80,6 @@ def patched(content: bytes, at: int, code: str, value: int) -> bytes:
     return bytes(changed)
 
 
-def test_a_real_splat_is_read(real_data):
-    splat = read_splat(real_data / "formats" / "splat" / "minimal.splat")
-    assert splat.valid().all()
-    np.testing.assert_allclose(splat.means, [[-1, 0, -1], [0, 0, -1], [-1, 0, 0], [0, 0, 0]])
-
-
 # ---- .spz ----
 
 # Half a step of each code, and the error of a rotation matrix. From version 3 on: half a step of 9 bits over
@@ -296,13 +290,6 @@ def test_missing_files_of_a_sog_are_named(tmp_path):
     for name in ("a", "b.sog"):
         with pytest.raises(InputError, match=r"quats\.webp"):
             load_gaussians(tmp_path / name)
-
-
-def test_a_real_sog_is_read(real_data):
-    got = load_gaussians(real_data / "gaussians" / "playbot_8k_sog")
-    assert len(got) == 8406
-    assert got.sh_degree == 2
-    assert got.valid().all()
 
 
 def test_a_sog_says_antialiased(tmp_path):

@@ -13,7 +13,6 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import INRIA
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.geometry.mesh import Mesh, close_holes, fuse, surface_depth
 from langsplat_core.extensions.geometry.occupancy import (
@@ -32,7 +31,6 @@ from langsplat_core.extensions.geometry.registration import agreement, merge, qu
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import NO_NODE, Gaussians, Scene, TaughtWord, look_at
 from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.transform import (
@@ -249,16 +247,6 @@ def test_merge_keeps_what_both_scenes_have():
             vectors = both.language.codec.decode(both.language.latents[level, rows])
             expected = one.language.codec.decode(one.language.latents[level])
             np.testing.assert_allclose(vectors, expected, atol=1e-6)
-
-
-def test_an_image_of_both_is_of_both_sets_of_gaussians():
-    """Harmonics of a lower degree are filled up by zeros."""
-    a, b = scene(0, "mug", degree=0), scene(5, "vase", degree=3)
-    both, camera = merge(a, b).gaussians, random_camera(1)
-    view = ReferenceRasterizer().view(both, camera, INRIA)
-    image, _ = view.splat(colours(both.sh, both.means, camera.position))
-    apart = np.concatenate([colours(g.sh, g.means, camera.position) for g in (a.gaussians, b.gaussians)])
-    np.testing.assert_allclose(image, view.splat(apart)[0], atol=1e-6)
 
 
 def test_a_scene_without_a_field_gets_no_meaning():
