@@ -1,7 +1,10 @@
 """`langsplat serve --mcp`: scenes answer an agent, by the Model Context Protocol over standard streams."""
 
+import asyncio
 import io
-from collections.abc import Callable
+import json
+import os
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -16,8 +19,9 @@ from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import EncoderOption
 from langsplat_core.cli.describe import outline_lines, outline_of
 from langsplat_core.cli.query import Unit, camera_of, unit_of
-from langsplat_core.errors import InputError, LangSplatError
+from langsplat_core.errors import InputError, LangSplatError, printable_line
 from langsplat_core.extensions.library.index import scenes_in
+from langsplat_core.interrupts import end, handled
 from langsplat_core.progress import silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import count_things, run_phrase
@@ -40,6 +44,9 @@ MOST_SIDE = 1024  # px of an image that is sent
 SIZE = (640, 480)  # px of an image towards a thing, where the scene has no cameras
 BACK = 2.2  # half diagonals of a thing's box: how far from it such a camera stands
 
+LONGEST_LINE = 1 << 20  # characters of a message
+NO_JSON, INVALID = -32700, -32600  # codes of JSON-RPC
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -57,7 +64,9 @@ class Serve:
     def run(self) -> None:
         if not self.mcp:
             raise InputError("say how: --mcp is the Model Context Protocol, on standard input and output")
-        build_server(Door(scene_files(self.scene), self.encoder)).run("stdio")
+        server = build_server(Door(scene_files(self.scene), self.encoder))
+        with handled(lambda number, _: end("langsplat", number)):  # there is nothing to keep
+            asyncio.run(_serve(server))
 
 
 def scene_files(place: Path) -> dict[str, Path]:
@@ -203,6 +212,60 @@ def towards(scene: Scene, answer: QueryResult) -> Camera:
     return max(scene.cameras, key=seen)
 
 
+class _Wire:
+    """Standard input and output, a message a line. What is no message is answered here with an error.
+
+    Nobody left to read ends the program. What libraries print goes to standard error.
+    """
+
+    def __init__(self) -> None:
+        self._in = open(os.dup(0), encoding="utf-8", errors="replace")  # noqa: SIM115  as long as the process
+        self._out = open(os.dup(1), "w", encoding="utf-8")  # noqa: SIM115
+        os.dup2(2, 1)
+
+    async def __aiter__(self) -> AsyncIterator[str]:
+        """Yield the lines that are messages."""
+        from mcp_types import jsonrpc_message_adapter
+
+        while line := await asyncio.to_thread(self._in.readline, LONGEST_LINE):
+            code, said = NO_JSON, "not JSON"
+            whole = line.endswith("\n")
+            while not whole and (more := await asyncio.to_thread(self._in.readline, LONGEST_LINE)):
+                line, whole = "", more.endswith("\n")
+            try:
+                json.loads(line or "0")
+                code, said = INVALID, f"no message of the protocol of at most {LONGEST_LINE} characters"
+                jsonrpc_message_adapter.validate_json(line, by_name=False)
+                yield line
+            except (ValueError, RecursionError):
+                answer = {"jsonrpc": "2.0", "id": None, "error": {"code": code, "message": said}}
+                await self.write(json.dumps(answer) + "\n")
+                await self.flush()
+
+    async def write(self, text: str) -> None:
+        """Write lines to the agent."""
+        self._out.write(text)
+
+    async def flush(self) -> None:
+        """Send what was written; where nobody reads, end the program as `| head` does, without a word."""
+        try:
+            await asyncio.to_thread(self._out.flush)
+        except BrokenPipeError:
+            os._exit(0)
+        except OSError as error:
+            os.write(2, f"langsplat: standard output cannot be written ({error.strerror})\n".encode())
+            os._exit(2)
+
+
+async def _serve(server: "MCPServer[Any]") -> None:
+    from mcp.server.stdio import stdio_server
+
+    wire: Any = _Wire()
+    core = server._lowlevel_server  # noqa: SLF001  as the SDK's own `run_stdio_async` does
+    async with stdio_server(wire, wire) as (incoming, outgoing):
+        await core.run(incoming, outgoing, core.create_initialization_options())
+
+
 def build_server(door: Door) -> "MCPServer[Any]":
     """Return the door as tools of the protocol.
 
@@ -213,7 +276,14 @@ def build_server(door: Door) -> "MCPServer[Any]":
     from mcp.server.mcpserver.exceptions import ToolError
     from mcp_types import ToolAnnotations
 
-    server: MCPServer[Any] = MCPServer("langsplat", instructions=INSTRUCTIONS, log_level="ERROR")
+    class Server(MCPServer[Any]):
+        async def call_tool(self, *args: Any, **kwargs: Any) -> Any:
+            try:
+                return await super().call_tool(*args, **kwargs)
+            except ToolError as error:  # of wrong types the SDK says several lines
+                raise ToolError(printable_line(error, 300)) from None
+
+    server = Server("langsplat", instructions=INSTRUCTIONS, log_level="CRITICAL")
     turn = Lock()
 
     def guarded(ask: Callable[P, T]) -> Callable[P, T]:

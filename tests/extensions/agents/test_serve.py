@@ -5,7 +5,11 @@ import base64
 import io
 import json
 import os
+import signal
+import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,3 +98,109 @@ def test_a_client_asks_over_standard_input_and_output(folder):
     assert refused.is_error
     assert "names nothing to look for" in refused.content[0].text
     assert before == {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
+
+
+# The wire itself, by hand: what clients of other makers may send.
+
+BEGIN = (
+    {"id": 0, "method": "initialize", "params": {"protocolVersion": "2024-11-05", "capabilities": {},
+     "clientInfo": {"name": "test", "version": "1"}}},
+    {"method": "notifications/initialized"},
+)  # fmt: skip
+MALFORMED = ["not json", "[]", "{}", "[" * 200_000, "9" * 5000, '{"id": 1', "\0", "\u2028x", " " * 2_000_000]
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A server that has begun to talk."""
+    pytest.importorskip("mcp")
+    words = [sys.executable, "-m", "langsplat_core", "serve", "--mcp", str(folder / "a.ply")]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe) as server:
+        try:
+            send(server, *BEGIN)
+            assert "result" in json.loads(server.stdout.readline())
+            yield server
+        finally:
+            server.kill()
+
+
+def send(server: subprocess.Popen[bytes], *messages: dict[str, object]) -> None:
+    for message in messages:
+        server.stdin.write(json.dumps({"jsonrpc": "2.0"} | message).encode() + b"\n")
+    server.stdin.flush()
+
+
+def call(number: int, tool: str, **arguments: object) -> dict[str, object]:
+    return {"id": number, "method": "tools/call", "params": {"name": tool, "arguments": arguments}}
+
+
+@pytest.mark.long
+def test_malformed_lines_and_wrong_types_are_answered_in_a_line(folder):
+    wrong = [{"phrase": 5}, {"phrase": ["mug"]}, {}, {"phrase": "mug", "scene": 7}, {"phrase": None}]
+    with serving(folder) as server:
+        for line in MALFORMED:
+            server.stdin.write(line.encode() + b"\n")
+            server.stdin.flush()
+            assert json.loads(server.stdout.readline())["error"]["code"] in (-32700, -32600)
+        for number, arguments in enumerate(wrong, 1):
+            send(server, call(number, "find", **arguments))
+            result = json.loads(server.stdout.readline())["result"]
+            assert result["isError"]
+            assert result["content"][0]["text"].isprintable()
+        server.stdin.close()
+        assert server.wait(60) == 0
+        assert server.stderr.read() == b""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_ends_the_server_in_a_line(folder, number, code):
+    with serving(folder) as server:
+        server.send_signal(number)
+        assert server.wait(20) == code
+        assert server.stderr.read().count(b"\n") == 1
+
+
+@pytest.mark.long
+def test_a_closed_output_ends_the_server_without_a_word(folder):
+    with serving(folder) as server:
+        server.stdout.close()
+        send(server, call(1, "scenes"))
+        assert server.wait(20) == 0
+        assert server.stderr.read() == b""
+
+
+@pytest.mark.slow
+def test_two_thousand_calls_are_all_answered(folder, request):
+    rng = np.random.default_rng(request.config.getoption("--seed") or 0)
+    texts = [
+        "mug",
+        "red mug",
+        "the",
+        "",
+        "book on the table",
+        "mug of mug of mug",
+        "\ud800",
+        "x" * 3000,
+        "not",
+    ]
+    numbers = [0, 1, -1, 10**30, 1.5, "2", None, True, float("nan"), float("inf")]
+    tools = [("find", "phrase"), ("count", "phrase"), ("look", "phrase"), ("distance", "first")]
+    memory = []
+    with serving(folder) as server:
+        for number in range(2000):
+            tool, name = tools[int(rng.integers(len(tools)))]
+            given: dict[str, object] = {name: texts[int(rng.integers(len(texts)))]}
+            if tool == "distance":
+                given["second"] = texts[int(rng.integers(len(texts)))]
+            if rng.random() < 0.3:
+                given["camera" if tool == "look" else "scene"] = numbers[int(rng.integers(len(numbers)))]
+            send(server, call(number, tool, **given))
+            answer = json.loads(server.stdout.readline())
+            assert answer["id"] == number
+            memory.append(Path(f"/proc/{server.pid}/statm").read_text().split()[1])
+        server.stdin.close()
+        assert server.wait(60) == 0
+        assert server.stderr.read() == b""
+    assert int(memory[-1]) < int(memory[500]) + 30_000_000 // os.sysconf("SC_PAGE_SIZE")
