@@ -16,6 +16,8 @@ from langsplat_core.io.files import shown
 from langsplat_core.io.hostile import MOST_PIXELS, open_for_reading
 from langsplat_core.progress import Progress, silent
 
+# The content chooses the demuxer: of text it may be one that asks the network, or reads other files.
+ALLOWED = {"format_whitelist": "mov,matroska,avi,mpegts", "protocol_whitelist": "file"}
 FEWEST = 3  # images, of which cameras can be found
 
 
@@ -46,7 +48,7 @@ def extract_frames(video: Path, out: Path, count: int, progress: Progress = sile
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
     try:
-        with open_for_reading(video)[0] as file, av.open(file, "r") as container:
+        with open_for_reading(video)[0] as file, av.open(file, "r", options=dict(ALLOWED)) as container:
             written = _write(container, unfinished, count, progress)
         if written < FEWEST:
             raise InputError(f"{shown(video)}: has {written} images; at least {FEWEST} are needed")
@@ -59,6 +61,8 @@ def extract_frames(video: Path, out: Path, count: int, progress: Progress = sile
         if plain and getattr(error, "errno", 0) != errno.EINVAL:
             raise  # of the disk
         reason = printable_line(getattr(error, "strerror", None) or error, 80)
+        if getattr(error, "errno", 0) == errno.EINVAL:
+            reason = "damaged, or neither MP4, MOV, MKV, WebM, AVI nor TS"
         raise FormatError(f"{shown(video)}: not a readable video ({reason}); copy it again") from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)

@@ -308,7 +308,24 @@ def test_damaged_videos_end_in_a_line_or_give_what_can_be_read(clip: Path, tmp_p
     assert read > 0
 
 
-@pytest.mark.parametrize("content", [b"", b"no video at all" * 50])
+@pytest.mark.parametrize("suffix", [".mov", ".mkv", ".avi", ".ts"])
+def test_containers_of_videos_are_read(suffix: str, tmp_path: Path) -> None:
+    video = write_video(tmp_path / f"a{suffix}", [scene(k) for k in range(12)])
+    assert len(extract_frames(video, tmp_path / "out", 4)) == 4
+
+
+STREAM = b"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 5004 RTP/AVP 96\n"
+STREAM += b"a=rtpmap:96 H264/90000\n"
+PLAYLIST = b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nclip.mp4\n#EXT-X-ENDLIST\n"
+TEXTS = [
+    STREAM,
+    PLAYLIST,
+    b"ffconcat version 1.0\nfile clip.mp4\n",
+    b"YUV4MPEG2 W8 H8 F25:1\n" + b"FRAME\n" * 9,
+]
+
+
+@pytest.mark.parametrize("content", [b"", b"no video at all" * 50, *TEXTS])
 def test_other_files_are_no_videos(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(content)
     with pytest.raises(FormatError, match=r"a\.mp4: not a readable video \([^\[:]+\); copy it again"):
