@@ -16,7 +16,7 @@ from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.rule import (
     RULE,
     Bars,
-    Outcome,
+    Judged,
     RegionTable,
     Verdict,
     decide,
@@ -32,7 +32,7 @@ AnswerRule = Literal["regions", "peak"]  # by `rule.decide`, or as published
 
 
 @dataclass(frozen=True, eq=False)
-class QueryResult:
+class QueryResult(Judged):
     """The answer to one phrase."""
 
     phrase: str
@@ -47,21 +47,6 @@ class QueryResult:
     place: Array | None  # (3,) world units
     box: Array | None  # (2, 3) corners, world units
     own_cut: float | None = None  # relevancy from which on everything is a member, where it was set by hand
-
-    @property
-    def found(self) -> bool:
-        """True if what was asked for is there."""
-        return self.judgement.found
-
-    @property
-    def verdict(self) -> Outcome:
-        """The verdict in words."""
-        return self.judgement.outcome
-
-    @property
-    def probability(self) -> float | None:
-        """The probability that it is there at all; None where nothing is calibrated."""
-        return self.judgement.probability
 
     @property
     def cut(self) -> float:

@@ -201,6 +201,27 @@ class Verdict:
         return Verdict(False, self.reached, -np.inf, None if self.probability is None else 0.0)
 
 
+class Judged:
+    """An answer that has a verdict, under `judgement`."""
+
+    judgement: Verdict
+
+    @property
+    def found(self) -> bool:
+        """True if what was asked for is there."""
+        return self.judgement.found
+
+    @property
+    def verdict(self) -> Outcome:
+        """The verdict in words."""
+        return self.judgement.outcome
+
+    @property
+    def probability(self) -> float | None:
+        """The probability that it is there at all; None where nothing is calibrated."""
+        return self.judgement.probability
+
+
 def combined(verdicts: Sequence[Verdict], all_needed: bool) -> Verdict:
     """Return the verdict on several things: the weakest where all are needed, else the strongest."""
     score = min if all_needed else max

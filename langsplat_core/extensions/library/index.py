@@ -43,6 +43,7 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors
 from langsplat_core.query.grammar import heads, named, parse
 from langsplat_core.query.rule import (
     Bars,
+    Judged,
     Outcome,
     RegionTable,
     Verdict,
@@ -462,7 +463,7 @@ def _region_means(
 
 
 @dataclass(frozen=True, eq=False)
-class Hit:
+class Hit(Judged):
     """The answer of one scene to a phrase."""
 
     path: Path
@@ -473,19 +474,9 @@ class Hit:
     picture: Array | None = None  # (H, W, 3) uint8, the answer as a heat map
 
     @property
-    def verdict(self) -> Outcome:
-        """The verdict in words."""
-        return self.judgement.outcome
-
-    @property
     def margin(self) -> float:
         """How certain the answer is, 0 where it begins to count as found, see `Verdict`."""
         return self.judgement.margin
-
-    @property
-    def probability(self) -> float | None:
-        """The probability that it is there at all; None where nothing is calibrated."""
-        return self.judgement.probability
 
 
 @dataclass(frozen=True, eq=False)
