@@ -235,6 +235,8 @@ def test_merge_keeps_what_both_scenes_have():
     a, b = scene(0, "mug"), scene(5, "vase", degree=3)
     both = merge(a, b)
     assert len(both.gaussians) == 2 * N
+    filled = np.pad(a.gaussians.sh, ((0, 0), (0, 12), (0, 0)))  # harmonics of a lower degree are zero beyond
+    np.testing.assert_array_equal(both.gaussians.sh, np.concatenate([filled, b.gaussians.sh]))
     assert len(both.cameras) == 4
     assert [word.name for word in both.language.taught] == ["mug", "vase"]
     assert list(both.language.phrasebook) == ["red vase", "red mug"]
