@@ -6,7 +6,8 @@ Core functions take a `Progress`; the command line and the window supply one eac
 import json
 import logging
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 log = logging.getLogger("langsplat")
@@ -23,7 +24,7 @@ class Report:
 
     @classmethod
     def from_json(cls, line: str) -> "Report":
-        """Return the report in a line of `LineProgress`; ValueError for any other line."""
+        """Return the report in a line of `line_progress`; ValueError for any other line."""
         try:
             stated = json.loads(line)
             metrics = {str(name): float(value) for name, value in stated.get("metrics", {}).items()}
@@ -75,30 +76,25 @@ class WorkCancelledError(Exception):
     """Raised by a `Progress` to stop the work; what was stored so far stays valid."""
 
 
-class LineProgress:
-    """Progress for other programs, a context manager: a line of JSON on stderr for every new report.
+@contextmanager
+def line_progress() -> Iterator[Progress]:
+    """Show progress to other programs: a line of JSON on stderr for every new report.
 
     ``{"stage": "training", "fraction": 0.2, "note": "step 9", "metrics": {"loss": 0.03}}``
     """
+    last = ""
 
-    def __init__(self) -> None:
-        self._last = ""
-
-    def __enter__(self) -> Progress:
-        return Progress(self._show)
-
-    def __exit__(self, *ending: object) -> None:
-        pass
-
-    def _show(self, report: Report) -> None:
+    def show(report: Report) -> None:
+        nonlocal last
         metrics = {name: float(f"{value:.4g}") for name, value in report.metrics.items()}
         fraction = round(min(max(report.fraction, 0.0), 1.0), 3)
-        line = json.dumps(
-            {"stage": report.stage, "fraction": fraction, "note": report.note, "metrics": metrics}
-        )
-        if line != self._last and not is_quiet():
-            self._last = line
+        stated = {"stage": report.stage, "fraction": fraction, "note": report.note, "metrics": metrics}
+        line = json.dumps(stated)
+        if line != last and not is_quiet():
+            last = line
             print(line, file=sys.stderr, flush=True)
+
+    yield Progress(show)
 
 
 class TerminalProgress:

@@ -63,19 +63,12 @@ def check_arguments(command: object) -> None:
     check_settings(command)
     for option, value, hint in named_values(command):
         for text in value if isinstance(value, tuple) else (value,):
-            if isinstance(text, str):
-                _check_text(option, text)
+            if isinstance(text, str) and text != text.encode("utf-8", "ignore").decode():
+                plain = text[:40].encode("utf-8", "backslashreplace").decode()
+                raise InputError(f"{option} {plain}: is not UTF-8; use a terminal that is set to UTF-8")
         written = next((part for part in annotations(hint) if isinstance(part, OutputPath)), None)
         if written is not None and value is not None:
             (check_output_file if written.kind == "file" else check_output_folder)(value)
-
-
-def _check_text(option: str, text: str) -> None:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        plain = text[:40].encode("utf-8", "backslashreplace").decode()
-        raise InputError(f"{option} {plain}: is not UTF-8; use a terminal that is set to UTF-8") from None
 
 
 def named(args: Sequence[str], option: str) -> str:

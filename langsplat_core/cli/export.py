@@ -68,12 +68,8 @@ class Export:
                 engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
             title = self.title or self.out.stem
             report = write_page(self.out, scene, engine, title, progress)
-        if report.why_not:
-            asked = f"nothing can be searched: {report.why_not}"
-        elif report.free_text:
-            asked = "any words of the scene's encoder can be searched"
-        else:
-            asked = f"{report.phrases:,} phrases can be searched"
+        what = "any words of the scene's encoder" if report.free_text else f"{report.phrases:,} phrases"
+        asked = f"nothing can be searched: {report.why_not}" if report.why_not else f"{what} can be searched"
         print(f"{self.out}: {report.gaussians:,} Gaussians, {report.bytes / 1e6:.2f} MB; {asked}")
 
 
@@ -241,7 +237,6 @@ class Crop:
 
 
 def _extent(scene: Scene) -> str:
-    """Return the extent of a scene's Gaussians, in words."""
     means = scene.gaussians.means[np.isfinite(scene.gaussians.means).all(1)]
     if not len(means):
         return "the scene holds none that lies anywhere"

@@ -31,7 +31,6 @@ from langsplat_core.interrupts import SAID, Terminated, raised
 from langsplat_core.io.files import NO_ROOM, shown
 
 log = logging.getLogger("langsplat")
-COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 _CONTINUES = "; the same command continues where it stopped"
 _ROOM = "make room, or choose another place; what was finished is kept"
@@ -82,7 +81,7 @@ def parsed(program: str, kind: Any, args: Sequence[str], description: str | None
     Sets how much is said; -v and -q may stand anywhere. SystemExit as tyro raises it, with help and
     completion scripts on stdout and complaints on stderr. InputError for completion of an unknown shell.
     """
-    if args and args[0] in COMPLETION and args[1:2] and args[1] not in SHELLS:
+    if len(args) > 1 and args[0].startswith("--tyro-") and args[1] not in SHELLS:
         raise InputError(f"{args[0]} {args[1]}: there is {', '.join(SHELLS)}")
     line = make_dataclass(
         "Line",

@@ -11,13 +11,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from rich.table import Table
-from rich.text import Text
-
 from langsplat_core import __version__
 from langsplat_core.cli.arguments import AnyScene, OutFolder
-from langsplat_core.cli.run import OutputConsole, print_json
-from langsplat_core.errors import EXTRAS, BackendError, LangSplatError, remedy
+from langsplat_core.cli.run import print_json
+from langsplat_core.errors import EXTRAS, BackendError, LangSplatError, printable_line, remedy
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.summary import SceneSummary, disk_bytes, summarise
 from langsplat_core.query.engine import QueryEngine
@@ -44,14 +41,11 @@ class Inspect:
             said = {"scene": str(self.scene), "disk_bytes": size, "unread": scene.unread, **asdict(summary)}
             print_json(said)
             return
-        table = Table.grid(padding=(0, 2))
-        for name, value in [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(summary)]:
-            table.add_row(name, Text(value))
+        lines = [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(summary)]
         if scene.language is not None:
-            table.add_row("answers", Text(QueryEngine(scene).basis.long))
-        for reason in scene.unread:
-            table.add_row("not read", Text(reason))
-        OutputConsole().print(table)
+            lines.append(("answers", QueryEngine(scene).basis.long))
+        for name, value in [*lines, *(("not read", reason) for reason in scene.unread)]:
+            print(f"{name:<16}  {printable_line(value)}")
 
 
 def _lines(a: SceneSummary) -> list[tuple[str, str]]:
@@ -75,6 +69,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
     if field is None:
         return [*lines, ("language field", "none")]
     observed = ", ".join(f"{name} {100 * share:.1f} %" for name, share in field.observed.items())
+    nodes = "none" if field.nodes is None else f"{', '.join(map(str, field.nodes))} nodes at the levels"
     return [
         *lines,
         ("language field", f"codec {field.codec} of {field.size}; {field.bytes / 1e6:.2f} MB in memory"),
@@ -82,10 +77,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
         ("phrasebook", f"{field.phrases} phrases"),
         ("taught words", ", ".join(field.taught) or "none"),
         ("observed", observed),
-        (
-            "tree",
-            "none" if field.nodes is None else f"{', '.join(map(str, field.nodes))} nodes at the levels",
-        ),
+        ("tree", nodes),
     ]
 
 

@@ -4,7 +4,7 @@ import contextlib
 import io
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -23,7 +23,7 @@ from langsplat_core.config import (
 )
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import read_text
-from langsplat_core.progress import LineProgress, TerminalProgress, silent
+from langsplat_core.progress import Progress, TerminalProgress, line_progress, silent
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class Train:
         from langsplat_core.pipeline.train import train_scene
 
         processes = join_processes()
-        shown = LineProgress() if self.progress == "lines" else TerminalProgress()
+        lines = self.progress == "lines"
+        shown: AbstractContextManager[Progress] = line_progress() if lines else TerminalProgress()
         with shown if processes.is_main else nullcontext(silent) as progress:
             report = train_scene(
                 self.dataset,

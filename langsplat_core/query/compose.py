@@ -40,9 +40,8 @@ from langsplat_core.semantics.relevancy import FLOOR
 
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
 LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
-# Of the peak: what is less is no longer the place. Of a thing's Gaussians: what shares so many with another
-# is the same, and not related to it. Of the way that an answer reaches below its best region: what fits an
-# unwanted name so well is what was meant.
+# Of the peak, where the place ends; of a thing's Gaussians, which two things share that are the same; of the
+# way below its best region, to which an unwanted name reaches.
 HALF = 0.5
 STRICT, WIDE = 0.25, 2.0  # of that way: the answers that the range of a count is taken from
 SAID_BY_VIEWER = ("left of", "right of", "behind", "in front of", "leftmost", "rightmost")

@@ -173,11 +173,11 @@ REPORTS = """
 import logging, sys
 from dataclasses import dataclass
 from langsplat_core.cli.run import main, parsed
-from langsplat_core.progress import LineProgress, TerminalProgress
+from langsplat_core.progress import line_progress, TerminalProgress
 @dataclass(frozen=True)
 class Reports:
     def run(self):
-        for progress in (LineProgress(), TerminalProgress()):
+        for progress in (line_progress(), TerminalProgress()):
             with progress as report:
                 report("working", 0.5)
         logging.getLogger("langsplat").warning("a warning")
