@@ -165,7 +165,7 @@ def chosen_camera(choice: str, scene: Scene | None = None) -> Camera | None:
         cameras = read_cameras(Path(choice))
         if not cameras:
             raise InputError(f"--camera {choice}: the file holds no camera")
-        return cameras[0]
+        return cameras[0] if scene is None else cameras[0].moved(-scene.origin)
     cameras = () if scene is None else scene.cameras
     if not cameras:
         raise InputError(f"--camera {choice}: the scene has no training cameras; name a camera file instead")

@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+from langsplat_core.arrays import Array
 from langsplat_core.cli.run import main, parsed
 from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.errors import InputError
@@ -19,7 +20,7 @@ from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.scene import LEVELS, NO_ORIGIN, Camera, Scene
 from langsplat_core.scene.language import split_phrases
 from langsplat_viewer import output
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera, spanning
@@ -139,7 +140,7 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
         say_compiling(progress)
     if options.is_film:
         extent = extent_of(scene)
-        motion: Motion | None = flight
+        motion: Motion | None = None if flight is None else flight.moved(-scene.origin)
         if options.turntable is not None:
             motion = turntable(from_camera(camera, extent), options.turntable)
         assert motion is not None
@@ -155,7 +156,7 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
         if SUFFIX in reason:  # of the cameras it was said when they were read
             log.warning("opened without its language field: %s", reason)
     basis = [f"answers: {engine.basis.long}"] if results else []
-    return [*lines, *map(answer_line, results), *basis]
+    return [*lines, *(answer_line(result, scene.origin) for result in results), *basis]
 
 
 def _first_camera(scene: Scene, options: ViewerOptions) -> Camera:
@@ -182,9 +183,9 @@ def _answers(
     return tuple(run_phrase(engine, phrase, options.level, camera, progress).answer for phrase in phrases)
 
 
-def answer_line(result: QueryResult) -> str:
-    """Return the answer as a line for people and for scripts."""
-    shown = None if result.verdict == "not here" else result.place
+def answer_line(result: QueryResult, origin: Array = NO_ORIGIN) -> str:
+    """Return the answer as a line for people and for scripts, its place in the world."""
+    shown = None if result.verdict == "not here" or result.place is None else origin + result.place
     place = "none" if shown is None else "({})".format(", ".join(f"{v:.3f}" for v in shown))
     verdict: str = result.verdict
     if result.probability is not None:

@@ -36,6 +36,7 @@ from langsplat_viewer.session import (
     SLOTS,
     Bits,
     Bookmark,
+    Point,
     Preferences,
     Session,
 )
@@ -109,7 +110,7 @@ def _write(path: Path, content: object) -> None:
 
 # Poses, in paths and bookmarks flat beside what else an entry has:
 #
-# {"position": [x, y, z],      world units
+# {"position": [x, y, z],      in the world; in projects relative to their origin
 #  "rotation": [[...], ...],   camera to world, three rows; OpenCV axes, as in cameras.json
 #  "fov_degrees": 50.0,        across the image's shorter side
 #  "span": 4.0}                world units across it; where it is, there is no perspective
@@ -243,6 +244,7 @@ class Shelf:
 # {"format": "langsplat-project", "version": 2,
 #  "scene": "room.ply",     from the project's folder, or absolute
 #  "gaussians": 81288,      that it has; of another number marks, moves and names are not taken
+#  "origin": [x, y, z],     of the scene, to which all places are relative; absent: zero
 #  "view": {...},           as a bookmark, and "intrinsics"
 #  "panels": ["Search"],    that are open
 #  "session": {...}}        the fields of `Session`. Masks are a bit for each Gaussian, zlib, base64
@@ -262,6 +264,7 @@ class Project(msgspec.Struct, omit_defaults=True):
     session: Session
     intrinsics: Intrinsics | None = None  # of the view, where the field of view does not say all
     panels: Annotated[tuple[str, ...], Meta(max_length=100)] = ()
+    origin: Point = (0.0, 0.0, 0.0)
     version: int = VERSION
     left_out: tuple[str, ...] = ()  # of a project of an earlier version, a line each
 

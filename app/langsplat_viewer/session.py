@@ -19,7 +19,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap, LevelChoice, PictureConfig
 from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES
 from langsplat_core.scene import FARTHEST, LEVELS, Scene
-from langsplat_core.scene.transform import Similarity, transform_scene
+from langsplat_core.scene.transform import Similarity, between_worlds, transform_scene
 from langsplat_viewer.camera.flight import Keyframe, Pose
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.rendering.request import Clip, Splats, Split, widget
@@ -175,6 +175,10 @@ class Bookmark:
     pose: Pose
     distance: Annotated[float, Meta(gt=0, le=FARTHEST)]  # to what it turns around, world units
 
+    def moved(self, offset: Array) -> "Bookmark":
+        """Return the view moved by `offset` (3,)."""
+        return replace(self, pose=self.pose.moved(offset))
+
 
 @dataclass(frozen=True)
 class Session:
@@ -203,6 +207,24 @@ class Session:
     keyframes: Annotated[tuple[Keyframe, ...], Meta(max_length=10_000)] = ()  # of the camera path, by time
     bookmarks: Annotated[tuple[Bookmark, ...], Meta(max_length=MOST_BOOKMARKS)] = ()
     ruler: Ruler = field(default_factory=Ruler)
+
+    def moved(self, offset: Array) -> "Session":
+        """Return the session of the same scene about an origin that lies `offset` (3,) lower."""
+        if not offset.any():
+            return self
+
+        def point(at: Point) -> Point:
+            x, y, z = np.add(at, offset).tolist()
+            return x, y, z
+
+        return replace(
+            self,
+            moves=tuple(replace(move, to=between_worlds(move.to, offset, offset)) for move in self.moves),
+            notes=tuple(replace(note, at=point(note.at)) for note in self.notes),
+            keyframes=tuple(key.moved(offset) for key in self.keyframes),
+            bookmarks=tuple(bookmark.moved(offset) for bookmark in self.bookmarks),
+            ruler=replace(self.ruler, points=tuple(map(point, self.ruler.points))),
+        )
 
     def query(self, phrase: str) -> Query | None:
         """Return the query of a phrase, None where it is not listed."""

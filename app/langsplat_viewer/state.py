@@ -15,7 +15,7 @@ from langsplat_core.query.answers import QueryResult, recut
 from langsplat_core.query.describe import Pointed
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.inventory import Outline, Suggestions
-from langsplat_core.scene import Camera, Scene
+from langsplat_core.scene import NO_ORIGIN, Camera, Scene
 from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
@@ -197,6 +197,7 @@ class SceneState:
     saved: Session = field(default_factory=Session)  # as a project or an exported scene last had it
     project: Path | None = None  # the file that it is saved to again
     count: int = 0  # Gaussians
+    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) of the scene
 
     scene: Scene | None = None
     path: Path | None = None
@@ -224,8 +225,8 @@ class SceneState:
     _edited: EditedScene | None = None  # of the last request
 
     def visit(self) -> "SceneState":
-        """Return what is kept of a scene that is left, to be found again: no arrays."""
-        names = ("session", "saved", "project", "count", "view", "opening_camera", "camera_index")
+        """Return what is kept of a scene that is left, to be found again: no large arrays."""
+        names = ("session", "saved", "project", "count", "origin", "view", "opening_camera", "camera_index")
         return SceneState(**{name: getattr(self, name) for name in names})
 
     @property

@@ -15,7 +15,9 @@ import pytest
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import LangSplatError
-from langsplat_core.scene.transform import moving
+from langsplat_core.io.cameras import read_cameras
+from langsplat_core.scene.transform import moving, place_scene
+from langsplat_viewer import options
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.camera.controls import orbit
@@ -280,6 +282,28 @@ def test_project_restores_the_whole_session(opened, saved, again):
     act(opening.open_file, again, saved)
     assert len(after.session.queries) == 4
     assert saving.save_project(again, Path("/nowhere")) == saved  # where it came from
+
+
+def test_places_in_files_are_in_the_world(opened, saved, again, monkeypatch, tmp_path):
+    """A scene that is read about another origin is shown, noted and filmed where it was."""
+    path, view = saving.save_path(opened, tmp_path), saving.save_view(opened, tmp_path)
+    origin = np.array([2.0, 0.5, -1.0])
+    monkeypatch.setitem(SCENES, "blobs.ply", place_scene(SCENES["blobs.ply"], origin=origin))
+    act(opening.open_project, again, saved)
+    before, after = opened.state, again.state
+    np.testing.assert_array_equal(after.origin, origin)
+    np.testing.assert_allclose(after.view.eye + origin, before.view.eye, atol=1e-9)
+    np.testing.assert_allclose(after.scene.gaussians.means + origin, before.scene.gaussians.means, atol=1e-5)
+    (note,), (was,) = after.session.notes, before.session.notes
+    np.testing.assert_allclose(note.at + origin, was.at, atol=1e-9)
+    viewpoint.load_path(again, path)
+    files = saving.save_path(again, tmp_path), saving.save_view(again, tmp_path)
+    keys = [read_flight(file).keyframes[0].pose.position for file in (path, files[0])]
+    np.testing.assert_allclose(*keys, atol=1e-9)
+    poses = [read_cameras(file)[0].world_to_camera for file in (view, files[1])]
+    np.testing.assert_allclose(*poses, atol=1e-9)
+    camera = options.chosen_camera(str(view), after.scene)
+    np.testing.assert_allclose(camera.position + origin, before.view.eye, atol=1e-9)
 
 
 def test_project_without_scene_or_window_is_refused(saved, opened, run_viewer):

@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from langsplat_core.compiled import is_compiled
 from langsplat_core.datasets.photos import count_photographs
 from langsplat_core.display.displays import DISPLAYS, latent_colours
@@ -96,7 +98,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state, scene, field = viewer.state, opened.scene, opened.scene.language
     if state.path is not None:
         viewer.visits[state.path.absolute()] = state.visit()
-    session = state.session.of_next_scene(viewpoint.read_bookmarks(viewer, path))
+    session = state.session.of_next_scene(viewpoint.read_bookmarks(viewer, path, scene.origin))
     if field is None:
         state.pointing = False
         session = _without_field(session)
@@ -105,6 +107,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
             session=session,
             saved=session,
             count=len(scene.gaussians),
+            origin=scene.origin,
             scene=scene,
             path=path,
             extent=opened.extent,
@@ -164,10 +167,12 @@ def return_to(viewer: Viewer, visit: SceneState) -> None:
     state = viewer.state
     if state.scene is None:
         return
-    state.view, state.opening_camera = visit.view or state.view, visit.opening_camera
+    offset, opening = visit.origin - state.origin, visit.opening_camera  # a file that was changed has another
+    state.view = state.view if visit.view is None else visit.view.moved(offset)
+    state.opening_camera = None if opening is None else opening.moved(offset)
     if visit.camera_index is not None and visit.camera_index < len(state.scene.cameras):
         state.camera_index = visit.camera_index
-    session, saved = visit.session.found_again(now=state.session), visit.saved
+    session, saved = visit.session.moved(offset).found_again(now=state.session), visit.saved.moved(offset)
     state.saved = replace(state.session, things=saved.things, notes=saved.notes)
     state.project = visit.project
     take_session(viewer, session if visit.count == state.count else replace(session, things=Things()))
@@ -356,6 +361,8 @@ def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = la
 def _restore(viewer: Viewer, project: Project, path: Path) -> None:
     state, now, session = viewer.state, viewer.state.session, project.session
     assert state.extent is not None
+    offset = np.array(project.origin) - state.origin
+    session = session.moved(offset)
     session = replace(session, bookmarks=session.bookmarks or now.bookmarks)
     if project.version == 1:  # which had no other settings
         session = replace(session, split=now.split, splats=now.splats, overlays=now.overlays)
@@ -372,7 +379,7 @@ def _restore(viewer: Viewer, project: Project, path: Path) -> None:
     except LangSplatError as error:
         viewer.say_error(f"{path}: its transforms are left out: {one_line(error)}")
         take_session(viewer, replace(session, moves=()))
-    view = viewpoint.bookmarked_view(project.view, state.extent)
+    view = viewpoint.bookmarked_view(project.view.moved(offset), state.extent)
     state.view = view if project.intrinsics is None else replace(view, intrinsics=project.intrinsics)
     state.saved, state.project = state.session, path
     state.preferences = state.preferences.with_recent(path)
@@ -504,7 +511,7 @@ def follow_beside(viewer: Viewer) -> None:
     other.messages, other.size = [], state.size
     if other.scene is None or state.view is None:
         return
-    other.view = state.view
+    other.view = state.view.moved(state.origin - other.origin)
     session = _mirrored(state, other)
     if session != beside.mirrored:
         beside.mirrored = session

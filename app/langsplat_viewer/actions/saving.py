@@ -84,7 +84,7 @@ def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
         viewer.say_error("open a scene first, then save a view of it")
         return None
     path = _new_file(viewer, folder, ".json", "-view")
-    camera = replace(state.view, orthographic=False).camera(*state.size)
+    camera = replace(state.view, orthographic=False).camera(*state.size).moved(state.origin)
     span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
     more = f"; show it again with --camera {path.name}{span}"
     return viewer.save(path, lambda: write_cameras(path, (camera,)), more)
@@ -98,7 +98,9 @@ def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
         return None
     path = _new_file(viewer, folder, PATHS)
     more = "; langsplat-viewer --headless --path makes a film of it"
-    return viewer.save(path, lambda: write_flight(path, flight_of(keyframes)), more)
+    return viewer.save(
+        path, lambda: write_flight(path, flight_of(keyframes).moved(viewer.state.origin)), more
+    )
 
 
 # Films, drawn by the CPU on a thread of their own.
@@ -205,6 +207,7 @@ def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
     project = Project(
         scene=str(state.path.absolute()),
         gaussians=len(state.scene.gaussians),
+        origin=(float(state.origin[0]), float(state.origin[1]), float(state.origin[2])),
         view=Bookmark("view", pose_of(state.view), state.view.distance),
         session=state.session,
         intrinsics=state.view.intrinsics,

@@ -345,7 +345,7 @@ def set_turning(viewer: Viewer, turns: bool) -> None:
 def load_path(viewer: Viewer, path: Path) -> None:
     """Take the path of a file in place of the one that is there."""
     try:
-        found = read_flight(path)
+        found = read_flight(path).moved(-viewer.state.origin)
     except LangSplatError as error:
         viewer.say_error(str(error))
         return
@@ -442,10 +442,10 @@ def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
     _keep(viewer, tuple(other for other in viewer.state.session.bookmarks if other is not bookmark))
 
 
-def read_bookmarks(viewer: Viewer, scene: Path) -> tuple[Bookmark, ...]:
-    """Read the bookmarks of a scene file; where they make no sense, say so."""
+def read_bookmarks(viewer: Viewer, path: Path, origin: Array) -> tuple[Bookmark, ...]:
+    """Read the bookmarks of a scene file with an `origin` (3,); where they make no sense, say so."""
     try:
-        return viewer.shelf.read(scene)
+        return tuple(bookmark.moved(-origin) for bookmark in viewer.shelf.read(path))
     except InputError as error:
         viewer.say_error(str(error))
         return ()
@@ -457,6 +457,6 @@ def _keep(viewer: Viewer, bookmarks: tuple[Bookmark, ...]) -> None:
     if state.path is None:
         return
     try:
-        viewer.shelf.write(state.path, bookmarks)
+        viewer.shelf.write(state.path, tuple(bookmark.moved(state.origin) for bookmark in bookmarks))
     except (OSError, InputError) as error:
         viewer.say_error(f"bookmarks not kept: {one_line(error)}")

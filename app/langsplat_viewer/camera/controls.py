@@ -148,6 +148,10 @@ class OrbitCamera:
     intrinsics: Intrinsics  # of an image that any window shows whole, uncropped
     orthographic: bool = False  # everything has the size that it has at the target
 
+    def moved(self, offset: Array) -> "OrbitCamera":
+        """Return the view moved by `offset` (3,)."""
+        return replace(self, target=self.target + offset) if offset.any() else self
+
     @property
     def eye(self) -> Array:
         """(3,) where the camera stands, world units."""

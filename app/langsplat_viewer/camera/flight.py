@@ -34,6 +34,10 @@ class Pose:
     fov_degrees: float  # across the image's shorter side, within `FOV_LIMITS`
     span: float | None = None  # world units across that side without perspective, > 0; None: in perspective
 
+    def moved(self, offset: Array) -> "Pose":
+        """Return the pose moved by `offset` (3,)."""
+        return replace(self, position=self.position + offset)
+
     def camera(self, width: int, height: int) -> Camera:
         """Return the pinhole camera of an image, its principal point centred; `camera_of` minds `span`."""
         matrix = np.eye(4)
@@ -49,6 +53,10 @@ class Keyframe:
 
     seconds: float  # from the start of the path, 0 to `LONGEST`
     pose: Pose
+
+    def moved(self, offset: Array) -> "Keyframe":
+        """Return the keyframe moved by `offset` (3,)."""
+        return replace(self, pose=self.pose.moved(offset))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +75,10 @@ class Flight:
             raise ValueError("a path needs a keyframe")
         if (np.diff([key.seconds for key in self.keyframes]) <= 0).any():
             raise ValueError("the times of keyframes must rise")
+
+    def moved(self, offset: Array) -> "Flight":
+        """Return the path moved by `offset` (3,)."""
+        return replace(self, keyframes=tuple(key.moved(offset) for key in self.keyframes))
 
     @property
     def seconds(self) -> float:

@@ -12,7 +12,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, Drawing, mapped, painted
 from langsplat_core.query.describe import LevelWords
-from langsplat_core.scene import LEVELS, Camera
+from langsplat_core.scene import LEVELS, NO_ORIGIN, Camera
 from langsplat_viewer.actions import saving, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
@@ -462,7 +462,7 @@ def draw_pointing(viewer: Viewer) -> None:
         imgui.text_colored(ui.muted(), name)
         imgui.same_line(hello_imgui.em_size(4.5))
         imgui.text_unformatted(said(words, sure))
-    for line in pointed_figures(hover):
+    for line in pointed_figures(hover, viewer.state.origin):
         imgui.text_colored(ui.muted(), line)
     imgui.pop_text_wrap_pos()
     imgui.end_tooltip()
@@ -475,13 +475,13 @@ def said(words: LevelWords, sure: bool) -> str:
     return ", ".join(named) if named else "nothing known"
 
 
-def pointed_figures(hover: Hover) -> list[str]:
-    """Return the relevancies of what is shown and the place, a line each."""
+def pointed_figures(hover: Hover, origin: Array = NO_ORIGIN) -> list[str]:
+    """Return the relevancies of what is shown and the place in the world, a line each."""
     assert hover.found is not None
     lines = [
         f"{phrase}: {value:.2f}" for phrase, value in zip(hover.phrases, hover.found.relevancy, strict=True)
     ]
-    x, y, z = hover.found.position
+    x, y, z = origin + hover.found.position
     return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth:.2f} away"]
 
 

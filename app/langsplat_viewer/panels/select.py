@@ -220,7 +220,7 @@ def draw_transform(viewer: Viewer) -> None:
     if ui.button("Apply", "Scale and rotate about the middle of what is transformed, then move"):
         editing.apply_form(viewer)
     imgui.separator()
-    low = _three("From", form.low, "A corner of the box, world units")
+    low = _three("From", form.low, "A corner of the box, world units from the scene's origin")
     high = _three("To", form.high, "The opposite corner")
     if (low, high) != (form.low, form.high):
         editing.set_box(viewer, low, high)

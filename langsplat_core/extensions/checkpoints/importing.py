@@ -41,7 +41,7 @@ from langsplat_core.io.hostile import exists
 from langsplat_core.io.scenes import warn_of_undrawable
 from langsplat_core.pipeline.language_field import field_of
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import LEVELS, AutoencoderCodec, Codec, Scene
+from langsplat_core.scene import LEVELS, AutoencoderCodec, Codec, Scene, about_origin
 from langsplat_core.scene.codec import LARGEST, SHORTEST
 from langsplat_core.semantics.encoders import OPEN_MODEL, load_text_encoder
 from langsplat_core.training.language.codec_fit import (
@@ -227,9 +227,11 @@ def _scene(carrier: Carrier) -> Scene:
     folder = carrier.path.resolve().parent
     model = folder.parent.parent if carrier.path.name == "point_cloud.ply" else folder
     cameras = [path for path in (carrier.path.with_suffix(CAMERAS), model / "cameras.json") if exists(path)]
+    means, origin = about_origin(carrier.gaussians.means)
     return Scene(
-        carrier.gaussians,
-        cameras=read_cameras(cameras[0]) if cameras else (),
+        replace(carrier.gaussians, means=means),
+        cameras=tuple(camera.moved(-origin) for camera in (read_cameras(cameras[0]) if cameras else ())),
+        origin=origin,
         antialiased=carrier.antialiased,
         extras=carrier.extras,
     )
