@@ -176,6 +176,9 @@ class DatasetConfig:
     # chosen: views that others surround, none of fewer than six; every: each n-th by name, as benchmarks do
     hold_out: Literal["chosen", "every"] = "chosen"
     frames: FrameCount = 100  # photographs that a video is made into: the sharpest image of each such part
+    # what is transparent in photographs: pixels that do not count, an empty background, or that which most of
+    # a capture looks like
+    alpha: Annotated[Literal["auto", "mask", "background"], tyro.conf.arg(aliases=["--alpha"])] = "auto"
     metres_per_unit: Positive | None = None
     """Scale of the dataset's world; None: as transforms.json says, or else the photographs' places (GPS)."""
     # go on where fewer than half of the photographs, or fewer than three, have a camera

@@ -18,6 +18,7 @@ from langsplat_core.progress import Progress, silent
 
 __all__ = ["Capture", "load_capture", "load_photographs"]
 
+TRANSFORMS = ("transforms.json", "transforms_train.json")
 ACCEPTED = (
     "a folder with transforms.json (nerfstudio) or that file, a folder with sparse/0 and images (COLMAP), "
     "a folder of at least three photographs (jpg, png, webp, tif, bmp, avif, heic), or a video"
@@ -50,17 +51,18 @@ def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Pr
     if not os.path.exists(path):  # unlike Path.exists, also no for names that no file system could hold
         raise InputError(f"{shown(path)} does not exist; expected {ACCEPTED}")
     try:
-        frames = path if path.is_file() and path.suffix.lower() == ".json" else path / "transforms.json"
-        if frames.is_file():
-            return centred(load_nerfstudio(frames, config.max_side, progress))
+        listed = [path] if path.suffix.lower() == ".json" else [path / name for name in TRANSFORMS]
+        frames = next(filter(Path.is_file, listed), None)
+        if frames is not None:
+            return centred(load_nerfstudio(frames, config, progress))
         model = find_model(path)
         if model is not None:
-            return centred(load_colmap(path, model, config.max_side, progress))
+            return centred(load_colmap(path, model, config, progress))
         if is_video(path):
             path = kept_frames(path, config.frames, work, progress)
-        photos = photo_folder(path)
-        if photos is None:
+        folder, photos = photo_folder(path)
+        if not photos:
             raise InputError(f"{path} is no dataset; expected {ACCEPTED}")
-        return load_photos(photos, config.max_side, config.allow_few_cameras, work, progress)
+        return load_photos(folder, photos, config, work, progress)
     except PermissionError as error:
         raise InputError(f"{error.filename}: may not be read ({error.strerror}); see to its rights") from None

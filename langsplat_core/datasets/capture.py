@@ -17,7 +17,7 @@ from scipy.spatial.distance import pdist
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets.photos import WORKERS, Photo, View, developer, place
+from langsplat_core.datasets.photos import WORKERS, Developed, Photo, View, developer, place
 from langsplat_core.datasets.workspace import Matches
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import PictureError
@@ -40,6 +40,7 @@ class Capture:
     photos: tuple[Photo, ...] = ()  # the files, in the same order; none for images made otherwise
     drawn: bool = False  # by `assets.making`, where encoders are calibrated
     masks: tuple[Array | None, ...] = ()  # (H, W) bool each, pixels that count; None: all; (): no masks
+    cut_out: bool = False  # pixels that do not count are empty, rather than not known
     matches: Matches | None = None  # of all photographs, where cameras came from structure from motion
     origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) what cameras and points are relative to
 
@@ -83,6 +84,7 @@ class Capture:
             digest.update(np.ascontiguousarray(image).data)
         for mask in (self.mask(i) for i in indices):
             digest.update(b"" if mask is None else np.packbits(mask).tobytes())
+        digest.update(b"cut out" * self.cut_out)
         digest.update(_rounded(self.points).tobytes())
         digest.update(self.colours.tobytes())
         return digest.hexdigest()
@@ -105,7 +107,7 @@ class Capture:
         """
         if not self.photos or longer_side >= max(max(self.images[index].shape) for index in indices):
             return self.shrunk(indices, longer_side)
-        view_of = developer(longer_side)
+        view_of = developer(longer_side, self.cut_out)
 
         def view(index: int) -> View:
             try:
@@ -148,6 +150,19 @@ def centred(capture: Capture) -> Capture:
     )
 
 
+def capture_of(views: Developed, points: Array, colours: Array) -> Capture:
+    """Return the capture of developed photographs, with (M, 3) points and (M, 3) uint8 colours."""
+    return Capture(
+        views.cameras,
+        views.images,
+        points,
+        colours,
+        photos=views.photos,
+        masks=views.masks,
+        cut_out=views.cut_out,
+    )
+
+
 def shrunk_view(camera: Camera, image: Array, mask: Array | None, size: tuple[int, int]) -> View:
     """Return a view at a smaller (width, height), shrunk as photographs are when they are read.
 
@@ -184,6 +199,9 @@ RADIAN = 2.0  # typical steps between cameras that a turn by a radian counts for
 
 def split_views(capture: Capture, config: DatasetConfig) -> tuple[list[int], list[int]]:
     """Return indices of (training, held-out) views, about one in ``config.test_every``."""
+    stated = [index for index, photo in enumerate(capture.photos) if photo.held_out]
+    if stated and config.test_every > 1:
+        return [index for index in range(len(capture)) if index not in stated], stated
     if config.hold_out == "every":
         return capture.split(config.test_every)
     held_out = surrounded_views(capture.cameras, config.test_every)

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array, rotation_matrices
-from langsplat_core.datasets.capture import Capture, warn_of_lost_points
+from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets.capture import Capture, capture_of, warn_of_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.datasets.photos import Photo, develop, find_photos, finder, mask_beside
 from langsplat_core.errors import FormatError, InputError, printable_line, shortened
@@ -266,7 +267,7 @@ def _photographs_of(model_folder: Path) -> int:
         return 0
 
 
-def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progress) -> Capture:
+def load_colmap(folder: Path, model_folder: Path, config: DatasetConfig, progress: Progress) -> Capture:
     """Return the photographs of `folder` with the cameras and points of the model; see `load_capture`."""
     model = read_model(model_folder)
     # Without a folder of their own, photographs lie in the dataset's.
@@ -283,12 +284,11 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
     if missing:
         share = f"{len(missing)} of {len(photos)} photographs of the model"
         log.warning("%s do not exist and are left out: %s", share, shortened(missing))
-    present = len(find_photos(images))
+    present = len(find_photos(images) or find_photos(images, below=images.name == "images"))
     if 2 * len(there) < present:
         share = f"cameras for only {len(there)} of the {present} photographs beside it"
         log.warning("%s has %s; another model may have more", shown(model_folder), share)
-    cameras, pixels, files, masks = develop(there, max_side, progress)
-    return Capture(cameras, pixels, *good_points(model), photos=files, masks=masks)
+    return capture_of(develop(there, config, progress), *good_points(model))
 
 
 def located_photos(model: SparseModel, folder: Path) -> list[Photo]:

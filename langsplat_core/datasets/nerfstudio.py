@@ -10,16 +10,18 @@ import math
 import os
 import reprlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import Capture, warn_of_lost_points
+from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets.capture import Capture, capture_of, warn_of_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.datasets.photos import Photo, develop, finder, mask_beside
-from langsplat_core.errors import FormatError, InputError, printable_line, quoted, shortened
+from langsplat_core.errors import FormatError, InputError, printable_line, quoted, report_loss, shortened
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file
 from langsplat_core.io.ply import read_cloud
 from langsplat_core.progress import Progress
@@ -33,16 +35,45 @@ JSON_LIMIT = 256 * 1024 * 1024  # bytes; a frame takes about 700
 Json = dict[str, Any]
 
 
-def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
-    """Return the photographs and cameras that `file` lists; points only if it names a PLY."""
+def load_nerfstudio(file: Path, config: DatasetConfig, progress: Progress) -> Capture:
+    """Return the photographs and cameras that `file` lists; points only if it names a PLY.
+
+    Of the synthetic scenes of NeRF, which list photographs apart, those of transforms_test.json, or of
+    transforms_val.json for want of it, are held out from the training on those of transforms_train.json.
+    """
+    top = _content(file)
+    photos = _photos(file, top, held_out=False)
+    others = (file.with_name(file.name.replace("_train", f"_{word}")) for word in ("test", "val"))
+    held_out = next((other for other in others if other != file and other.is_file()), None)
+    if held_out is not None:
+        photos |= _photos(held_out, _content(held_out), held_out=True)
+    try:  # a key of our own: nerfstudio's files do not state it
+        metres = _number(top, "metres_per_unit") if top.get("metres_per_unit") is not None else None
+        if metres is not None and metres <= 0:
+            raise ValueError(f'"metres_per_unit" must be above 0, got {metres:g}')
+    except ValueError as error:
+        raise FormatError(f"{file}: {error}") from None
+    points, colours = _points(file, top.get("ply_file_path"))
+    capture = capture_of(develop(list(photos.values()), config, progress), points, colours)
+    # ours, of `python -m assets.making dataset`
+    return replace(capture, metres_per_unit=metres, drawn=top.get("drawn") is True)
+
+
+def _content(file: Path) -> Json:
+    """Return the content of a transforms.json, which lists frames; FormatError."""
     top = read_json_file(file, JSON_LIMIT)
     frames = top.get("frames") if isinstance(top, dict) else None
     if not isinstance(frames, list) or not frames:
         raise FormatError(f'{file} has no list of "frames"; it is not a nerfstudio dataset')
+    return dict(top)
+
+
+def _photos(file: Path, top: Json, held_out: bool) -> dict[str, Photo]:
+    """Return the photographs of a file's frames by their names, those that can be opened."""
     photos: dict[str, Photo] = {}
-    missing = []
+    missing: list[str] = []
     find = finder(file.parent)
-    for number, frame in enumerate(frames):
+    for number, frame in enumerate(top["frames"]):
         where = f"{file}: frame {number}"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise FormatError(f'{where} has no "file_path"; it is not a nerfstudio dataset')
@@ -50,29 +81,24 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
         try:
             path = _photo_file(find, label)
             size = picture_size(path)
-        except (FileNotFoundError, PictureError):
+        except FileNotFoundError:
             missing.append(label)
+            continue
+        except PictureError as error:
+            missing.append(f"{label} ({error.reason})")
             continue
         try:
             mask = _mask_file(find, frame) or mask_beside(path)
-            photos[label] = Photo(path, label, _lens({**top, **frame}, size), _pose(frame), mask=mask)
+            lens, pose = _lens({**top, **frame}, size), _pose(frame)
         except ValueError as error:
             raise FormatError(f"{where} ({printable_line(label, 60)}): {error}") from None
+        photos[label] = Photo(path, label, lens, pose, mask=mask, held_out=held_out)
     if missing:
-        lost = f"{len(missing)} of {len(frames)} photographs in {file.name} cannot be opened"
-        if not photos:
+        lost = f"{len(missing)} of {len(top['frames'])} photographs in {file.name} cannot be opened"
+        if not photos and not held_out:
             raise InputError(f"{file}: {lost}: {shortened(missing)}; its paths begin at its folder")
-        log.warning("%s and are left out: %s", lost, shortened(missing))
-    try:  # a key of our own: nerfstudio's files do not state it
-        metres = _number(top, "metres_per_unit") if top.get("metres_per_unit") is not None else None
-        if metres is not None and metres <= 0:
-            raise ValueError(f'"metres_per_unit" must be above 0, got {metres:g}')
-    except ValueError as error:
-        raise FormatError(f"{file}: {error}") from None
-    cameras, images, files, masks = develop(list(photos.values()), max_side, progress)
-    points, colours = _points(file, top.get("ply_file_path"))
-    drawn = top.get("drawn") is True  # ours, of `python -m assets.making dataset`
-    return Capture(cameras, images, points, colours, metres, files, drawn, masks)
+        report_loss("%s and are left out: %s", lost, shortened(missing))
+    return photos
 
 
 def _photo_file(find: Callable[[str], Path], label: str) -> Path:

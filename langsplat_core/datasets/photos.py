@@ -17,9 +17,18 @@ from PIL import Image, ImageOps
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets.colour import Tell, as_srgb, coded_as
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics, pinhole_for, resample, source_positions
-from langsplat_core.errors import InputError, shortened
-from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, decode_name, is_video, opened
+from langsplat_core.errors import InputError, report_loss, shortened
+from langsplat_core.io.hostile import (
+    MOST_PIXELS,
+    MOST_PIXELS_REDUCED,
+    PHOTO_SUFFIXES,
+    PictureError,
+    decode_name,
+    is_video,
+    opened,
+)
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
@@ -39,23 +48,34 @@ class Photo:
     world_to_camera: Array  # (4, 4) float64, rigid
     upright: bool = False  # the lens describes the photograph turned as its EXIF data ask
     mask: Path | None = None  # an image of the same shape, black where the photograph does not count
+    held_out: bool = False  # its dataset says that it is not for training
 
 
 # Finding them.
 
 
-def find_photos(folder: Path) -> list[Path]:
-    """Return photographs directly in `folder`, by name; hidden files do not count."""
+def find_photos(folder: Path, below: bool = False) -> list[Path]:
+    """Return photographs directly in `folder`, by name, or `below` it, in its folders; no hidden files."""
     if not folder.is_dir():
         return []
-    found = (p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and p.name[0] != ".")
-    return sorted(p for p in found if p.is_file())
+    listed = sorted(path for path in folder.iterdir() if path.name[0] != ".")
+    if below:
+        inside = (find_photos(path) for path in listed if path.name != "masks")
+        return [photo for photos in inside for photo in photos]
+    return [path for path in listed if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()]
 
 
-def photo_folder(folder: Path) -> Path | None:
-    """Return the folder of the photographs of a dataset: `folder` itself or one level down."""
-    candidates = (folder, folder / "images", folder / "photos")
-    return next((candidate for candidate in candidates if find_photos(candidate)), None)
+def photo_folder(folder: Path) -> tuple[Path, list[Path]]:
+    """Return the folder of the photographs of a dataset, and these; none where there are none.
+
+    That is `folder` itself or a folder "images" or "photos" in it; else photographs lie in folders of those.
+    """
+    named = folder / "images", folder / "photos"
+    for below, candidates in ((False, (folder, *named)), (True, (*named, folder))):
+        for candidate in candidates:
+            if photos := find_photos(candidate, below):
+                return candidate, photos
+    return folder, []
 
 
 def count_photographs(dataset: Path) -> int:
@@ -64,7 +84,7 @@ def count_photographs(dataset: Path) -> int:
         if is_video(dataset):
             return DatasetConfig.frames
         folder = dataset if dataset.is_dir() else dataset.parent
-        return len(find_photos(folder / "images") or find_photos(photo_folder(folder) or folder))
+        return len(find_photos(folder / "images") or photo_folder(folder)[1])
     except OSError:
         return 0
 
@@ -176,39 +196,67 @@ def place(path: Path) -> tuple[float, float]:
 # Reading them.
 
 
-def read_photo(path: Path, upright: bool) -> Image.Image:
-    """Return an RGB image; transparent pixels are laid over black, 16 bits become 8.
+def read_photo(path: Path, upright: bool, tell: Tell = lambda _: None) -> Image.Image:
+    """Return an RGB image of sRGB colours, or RGBA where a pixel is transparent; 16 bits become 8.
 
-    With `upright` it is turned as its EXIF data ask; unreadable EXIF data count as none. Raises PictureError.
+    With `upright` it is turned as its EXIF data ask; unreadable EXIF data count as none. What is larger than
+    other images may be is reduced as it is read. tell: is told what was guessed. Raises PictureError.
     """
-    with opened(path) as stored:
-        image = stored
+    with opened(path, most=MOST_PIXELS_REDUCED) as stored:
+        image: Image.Image = stored
+        coded = coded_as(stored)
+        large = stored.width * stored.height > MOST_PIXELS
+        if large:
+            stored.draft(None, (stored.width // 2, stored.height // 2))
         if upright:
             stored.load()  # so that nothing but the EXIF data can fail below
             try:
                 image = ImageOps.exif_transpose(stored)
             except Exception:  # noqa: BLE001  Pillow's parser lets through what damaged tags cause
                 image = stored.copy()
+        if large and image.width * image.height > MOST_PIXELS:
+            image = image.reduce(2)
         if image.mode.startswith("I") or image.mode == "F":  # Pillow's own conversion would clip
-            values = np.asarray(image)
-            if image.mode == "F" or not 0 <= values.min(initial=0) <= values.max(initial=0) <= 65535:
-                raise PictureError(path, "more than 16 bits per channel")
-            # the nearest of 256 shades: v / 257 rounded, in whole numbers
-            return Image.fromarray(((values.astype(np.uint32) + 128) // 257).astype(np.uint8)).convert("RGB")
+            image = _of_8_bits(image, path, tell)
+        shown = as_srgb(image, coded, tell)
         if image.has_transparency_data:
-            black = Image.new("RGBA", image.size, (0, 0, 0, 255))
-            return Image.alpha_composite(black, image.convert("RGBA")).convert("RGB")
-        return image.convert("RGB")
+            alpha = image.convert("RGBA").getchannel("A")
+            if alpha.getextrema() != (255, 255):
+                shown.putalpha(alpha)
+        return shown
 
 
-def _read_for(photo: Photo) -> tuple[Image.Image, PhotoIntrinsics]:
+def _of_8_bits(image: Image.Image, path: Path, tell: Tell) -> Image.Image:
+    """Return a grey image of 16 bits as one of 8; of 12 bits where no pixel has more."""
+    values = np.asarray(image)
+    if image.mode == "F" or not 0 <= values.min(initial=0) <= values.max(initial=0) <= 65535:
+        raise PictureError(path, "more than 16 bits per channel")
+    most = int(values.max(initial=0))
+    if 255 < most <= 4095:
+        tell("no value is above 4095 of 65535, and 12 bits are taken for white")
+    white = 4095 if 255 < most <= 4095 else 65535
+    shades = (values.astype(np.uint32) * 255 + white // 2) // white
+    grey = Image.fromarray(shades.astype(np.uint8))
+    grey.info = image.info
+    return grey
+
+
+def over_black(image: Image.Image) -> Image.Image:
+    """Return an RGB image without its transparency."""
+    if image.mode != "RGBA":
+        return image
+    black = Image.new("RGBA", image.size, (0, 0, 0, 255))
+    return Image.alpha_composite(black, image).convert("RGB")
+
+
+def _read_for(photo: Photo, tell: Tell) -> tuple[Image.Image, PhotoIntrinsics]:
     """Read a photograph, and return its intrinsics on the pixel grid of the file.
 
     COLMAP reads pixels as stored, other tools turn them first; when the stored shape does not fit the
     lens but the turned one does, the latter is meant.
     """
     intrinsics = photo.intrinsics
-    image = read_photo(photo.path, photo.upright)
+    image = read_photo(photo.path, photo.upright, tell)
     if not photo.upright and not _fits(image.size, intrinsics):
         image = read_photo(photo.path, upright=True)
     if not _fits(image.size, intrinsics):
@@ -230,7 +278,7 @@ def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
 
 def _read_mask(path: Path, size: tuple[int, int]) -> Image.Image:
     """Return the mask of a photograph of `size` pixels, as large. InputError for one of another shape."""
-    mask = read_photo(path, upright=False)
+    mask = over_black(read_photo(path, upright=False))
     if abs(mask.width * size[1] / (mask.height * size[0]) - 1) > ASPECT_TOLERANCE:
         raise InputError(
             f"{path}: is {mask.width}x{mask.height} pixels, its photograph {size[0]}x{size[1]}; a mask has "
@@ -241,10 +289,36 @@ def _read_mask(path: Path, size: tuple[int, int]) -> Image.Image:
 
 # A pinhole, its (H, W, 3) uint8 image, and its (H, W) bool pixels that count (None: all).
 View = tuple[Camera, Array, Array | None]
+OPAQUE, SOLID = 250, 5  # of 255: from where a pixel is the thing alone, and from where it is a part of it
 
 
-def developer(max_side: int) -> Callable[[Photo], View]:
-    """Return the function that makes views, at most `max_side` px long, of photographs; PictureError."""
+def developer(max_side: int, cut_out: bool) -> Callable[[Photo], View]:
+    """Return the function that makes views, at most `max_side` px long, of photographs; PictureError.
+
+    cut_out: pixels count that show anything of the thing; else those that show nothing but it.
+    """
+    developed = _developer(max_side)
+
+    def view(photo: Photo) -> View:
+        camera, pixels, mask, alpha = developed(photo, lambda _: None)
+        return camera, pixels, _counted(mask, alpha, cut_out)
+
+    return view
+
+
+def _counted(mask: Array | None, alpha: Array | None, cut_out: bool) -> Array | None:
+    """Return the (H, W) bool pixels that count by a mask and by transparency; None: all."""
+    if alpha is None:
+        return mask
+    solid = np.asarray(alpha >= (SOLID if cut_out else OPAQUE))
+    return solid if mask is None else mask & solid
+
+
+Layers = tuple[Camera, Array, Array | None, Array | None]  # a view, and its (H, W) uint8 alpha
+
+
+def _developer(max_side: int) -> Callable[[Photo, Tell], Layers]:
+    """Return the function that makes the layers of a photograph, and tells what was guessed."""
 
     # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
     @lru_cache(maxsize=4)
@@ -252,17 +326,28 @@ def developer(max_side: int) -> Callable[[Photo], View]:
         camera = pinhole_for(intrinsics, max_side)
         return camera, None if intrinsics.distortion is None else source_positions(intrinsics, camera)
 
-    def view(photo: Photo) -> View:
-        image, intrinsics = _read_for(photo)
+    def developed(photo: Photo, tell: Tell) -> Layers:
+        image, intrinsics = _read_for(photo, tell)
         camera, positions = plan(intrinsics)
         camera = replace(camera, world_to_camera=photo.world_to_camera)
-        pixels = resample(image, intrinsics, camera, positions)
-        if photo.mask is None:
-            return camera, pixels, None
-        mask = resample(_read_mask(photo.mask, image.size), intrinsics, camera, positions)
-        return camera, pixels, np.asarray(mask[..., 0] >= 128)
 
-    return view
+        def shown(source: Image.Image) -> Array:
+            return resample(source, intrinsics, camera, positions)
+
+        alpha = shown(image.getchannel("A").convert("RGB"))[..., 0] if image.mode == "RGBA" else None
+        mask = None if photo.mask is None else shown(_read_mask(photo.mask, image.size))[..., 0] >= 128
+        return camera, shown(over_black(image)), mask, alpha
+
+    return developed
+
+
+def _is_cut_out(alpha: Array | None) -> bool:
+    """Return True where most of a photograph, or of its edge, is transparent."""
+    if alpha is None:
+        return False
+    empty = alpha < SOLID
+    edge = np.concatenate([empty[0], empty[-1], empty[:, 0], empty[:, -1]])
+    return bool(empty.mean() > 0.5 or edge.mean() > 0.5)
 
 
 IN_MEMORY = 512_000_000  # bytes of images that are held there; further ones lie in files
@@ -280,45 +365,78 @@ def in_file(image: Array) -> Array:
         raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
 
 
-def develop(
-    photos: Sequence[Photo], max_side: int, progress: Progress
-) -> tuple[tuple[Camera, ...], tuple[Array, ...], tuple[Photo, ...], tuple[Array | None, ...]]:
-    """Return the cameras, images, files and masks of the views of `photos`, sorted by name.
+@dataclass(frozen=True, eq=False)
+class Developed:
+    """The views of photographs, sorted by name."""
 
-    There are no masks at all where no photograph has one. Files that cannot be read are reported once and
-    left out; InputError when none is left.
+    cameras: tuple[Camera, ...]
+    images: tuple[Array, ...]
+    photos: tuple[Photo, ...]  # their files
+    masks: tuple[Array | None, ...]  # none at all where no photograph has one
+    cut_out: bool  # pixels that do not count are empty
+
+
+def develop(photos: Sequence[Photo], config: DatasetConfig, progress: Progress) -> Developed:
+    """Return the views of `photos`, as ``config.max_side`` and ``config.alpha`` say.
+
+    Files that cannot be read are reported once and left out; InputError when none is left.
     """
     if not photos:
         raise InputError("the dataset lists no photographs")
     names = unique_names([photo.label for photo in photos])
     order = sorted(range(len(photos)), key=names.__getitem__)
-    view_of = developer(max_side)
+    told: list[tuple[str, str]] = []  # what was guessed, and of which photograph
 
-    def view(index: int) -> View | str:
+    developed = _developer(config.max_side)
+
+    def view(index: int) -> Layers | str:
         photo = photos[index]
         try:
-            camera, image, mask = view_of(photo)
+            camera, image, mask, alpha = developed(photo, lambda what: told.append((what, photo.label)))
         except PictureError as error:
             return f"{photo.label} ({error.reason})"
-        if mask is not None and not mask.any():
+        if (counted := _counted(mask, alpha, True)) is not None and not counted.any():
             return f"{photo.label} (its mask leaves nothing of it)"
-        return replace(camera, name=names[index]), image, mask
+        return replace(camera, name=names[index]), image, mask, alpha
 
     room = IN_MEMORY
-    done: list[tuple[Camera, Array, Photo, Array | None]] = []
+    done: list[tuple[Camera, Array, Photo, Array | None, Array | None]] = []
     broken: list[str] = []
     with ThreadPoolExecutor(WORKERS) as pool:
         for count, (index, found) in enumerate(zip(order, pool.map(view, order), strict=True), 1):
             if isinstance(found, str):
                 broken.append(found)
             else:
-                camera, image, mask = found
+                camera, image, mask, alpha = found
                 room -= image.nbytes
-                done.append((camera, image if room >= 0 else in_file(image), photos[index], mask))
+                kept = image if room >= 0 else in_file(image)
+                done.append((camera, kept, photos[index], mask, alpha))
             progress("reading photographs", count / len(order))
     if not done:
         raise InputError(f"no photograph can be read: {shortened(broken)}")
     if broken:
-        log.warning("%d photographs cannot be used and are left out: %s", len(broken), shortened(broken))
-    cameras, images, files, masks = zip(*done, strict=True)
-    return cameras, images, files, masks if any(mask is not None for mask in masks) else ()
+        report_loss("%d photographs cannot be used and are left out: %s", len(broken), shortened(broken))
+    for what in dict(told):
+        labels = shortened(label for said, label in told if said == what)
+        report_loss("%d photographs: %s (%s)", sum(said == what for said, _ in told), what, labels)
+    cameras, images, files, masks, alphas = zip(*done, strict=True)
+    cut_out = _cut_out(masks, alphas, config)
+    masks = tuple(_counted(mask, alpha, cut_out) for mask, alpha in zip(masks, alphas, strict=True))
+    masks = masks if any(mask is not None for mask in masks) else ()
+    return Developed(cameras, images, files, masks, cut_out)
+
+
+def _cut_out(masks: Sequence[Array | None], alphas: Sequence[Array | None], config: DatasetConfig) -> bool:
+    """Return True where what is transparent is an empty background, and say how transparency is taken."""
+    seen = sum(alpha is not None for alpha in alphas)
+    if not seen:
+        return False
+    cut_out = config.alpha == "background" or (
+        config.alpha == "auto" and 2 * sum(map(_is_cut_out, alphas)) > len(alphas)
+    )
+    cut_out = cut_out and all(mask is None for mask in masks)  # which say what does not count
+    said = "an empty background" if cut_out else "no part of the thing, and does not count"
+    say = report_loss if config.alpha == "auto" else log.info
+    message = "what is transparent in %d of %d photographs is %s; else: --alpha %s"
+    say(message, seen, len(alphas), said, "mask" if cut_out else "background")
+    return cut_out

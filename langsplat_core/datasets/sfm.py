@@ -13,15 +13,16 @@ import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import Capture, random_points
+from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets.capture import Capture, capture_of, random_points
 from langsplat_core.datasets.colmap import good_points, has_model, located_photos, read_model
 from langsplat_core.datasets.photos import (
     EXIF_IFD,
     develop,
     developer,
-    find_photos,
     mask_beside,
     optics,
+    over_black,
     read_photo,
 )
 from langsplat_core.datasets.workspace import (
@@ -48,17 +49,17 @@ log = logging.getLogger("langsplat")
 
 
 def load_photos(
-    folder: Path, max_side: int, allow_few_cameras: bool, work: Path, progress: Progress
+    folder: Path, paths: Sequence[Path], config: DatasetConfig, work: Path, progress: Progress
 ) -> Capture:
-    """Locate the photographs in `folder` (kept in ``work/sfm-*``) and load them; see `load_capture`."""
-    paths = find_photos(folder)
+    """Locate photographs in or below `folder` (kept in ``work/sfm-*``) and load them; see `load_capture`."""
     if len(paths) < MIN_PHOTOS:
         raise InputError(
             f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed, each sharing "
             "at least two thirds of its view with the next"
         )
-    contents = [(path.name, _content(path)) for path in paths]
-    masked = [(path.name, _content(mask)) for path in paths if (mask := mask_beside(path))]
+    labels = {path: path.relative_to(folder).as_posix() for path in paths}
+    contents = [(labels[path], _content(path)) for path in paths]
+    masked = [(labels[path], _content(mask)) for path in paths if (mask := mask_beside(path))]
     workspace = open_workspace(work, ["photographs", 4, SIDE, contents, *([masked] if masked else [])])
     files = numbered(paths)
     if not has_model(workspace / "sparse"):
@@ -73,7 +74,7 @@ def load_photos(
     matches = read_matches(workspace, files, {image.name for image in model.images} if model else ())
     lost = _left_out(matches, contents)
     found = len(matches.located)
-    if model is None or (found < max(MIN_PHOTOS, FEWEST * len(files)) and not allow_few_cameras):
+    if model is None or (found < max(MIN_PHOTOS, FEWEST * len(files)) and not config.allow_few_cameras):
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
         raise InputError(
             f"only {found} of {len(files)} photographs could be located together "
@@ -84,12 +85,11 @@ def load_photos(
         what = "could not be located and are left out"
         log.warning("%s %s (%s); %s", share, what, _listed(lost, 5), matches.advice())
     photos = [
-        replace(copy, path=path, label=path.name, upright=True, mask=mask_beside(path))
+        replace(copy, path=path, label=labels[path], upright=True, mask=mask_beside(path))
         for copy in located_photos(model, workspace / "images")
         for path in (files[copy.label],)
     ]
-    cameras, images, kept, masks = develop(photos, max_side, progress)
-    return Capture(cameras, images, *good_points(model), photos=kept, masks=masks, matches=matches)
+    return replace(capture_of(develop(photos, config, progress), *good_points(model)), matches=matches)
 
 
 def numbered(paths: Sequence[Path]) -> dict[str, Path]:
@@ -153,7 +153,7 @@ def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> l
         progress("preparing photographs", index / len(files))
         try:
             if not (folder / name).is_file():
-                image = read_photo(path, upright=True)
+                image = over_black(read_photo(path, upright=True))
                 image.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
                 with atomic_path(folder / name) as temporary:
                     image.save(temporary, quality=95, exif=optics(path))
@@ -162,17 +162,20 @@ def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> l
                 lens = str(dict(exif) | dict(exif.get_ifd(EXIF_IFD)))
             if any_masks:
                 mask = mask_beside(path)
-                counted = Image.new("L", size, 255) if mask is None else read_photo(mask, False).convert("L")
+                given = Image.new("RGB", size, "white") if mask is None else read_photo(mask, False)
+                counted = over_black(given).convert("L")
                 _write_mask(folder, name, counted.resize(size, Image.Resampling.NEAREST))
             members.setdefault((size, lens), []).append(name)
         except PictureError as error:
             broken.append(f"{path.name} ({error.reason})")
     progress("preparing photographs", 1.0)
-    if broken:
-        log.warning("%d photographs cannot be read: %s", len(broken), shortened(broken))
     count = len(files) - len(broken)
     if count < MIN_PHOTOS:
-        raise InputError(f"only {count} photographs can be read; at least {MIN_PHOTOS} are needed")
+        raise InputError(
+            f"only {count} photographs can be read; at least {MIN_PHOTOS} are needed: {shortened(broken)}"
+        )
+    if broken:
+        log.warning("%d photographs cannot be read: %s", len(broken), shortened(broken))
     return [
         CameraGroup(tuple(names), "SIMPLE_RADIAL", side=max(size)) for (size, _), names in members.items()
     ]
@@ -259,7 +262,7 @@ def _write_images(
     folder: Path, names: Sequence[str], capture: Capture, views: Sequence[int], progress: Progress
 ) -> tuple[Camera, ...]:
     """Write images to seek features in and return their cameras: from the files, larger than for training."""
-    enlarge = developer(SIDE)
+    enlarge = developer(SIDE, capture.cut_out)
     cameras = []
     for count, (name, index) in enumerate(zip(names, views, strict=True)):
         progress("preparing photographs", count / len(views))

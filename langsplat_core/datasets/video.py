@@ -11,7 +11,8 @@ import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError, InputError, optional_imports, printable_line
+from langsplat_core.datasets.colour import HLG, PQ, UNSPECIFIED, Tell, to_srgb
+from langsplat_core.errors import FormatError, InputError, optional_imports, printable_line, report_loss
 from langsplat_core.io.files import shown
 from langsplat_core.io.hostile import MOST_PIXELS, open_for_reading
 from langsplat_core.progress import Progress, silent
@@ -26,7 +27,7 @@ def kept_frames(video: Path, count: int, work: Path, progress: Progress = silent
     file, _ = open_for_reading(video)
     with file:
         content = hashlib.file_digest(file, "sha256").hexdigest()[:12]  # type: ignore[arg-type]
-    folder = work / f"frames-{content}-{count}"
+    folder = work / f"frames-{content}-{count}-srgb"  # earlier ones have other colours
     if not folder.is_dir():
         extract_frames(video, folder, count, progress)
     return folder
@@ -82,17 +83,23 @@ def _write(container: Any, folder: Path, count: int, progress: Progress) -> int:
     first, last = min(times), max(times)
     container.seek(0)
     best: dict[int, tuple[float, Any]] = {}  # span -> sharpness and image, of the span under way
+    aspect = float(stream.sample_aspect_ratio or 1)
+    if not 0.25 <= aspect <= 4:
+        raise ValueError(f"pixels of {stream.sample_aspect_ratio}")
+    told: set[str] = set()
     for frame in _decoded(container, stream):
         share = (float(frame.time or first) - first) / max(last - first, 1e-9)
         span = min(int(share * count), count - 1)
         for done in [number for number in best if number < span]:
-            _save(best.pop(done)[1], folder)
+            _save(best.pop(done)[1], aspect, folder, told.add)
         progress("taking photographs out of the video", min(share, 1.0))
         sharp = sharpness(frame)
         if span not in best or sharp > best[span][0]:
             best[span] = (sharp, frame)
     for _, frame in best.values():
-        _save(frame, folder)
+        _save(frame, aspect, folder, told.add)
+    for what in told:
+        report_loss("%s: %s", container.name, what)
     return len(list(folder.iterdir()))
 
 
@@ -118,8 +125,24 @@ def sharpness(frame: Any) -> float:
     return float((around - 4 * grey[1:-1, 1:-1]).var())
 
 
-def _save(frame: Any, folder: Path) -> None:
-    """Write an image, turned as it is shown, under the next number."""
-    upright = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
+def _save(frame: Any, aspect: float, folder: Path, tell: Tell) -> None:
+    """Write an image, turned and coloured as it is shown, under the next number.
+
+    aspect: of its pixels, width over height; tell: is told of colours that are not known.
+    """
+    from av.video.reformatter import Colorspace, Interpolation
+
+    deep = frame.color_trc in (HLG, PQ)  # whose dark shades need more than 8 bits
+    # HD without a word is BT.709, smaller images BT.601, as players take them.
+    hd = frame.colorspace == UNSPECIFIED and max(frame.width / 16, frame.height / 9) >= 80
+    shown = frame.reformat(
+        width=round(frame.width * max(aspect, 1)),
+        height=round(frame.height / min(aspect, 1)),
+        format="rgb48le" if deep else "rgb24",
+        src_colorspace=Colorspace.ITU709 if hd else None,
+        interpolation=Interpolation.BICUBIC,
+    )
+    pixels = to_srgb(shown.to_ndarray(), frame.color_trc, frame.color_primaries, tell)
+    upright = np.rot90(pixels, round(frame.rotation / 90))
     name = f"frame_{len(list(folder.iterdir())) + 1:04d}.jpg"
     Image.fromarray(np.ascontiguousarray(upright)).save(folder / name, quality=95)

@@ -173,8 +173,11 @@ def read_matches(folder: Path, files: dict[str, Path], located: Collection[str])
     """Return a workspace's graph of matches; files: by their names there; located: names with a camera."""
     kept = json.loads((folder / MATCHES).read_text())
     row = {name: index for index, name in enumerate(files)}
+    names, unlike = (
+        tuple(path.relative_to(path.parents[level]).as_posix() for path in files.values()) for level in (0, 1)
+    )
     return Matches(
-        names=tuple(path.name for path in files.values()),
+        names=names if len(set(names)) == len(names) else unlike,
         features=tuple(kept["features"].get(name, -1) for name in files),
         pairs=tuple((row[a], row[b], count) for a, b, count in kept["pairs"]),
         located=frozenset(row[name] for name in located),

@@ -334,6 +334,8 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".a
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 HEIF_BRANDS = (b"heic", b"heix", b"mif1", b"hevc", b"heim", b"heis")
 MOST_PIXELS = 178_000_000  # of any image: 0.7 GB once decoded. The largest cameras make 151 million
+MOST_PIXELS_REDUCED = 268_000_000  # of photographs, which are halved as they are read; some phones make 200
+Image.MAX_IMAGE_PIXELS = MOST_PIXELS_REDUCED  # of which Pillow allows twice as many
 # Declared pixels beyond these need a file of a fitting size: photographs keep 2 to 100 pixels a byte, what is
 # made to exhaust memory a million. The decoders of WebP and AVIF hold two more copies of the image.
 FREE_PIXELS, FREE_PIXELS_COPIED, PIXELS_PER_BYTE = 16_000_000, 8_000_000, 128
@@ -351,13 +353,16 @@ class PictureError(FormatError):
 
 @contextmanager
 def opened(
-    source: Path | bytes, name: str | None = None, kinds: tuple[str, ...] | None = None
+    source: Path | bytes,
+    name: str | None = None,
+    kinds: tuple[str, ...] | None = None,
+    most: int = MOST_PIXELS,
 ) -> Iterator[Image.Image]:
     """Open the image in a file or in bytes, not decoded yet; inside the block it may be.
 
     `name` is for messages, by default the path. Raises PictureError for what cannot be opened, is of none of
-    the `kinds` (default: all that are read) or declares too many pixels, and for whatever Pillow raises
-    inside the block.
+    the `kinds` (default: all that are read) or declares more than `most` pixels, and for whatever Pillow
+    raises inside the block.
     """
     name = name or (str(source) if isinstance(source, Path) else "a picture in memory")
     try:
@@ -374,7 +379,7 @@ def opened(
             # Image.open looks at the first bytes only to choose the kind; the name's ending plays no part
             with Image.open(file, formats=kinds or known) as picture:
                 free = FREE_PIXELS_COPIED if picture.format in ("WEBP", "AVIF", "HEIF") else FREE_PIXELS
-                most = min(MOST_PIXELS, free + PIXELS_PER_BYTE * size)
+                most = min(most, free + PIXELS_PER_BYTE * size)
                 if picture.width * picture.height > most:
                     declared = f"declares {picture.width}x{picture.height} pixels; at most {most // 10**6}"
                     raise PictureError(name, f"{declared} million are read from a file of {size} bytes")
@@ -414,5 +419,5 @@ def _lacks_heif(file: BinaryIO) -> bool:
 
 def picture_size(path: Path) -> tuple[int, int]:
     """Return (width, height) in pixels as the header declares them. Raises PictureError."""
-    with opened(path) as picture:
+    with opened(path, most=MOST_PIXELS_REDUCED) as picture:
         return picture.size

@@ -50,6 +50,7 @@ from langsplat_core.scene.transform import C0
 HEADER_LIMIT = 64 * 1024  # bytes; a real header of 62 properties takes about 1.5 KiB
 NAME_LIMIT = 64  # characters; the longest of known programs has 17
 CHUNK_ROWS = 2048  # about 0.5 MB of a degree-3 scene: the columns are then picked out of the cache
+CLOUDCOMPARE = "scalar_"  # before names of properties in files of CloudCompare's
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 TYPE_NAMES = {  # NumPy code -> names, the first of which is written
     "i1": ("char", "int8"), "u1": ("uchar", "uint8"), "i2": ("short", "int16"), "u2": ("ushort", "uint16"),
@@ -100,6 +101,10 @@ class PlyFile:
                 raise malformed(path, what)
         if not self._format:
             raise malformed(path, "the header has no 'format' line")
+        for element in self.elements.values():
+            plain = [name.removeprefix(CLOUDCOMPARE) for name in element.numbers]
+            if len(set(plain)) == len(plain) and not element.lists:
+                element.numbers = dict(zip(plain, element.numbers.values(), strict=True))
         self._order = BYTE_ORDERS[self._format]  # "<" or ">"; empty of ascii
 
     def _parse(self, line: str) -> bool:

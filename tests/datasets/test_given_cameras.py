@@ -16,6 +16,7 @@ from plyfile import PlyData, PlyElement
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture, load_photographs
+from langsplat_core.datasets.capture import split_views
 from langsplat_core.datasets.colmap import LENSES, find_model, good_points, lens_of, read_model
 from langsplat_core.datasets.intrinsics import (
     BrownDistortion,
@@ -258,7 +259,7 @@ def rewrite(folder: Path, data: object) -> Path:
 
 
 def load(folder: Path):  # type: ignore[no-untyped-def]
-    return load_nerfstudio(folder / "transforms.json", 160, silent)
+    return load_nerfstudio(folder / "transforms.json", DatasetConfig(max_side=160), silent)
 
 
 def test_pictures_are_what_the_cameras_see(tmp_path: Path) -> None:
@@ -332,6 +333,19 @@ def test_applied_transform_changes_neither_points_nor_poses(tmp_path: Path) -> N
     np.testing.assert_array_equal(capture.points, points[good])
     np.testing.assert_array_equal(capture.colours, colours[good])
     np.testing.assert_allclose(capture.cameras[0].world_to_camera, poses(3)[0], atol=1e-9)
+
+
+def test_synthetic_scenes_of_nerf_hold_their_test_views_out(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path, GLOBAL, views=4)
+    (tmp_path / "transforms.json").unlink()
+    parts = {"train": data["frames"][:2], "test": data["frames"][2:3], "val": data["frames"][3:]}
+    for part, frames in parts.items():
+        text = json.dumps({**data, "frames": frames})
+        (tmp_path / f"transforms_{part}.json").write_text(text)
+    capture = load_photographs(tmp_path, WHOLE, tmp_path / "work")
+    assert [camera.name for camera in capture.cameras] == ["view_0", "view_1", "view_2"]
+    assert split_views(capture, WHOLE) == ([0, 1], [2])
+    assert split_views(capture, replace(WHOLE, test_every=0)) == ([0, 1, 2], [])
 
 
 def test_transparent_photographs_lie_over_black(tmp_path: Path) -> None:

@@ -1,22 +1,26 @@
 """Photographs of every kind, their masks and lenses, broken ones, and what phones make."""
 
 import errno
+import io
 import struct
 import sys
+import zlib
 from contextlib import suppress
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
+from typing import Literal
 
 import av
 import numpy as np
 import pillow_heif
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 from scipy.ndimage import gaussian_filter
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig, RadianceConfig
-from langsplat_core.datasets import Capture, load_capture
+from langsplat_core.datasets import Capture, load_capture, load_photographs
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.photos import (
     Photo,
@@ -25,14 +29,16 @@ from langsplat_core.datasets.photos import (
     in_file,
     mask_beside,
     optics,
+    photo_folder,
     read_photo,
     unique_names,
 )
 from langsplat_core.datasets.video import extract_frames, kept_frames
 from langsplat_core.errors import FormatError, InputError, LangSplatError
-from langsplat_core.io.hostile import PictureError, is_video
+from langsplat_core.io.hostile import PictureError, is_video, picture_size
 from langsplat_core.progress import WorkCancelledError, silent
-from langsplat_core.scene import look_at
+from langsplat_core.raster.render import render
+from langsplat_core.scene import Scene, look_at
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support.photographs import (
@@ -123,6 +129,194 @@ def test_photographs_are_counted_where_they_lie(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text("{}")
     assert count_photographs(tmp_path) == count_photographs(tmp_path / "transforms.json") == 1
     assert count_photographs(tmp_path / "walk.mp4") == DatasetConfig.frames
+    for name in ("images/a.jpg", "a.jpg", "b.PNG"):
+        (tmp_path / name).unlink()
+    for name in ("left/1.jpg", "right/1.jpg", "masks/1.png", ".hidden/1.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert photo_folder(tmp_path) == (tmp_path, [tmp_path / "left/1.jpg", tmp_path / "right/1.jpg"])
+
+
+@pytest.mark.parametrize("name", ["large.jpg", "large.png"])
+def test_photographs_larger_than_other_images_may_be_are_halved(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shade = np.linspace(0, 255, 160).astype(np.uint8)
+    Image.fromarray(np.broadcast_to(shade, (120, 160)).copy()).save(tmp_path / name)
+    monkeypatch.setattr("langsplat_core.datasets.photos.MOST_PIXELS", 10_000)
+    assert picture_size(tmp_path / name) == (160, 120)
+    assert read_photo(tmp_path / name, upright=True).size == (80, 60)
+
+
+# Colours: what a file says its numbers mean.
+
+PATCHES = np.array([(200, 40, 40), (40, 170, 60), (128, 128, 128), (235, 235, 235), (20, 20, 20)])
+P3 = [(0.51512, 0.2412, -0.00105), (0.29198, 0.69225, 0.04189), (0.1571, 0.06657, 0.78407)]  # XYZ, of D50
+TO_P3 = np.array([[0.8225, 0.1774, 0.0], [0.0332, 0.9669, 0.0], [0.0171, 0.0724, 0.9108]])
+TO_2020 = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])
+
+
+def linear(shades: Array) -> Array:
+    values = shades / 255
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def as_srgb(light: Array) -> Array:
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def as_hlg(shades: Array) -> Array:
+    """HLG of BT.2020, with diffuse white at 75 %."""
+    light = 0.26496 * (linear(shades) @ TO_2020.T)
+    high = 0.17883277 * np.log(np.maximum(12 * light - 0.28466892, 1e-9)) + 0.55991073
+    return np.where(light <= 1 / 12, np.sqrt(3 * light), high)
+
+
+def as_pq(shades: Array) -> Array:
+    power = (203 / 10_000 * (linear(shades) @ TO_2020.T)) ** 0.1593017578125
+    return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+
+
+def p3_profile() -> bytes:
+    """sRGB's profile with the primaries of Display P3."""
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    for name, place in zip((b"rXYZ", b"gXYZ", b"bXYZ"), P3, strict=True):
+        (at,) = struct.unpack_from(">I", profile, profile.index(name) + 4)
+        struct.pack_into(">3i", profile, at + 8, *(round(65536 * part) for part in place))
+    return bytes(profile)
+
+
+def with_chunk(data: bytes, name: bytes, content: bytes) -> bytes:
+    """A PNG with one more chunk behind its header."""
+    chunk = struct.pack(">I", len(content)) + name + content
+    return data[:33] + chunk + struct.pack(">I", zlib.crc32(name + content)) + data[33:]
+
+
+def patches(coded: Array) -> Image.Image:
+    """An image with a patch of 16 px for each row, in [0, 1]."""
+    shades = np.rint(255 * np.clip(coded, 0, 1)).astype(np.uint8)
+    return Image.fromarray(shades[None].repeat(16, 0).repeat(16, 1))
+
+
+def shown_patches(image: Array) -> Array:
+    height, width = image.shape[:2]
+    return image[height // 2, [width * (2 * k + 1) // (2 * len(PATCHES)) for k in range(len(PATCHES))]]
+
+
+P3_CODED = as_srgb(linear(PATCHES) @ TO_P3.T)
+CODED = {
+    "profile": (P3_CODED, {"icc_profile": p3_profile()}, []),
+    "profile before gAMA": (P3_CODED, {"icc_profile": p3_profile()}, [(b"gAMA", struct.pack(">I", 100_000))]),
+    "linear": (linear(PATCHES), {}, [(b"gAMA", struct.pack(">I", 100_000))]),
+    "gAMA of sRGB": (PATCHES / 255, {}, [(b"gAMA", struct.pack(">I", 45_455))]),
+    "cICP of P3": (P3_CODED, {}, [(b"cICP", bytes([12, 13, 0, 1]))]),
+    "cICP of HLG": (as_hlg(PATCHES), {}, [(b"cICP", bytes([9, 18, 0, 1]))]),
+    "cICP of PQ": (as_pq(PATCHES), {}, [(b"cICP", bytes([9, 16, 0, 1]))]),
+    "nothing": (PATCHES / 255, {}, []),
+}
+
+
+@pytest.mark.parametrize("case", CODED)
+def test_photographs_are_read_as_srgb(case: str, tmp_path: Path) -> None:
+    coded, options, chunks = CODED[case]
+    file = io.BytesIO()
+    patches(coded).save(file, "png", **options)
+    data = file.getvalue()
+    for chunk in chunks:
+        data = with_chunk(data, *chunk)
+    (tmp_path / "a.png").write_bytes(data)
+    told: list[str] = []
+    found = shown_patches(np.asarray(read_photo(tmp_path / "a.png", True, told.append)))
+    assert np.abs(found.astype(int) - PATCHES).max() <= (
+        3 if case in ("cICP of HLG", "cICP of PQ") else 2
+    )  # of 8 bits
+    assert not told
+
+
+def test_colours_that_are_not_known_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_colmap(tmp_path)
+    want = load_photographs(tmp_path, CONFIG, tmp_path / "work").images[0]
+    file = tmp_path / "images/a.png"
+    plain = file.read_bytes()
+    for said in (with_chunk(plain, b"cICP", bytes([22, 9, 0, 1])), None):
+        caplog.clear()
+        if said is None:
+            Image.open(io.BytesIO(plain)).save(file, icc_profile=b"no profile")
+        else:
+            file.write_bytes(said)
+        np.testing.assert_array_equal(load_photographs(tmp_path, CONFIG, tmp_path / "work").images[0], want)
+        (line,) = caplog.messages
+        assert "a.png" in line
+
+
+def test_16_bits_and_12_in_them_become_8(tmp_path: Path) -> None:
+    shades = np.arange(256, dtype=np.uint16).reshape(16, 16)
+    for white, told_of in ((65535, 0), (4095, 1)):
+        told: list[str] = []
+        Image.fromarray((shades * (white / 255)).astype(np.uint16)).save(tmp_path / "a.png")
+        found = np.asarray(read_photo(tmp_path / "a.png", True, told.append))[..., 0]
+        assert np.abs(found.astype(int) - shades).max() <= 1
+        assert len(told) == told_of
+
+
+# Transparency: no part of the thing.
+
+
+def write_cut_out(folder: Path, inside: bool) -> None:
+    """Photographs with one transparent part: all around the thing, or a spot inside."""
+    write_colmap(folder)
+    for path in (folder / "images").iterdir():
+        alpha = np.full((30, 40), 255 * inside, np.uint8)
+        alpha[8:22, 10:30] = 255 * (not inside)
+        alpha[8, 10:30] = 100
+        image = Image.open(path)
+        image.putalpha(Image.fromarray(alpha))
+        image.save(path)
+
+
+@pytest.mark.parametrize("alpha", ["auto", "mask", "background"])
+@pytest.mark.parametrize("inside", [True, False])
+def test_transparency_is_a_mask_or_an_empty_background(
+    tmp_path: Path,
+    inside: bool,
+    alpha: Literal["auto", "mask", "background"],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    write_cut_out(tmp_path, inside)
+    config = replace(CONFIG, alpha=alpha)
+    capture = load_photographs(tmp_path, config, tmp_path / "work")
+    assert capture.cut_out == (not inside if alpha == "auto" else alpha == "background")
+    counted = capture.mask(0)
+    assert counted is not None
+    assert bool(counted[15, 20]) != inside
+    assert bool(counted[8, 20]) == capture.cut_out  # the thing's edge
+    assert (capture.images[0][15 if inside else 0, 20] == 0).all()
+    assert len(caplog.messages) == (alpha == "auto")
+    again = capture.read_at([0], 30)
+    assert again.cut_out == capture.cut_out
+    assert again.mask(0) is not None
+
+
+def test_cut_out_background_stays_empty() -> None:
+    """A red ball before nothing, from points all over the space around it."""
+    rng = np.random.default_rng(3)
+    cameras, images, masks = [], [], []
+    for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
+        eye = 4 * np.array([np.cos(angle), np.sin(angle), 0.3])
+        camera = replace(look_at(eye, np.zeros(3), np.array([0, 0, 1.0]), (48, 48)), name=f"{angle:.2f}")
+        y, x = np.mgrid[:48, :48]
+        mask = np.hypot(x - 23.5, y - 23.5) < 10
+        cameras.append(camera)
+        masks.append(mask)
+        images.append(np.where(mask[..., None], np.uint8([200, 40, 40]), np.uint8(0)))
+    points = rng.uniform(-1.5, 1.5, (400, 3))
+    colours = np.zeros((400, 3), np.uint8)
+    capture = Capture(tuple(cameras), tuple(images), points, colours, masks=tuple(masks), cut_out=True)
+    config = RadianceConfig(steps=150, sh_degree=0, max_gaussians=600, backend="cpu")
+    gaussians = train_radiance(capture, config, range(8))
+    alphas = [render(Scene(gaussians), camera).alpha for camera in cameras]
+    assert np.mean([alpha[~mask].mean() for alpha, mask in zip(alphas, masks, strict=True)]) < 0.05
+    assert np.mean([alpha[mask].mean() for alpha, mask in zip(alphas, masks, strict=True)]) > 0.8
 
 
 # Masks beside photographs.
@@ -150,12 +344,12 @@ def test_a_mask_has_the_shape_of_the_photograph_as_it_is_shown(tmp_path: Path) -
     shown[:, :20] = False
     mask = mask_file(tmp_path / "masks/a.png", shown)
     photo = Photo(tmp_path / "a.jpg", "a.jpg", LENS, np.eye(4), upright=True, mask=mask)
-    _, _, _, (found,) = develop([photo], 120, silent)
+    (found,) = develop([photo], DatasetConfig(max_side=120), silent).masks
     assert found is not None
     np.testing.assert_array_equal(found, shown.repeat(2, 0).repeat(2, 1))
     mask_file(mask, shown.T)
     with pytest.raises(InputError, match=r"a\.png: is 45x60 pixels, its photograph 120x90"):
-        develop([photo], 120, silent)
+        develop([photo], DatasetConfig(max_side=120), silent)
 
 
 def test_a_photograph_of_which_nothing_counts_is_left_out(
@@ -165,8 +359,8 @@ def test_a_photograph_of_which_nothing_counts_is_left_out(
     mask = mask_file(tmp_path / "masks/view_1.png", np.zeros((90, 120), bool))
     photos = [Photo(tmp_path / name, name, LENS, np.eye(4)) for name in names]
     photos[1] = replace(photos[1], mask=mask)
-    cameras, _, _, masks = develop(photos, 120, silent)
-    assert ([camera.name for camera in cameras], masks) == (["view_0"], ())
+    views = develop(photos, DatasetConfig(max_side=120), silent)
+    assert ([camera.name for camera in views.cameras], views.masks) == (["view_0"], ())
     assert "view_1.png (its mask leaves nothing of it)" in caplog.text
 
 
@@ -247,6 +441,41 @@ def scene(step: int, blur: float = 0.0) -> Array:
     image[: HEIGHT // 2, :, 0] = image[HEIGHT // 2 :, :, 2] = 200
     image[:, (np.arange(WIDTH) + step) % 12 < 4] += 50
     return gaussian_filter(image, (blur, blur, 0)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("size", "deep", "tags", "aspect"),
+    [
+        ((1280, 720), False, (2, 2, 2), 1),  # HD without a word
+        ((640, 320), False, (5, 6, 6), 1),  # BT.601
+        ((640, 320), True, (9, 18, 9), 1),  # HLG
+        ((480, 360), False, (1, 1, 1), Fraction(4, 3)),  # pixels that are wider than high
+        ((480, 360), False, (1, 1, 1), Fraction(3, 4)),
+    ],
+)
+def test_videos_are_read_as_they_are_shown(
+    size: tuple[int, int], deep: bool, tags: tuple[int, int, int], aspect: Fraction, tmp_path: Path
+) -> None:
+    coded = (as_hlg(PATCHES) if deep else PATCHES / 255)[np.arange(size[0]) * len(PATCHES) // size[0]]
+    image = np.broadcast_to(coded, (size[1], size[0], 3))
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options={"crf": "8"})
+        stream.width, stream.height = size
+        stream.pix_fmt = "yuv420p10le" if deep else "yuv420p"
+        stream.codec_context.sample_aspect_ratio = aspect
+        context = stream.codec_context
+        context.colorspace, context.color_trc, context.color_primaries, context.color_range = *tags, 1
+        for _ in range(3):
+            whole = np.rint(image * (65535 if deep else 255)).astype("<u2" if deep else "u1")
+            frame = av.VideoFrame.from_ndarray(whole, format="rgb48le" if deep else "rgb24")
+            made = 1 if tags[0] == 2 else tags[0]
+            shown = frame.reformat(format=stream.pix_fmt, dst_colorspace=made, dst_color_range=1)
+            shown.colorspace, shown.color_trc, shown.color_primaries, shown.color_range = *tags, 1
+            container.mux(stream.encode(shown))
+        container.mux(stream.encode())
+    first = np.asarray(Image.open(extract_frames(tmp_path / "a.mp4", tmp_path / "out", 3)[0]))
+    assert first.shape[:2] == (round(size[1] / min(aspect, 1)), round(size[0] * max(aspect, 1)))
+    assert np.abs(shown_patches(first).astype(int) - PATCHES).max() <= 5
 
 
 def write_video(path: Path, images: list[Array], rate: int = 10) -> Path:

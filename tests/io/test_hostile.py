@@ -15,6 +15,7 @@ import pytest
 import zstandard
 from PIL import Image
 
+from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import read_photo
 from langsplat_core.io.cameras import read_cameras
@@ -367,7 +368,7 @@ def read_any(path: Path) -> float:
         case ".npz":
             read_npz(path)
         case ".json":
-            load_nerfstudio(path, 64, silent)
+            load_nerfstudio(path, DatasetConfig(max_side=64), silent)
         case _:
             load_gaussians(path)
     return 1.0

@@ -25,6 +25,7 @@ from assets.making.kit import Kit
 from assets.making.objects import EVERYTHING
 from assets.making.render import Renderer
 from assets.making.world import World, bounds, build_room, label_region
+from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import EncoderError
 from langsplat_core.io.scenes import load_scene
@@ -66,7 +67,7 @@ def test_truth_is_nested_and_follows_the_seed(world):
 
 def test_written_dataset_is_read_back(tmp_path, coarse_light):
     write_dataset(tmp_path, 1, 5, (64, 48), silent)
-    capture = load_nerfstudio(tmp_path / "transforms.json", 800, silent)
+    capture = load_nerfstudio(tmp_path / "transforms.json", DatasetConfig(), silent)
     assert (capture.metres_per_unit, capture.drawn) == (1, True)
     assert len(capture) == 5
     assert capture.images[0].shape == (48, 64, 3)

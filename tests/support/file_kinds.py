@@ -22,6 +22,7 @@ import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import unit
+from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
@@ -510,7 +511,7 @@ def cloud_folder(folder: Path) -> list[bytes]:
 
 
 def beside_transforms(path: Path) -> float:
-    return _usable(load_nerfstudio(path.parent / "transforms.json", 64, silent))
+    return _usable(load_nerfstudio(path.parent / "transforms.json", DatasetConfig(max_side=64), silent))
 
 
 def _usable(capture: Capture) -> float:
@@ -528,7 +529,9 @@ def colmap(part: str) -> FileKind:
         return [(write_colmap(folder, part.rpartition(".")[2]) / part).read_bytes()]
 
     def read(path: Path) -> float:
-        return _usable(load_colmap(path.parent.parent.parent, path.parent, 64, silent))
+        return _usable(
+            load_colmap(path.parent.parent.parent, path.parent, DatasetConfig(max_side=64), silent)
+        )
 
     return FileKind(f"sparse/0/{part}", samples, read)
 

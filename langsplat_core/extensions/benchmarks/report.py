@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import InputError, shortened
@@ -434,7 +435,8 @@ def _other_cameras(
 
 def _dataset_cameras(folder: Path, progress: Progress) -> tuple[Camera, ...]:
     """Return the cameras that came with a dataset; none where it has none. Photographs are not shrunk."""
+    whole = DatasetConfig(max_side=65_536)
     if (folder / "transforms.json").is_file():
-        return load_nerfstudio(folder / "transforms.json", 100_000, progress).cameras
+        return load_nerfstudio(folder / "transforms.json", whole, progress).cameras
     model = find_model(folder)
-    return () if model is None else load_colmap(folder, model, 100_000, progress).cameras
+    return () if model is None else load_colmap(folder, model, whole, progress).cameras

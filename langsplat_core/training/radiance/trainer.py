@@ -216,6 +216,7 @@ class _Views:
         def kept(image: Array | None) -> Array | Tensor | None:
             return image if image is None or device.type == "cpu" else torch.tensor(image, device=device)
 
+        self.cut_out = capture.cut_out
         self.cameras = [capture.cameras[i] for i in indices]
         views = [(capture.cameras[i], capture.images[i], capture.mask(i)) for i in indices]
         self._fine, self._coarse = (
@@ -266,11 +267,12 @@ class _Run:
         if exposing and step >= exposing[0]:
             image = with_exposure(image, state.exposures[index])
         self.observe_transients(state, index, image, target, mask)
-        mask = self.counted(state, index, mask, camera)
+        loss = self.emptiness(rendered.alpha, mask)
+        mask = self.counted(state, index, None if self.views.cut_out else mask, camera)
         if mask is not None:  # what is masked differs from nothing, and nothing flows back from it
             image = torch.where(mask[..., None], image, image.detach())
             target = torch.where(mask[..., None], target, image.detach())
-        loss = radiance_loss(image, target, config.lambda_dssim)
+        loss = loss + radiance_loss(image, target, config.lambda_dssim)
         loss.backward()
         if config.opacity_decay > 0:
             add_opacity_decay(state, config.opacity_decay)
@@ -287,6 +289,10 @@ class _Run:
             reset_opacities(state)
         state.step = step
         return float(loss.detach())
+
+    def emptiness(self, alpha: Tensor, mask: Tensor | None) -> Tensor | float:
+        """Return the mean alpha where a view shows nothing: black Gaussians would look as empty as none."""
+        return alpha.masked_fill(mask, 0).mean() if self.views.cut_out and mask is not None else 0.0
 
     def find_exposures(self, state: TrainingState) -> Tensor:
         """(V, 4, 3) exposures of the training views; no change where they explain too little."""
