@@ -9,7 +9,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import atomic_path, is_utf8
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import format_of
 from langsplat_core.pipeline.report import work_folder
@@ -52,7 +52,7 @@ def list_folder(folder: Path) -> Listing:
 
 
 def _entry(path: Path) -> FolderEntry | None:
-    if path.name.startswith("."):
+    if path.name.startswith(".") or not is_utf8(path):
         return None
     try:
         if path.is_dir():

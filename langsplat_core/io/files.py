@@ -118,6 +118,11 @@ def check_output_folder(path: Path | str) -> None:
         raise InputError(f"{shown(path)}: is a file; name a folder")
 
 
+def is_utf8(path: Path | str) -> bool:
+    """Return False for a name of bytes that are no text, which neither a window nor JSON can hold."""
+    return not re.search("[\\ud800-\\udfff]", str(path))
+
+
 def shown(path: Path | str) -> str:
     """Return a path for a message: printable, and without its middle where it is long."""
     text = str(path).encode("utf-8", "backslashreplace").decode()

@@ -218,7 +218,12 @@ def read_json_file(path: Path, limit: int) -> Any:
     data = read_file(path, limit)
     with _as_json(path):
         _check_values(data, path)
-        return json.loads(decode_text(data, path))
+        text = decode_text(data, path)
+        # an integer of 400 digits has no float, and half a character no window can show
+        value = json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 20 else float(digits))
+        if re.search(r"\\u[dD][89a-fA-F]", text):
+            json.dumps(value, ensure_ascii=False).encode()
+        return value
 
 
 def decode_json(text: bytes, kind: type[T], path: Path) -> T:

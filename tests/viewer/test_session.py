@@ -397,7 +397,7 @@ def test_damaged_file_is_refused_in_one_line(saved, name):
     refused: list[str] = []
     tried = 0
     for way in list(places(top)):
-        for odd in (None, "x", -1, True, [], {}, 1e308, 10**400, [[["x"]]], "\0"):
+        for odd in (None, "x", -1, True, [], {}, 1e308, 10**400, [[["x"]]], "\0", "\ud800"):
             broken = copy.deepcopy(top)
             inner = broken
             for step in way[:-1]:

@@ -11,6 +11,7 @@ from langsplat_core.compiled import is_compiled
 from langsplat_core.datasets.photos import count_photographs
 from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError, LangSplatError
+from langsplat_core.io.files import is_utf8, shown
 from langsplat_core.io.scenes import format_of, scene_files
 from langsplat_core.pipeline.report import stated_warnings, work_folder
 from langsplat_core.progress import Progress
@@ -54,6 +55,9 @@ def open_scene(
     The scene shown so far stays until the new one is there, and for good if that fails; what was deleted in
     it and not saved is asked about first. `check` raises InputError for a scene that is not to be shown.
     """
+    if not is_utf8(path):
+        viewer.say_error(f"{shown(path)}: its name is not UTF-8, which a window cannot show; rename it")
+        return
 
     def load(progress: Progress) -> _Opened:
         progress(f"opening {path.name}", 0.1)

@@ -16,7 +16,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import accumulate, chain
+from itertools import accumulate, chain, filterfalse
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -32,7 +32,7 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import Channels
 from langsplat_core.errors import EncoderError, FormatError, InputError, LangSplatError, printable_line
-from langsplat_core.io.files import atomic_path, locked
+from langsplat_core.io.files import atomic_path, is_utf8, locked, shown
 from langsplat_core.io.hostile import FromFile, exists, open_for_reading
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
 from langsplat_core.io.sidecar import SUFFIX, read_stored
@@ -166,7 +166,10 @@ def scenes_in(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: no such folder; name one with scenes in it")
     found: list[Path] = []
     for root, folders, files in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in filterfalse(is_utf8, (*folders, *files)):
+            log.warning("not searched: %s: its name is not UTF-8; rename it", shown(Path(root, name)))
+        files[:] = filter(is_utf8, files)
+        folders[:] = sorted(name for name in folders if is_utf8(name) and not name.startswith("."))
         fields = {name.removesuffix(SUFFIX) for name in files if name.endswith(SUFFIX)}
         if not fields:
             continue
