@@ -220,6 +220,7 @@ FAR = 100.0  # radii from zero, from which on steps of float32 are more than 1e-
 LOOKED_AT = 4096  # positions, evenly taken: enough for a median
 
 
+@np.errstate(over="ignore", invalid="ignore")  # whatever a file holds
 def origin_of(points: Array) -> Array:
     """Return the (3,) float64 origin about which float32 holds (N, 3) positions: zero unless they are far.
 

@@ -131,7 +131,10 @@ def similarity(matrix: Array) -> Similarity:
         raise InputError("a matrix whose numbers are not all finite is no transform")
     if matrix.shape[0] == 4 and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
         raise InputError("the last row of a transform's matrix must be 0 0 0 1")
-    determinant = float(np.linalg.det(linear))
+    with np.errstate(over="ignore"):
+        determinant = float(np.linalg.det(linear))
+    if not np.isfinite(determinant):
+        raise InputError("the matrix makes the scene larger than numbers can say")
     if determinant < 0:
         raise InputError("the matrix mirrors the scene, which Gaussians cannot follow; negate one axis of it")
     if (scale := determinant ** (1 / 3)) <= 1e-12:

@@ -1,5 +1,6 @@
 """The INRIA PLY in all its variants, SuperSplat's compressed one, and one broken rule of either at a time."""
 
+import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -247,6 +248,25 @@ MALFORMED = {  # a good file, and what of it is replaced by what
     "too few chunks": (PACKED, b"chunk 3\n", b"chunk 2\n"),
     "coefficients of chars": (PACKED, b"uchar f_rest_3", b"char f_rest_3"),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("lengths", ["3 3 3 4", "0" * 50, "random", "hole"])
+def test_lists_of_any_lengths_before_the_vertices_are_skipped(tmp_path, put, lengths):
+    """A hole of millions of empty lists takes no time."""
+    rng = np.random.default_rng(0)
+    counts = rng.integers(0, 5, 300) if lengths == "random" else [int(n) for n in lengths if n.isdigit()]
+    rows = b"".join(bytes([count]) + bytes(4 * count) + b"\7" for count in counts)
+    number = 8_000_000 if lengths == "hole" else len(counts)
+    faces = f"element face {number}\nproperty list uchar int v\nproperty uchar flag\n".encode()
+    header, end, body = PLAIN.partition(b"end_header\n")
+    path = tmp_path / "a.ply"
+    with path.open("wb") as file:
+        file.write(header.replace(b"element vertex", faces + b"element vertex") + end + rows)
+        file.seek(2 * number if lengths == "hole" else 0, 1)
+        file.write(body)
+    began = time.process_time()
+    assert_same(read_ply(path), read_ply(put(PLAIN, "plain.ply")))
+    assert time.process_time() - began < 5
 
 
 @pytest.mark.parametrize("case", MALFORMED)

@@ -352,15 +352,22 @@ def tried(kind: FileKind, folder: Path, contents: Iterable[bytes]) -> Outcome:
 def _verdict(kind: FileKind, path: Path, said: list[str], outcome: Outcome) -> str | None:
     """The fault, if any; counts what loaded."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            sound = kind.read(path)
+        with warnings.catch_warnings(record=True) as warned:  # raised, a broad `except` would hide them
+            warnings.simplefilter("always")
+            try:
+                sound = kind.read(path)
+            finally:
+                given = [
+                    f"{Path(one.filename).name}:{one.lineno}: {one.message}"
+                    for one in warned
+                    if "/PIL/" not in one.filename  # which `io.hostile` silences
+                ]
     except InputError as error:
-        return _bad_line(str(error))
+        return f"warning: {given[0]}" if given else _bad_line(str(error))
     except Exception as error:  # noqa: BLE001  which is what is looked for
         last = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__} ({str(error)[:80]}) at {Path(last.filename).name}:{last.lineno}"
-    bad = next((line for line in map(_bad_line, said) if line), None)
+    bad = f"warning: {given[0]}" if given else next(filter(None, map(_bad_line, said)), None)
     if bad is None and sound < 0.5 and not said:
         bad = "mostly unsound, unsaid"
     outcome.loaded += bad is None

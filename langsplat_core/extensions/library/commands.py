@@ -132,7 +132,9 @@ def _hit_fields(hit: Hit, library: Library) -> dict[str, Any]:
 
 def _html(listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> str:
     """Return the answers that have pictures, under the headings of their phrases."""
-    parts = ["<!doctype html><meta charset='utf-8'><title>langsplat find</title>"]
+    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # names of files are no code
+    parts = [f'<!doctype html><meta http-equiv="Content-Security-Policy" content="{policy}">']
+    parts += ["<meta charset='utf-8'><title>langsplat find</title>"]
     parts += ["<style>body{font:14px sans-serif}figure{display:inline-block;margin:4px}</style>"]
     for answered, hits in listed:
         parts.append(f"<h2>{html.escape(_heading(answered))}</h2>")
