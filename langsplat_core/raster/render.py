@@ -27,6 +27,8 @@ from langsplat_core.raster.protocol import (
     LiftingView,
     V,
     View,
+    dilation,
+    farthest,
 )
 from langsplat_core.scene import Camera, Gaussians, Scene
 
@@ -121,12 +123,41 @@ def pixel_weights(
 ) -> tuple[Array, Array]:
     """(M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and their (M,) float32 weights.
 
-    The weights, alpha_i T_i > 0, add up to the pixel's alpha; rasterizer and settings as in `view_of`. The
+    The weights, alpha_i T_i > 0, add up to the pixel's alpha; rasterizer and settings as in `view_of`. Only
+    those that could reach the pixel are projected, in their order: weights are those of the whole view. The
     pixel must lie in the image.
     """
     column, row = pixel
+    formed = scene.raster_settings() if settings is None else settings
+    near = np.flatnonzero(_may_reach(scene.gaussians, camera, pixel, formed))
+    view = (rasterizer or _cpu()).view(scene.gaussians.take(near), camera, formed)
     chosen = np.zeros((camera.height, camera.width, 1), np.float32)
     chosen[row, column] = 1
-    weights = view_of(scene, camera, rasterizer or _cpu(), settings).gather(chosen)[:, 0]
-    painting = np.flatnonzero(weights > 0)
-    return painting, weights[painting]
+    weights = np.asarray(view.gather(chosen))[:, 0]
+    painting = weights > 0
+    return near[painting], weights[painting]
+
+
+def _may_reach(
+    gaussians: Gaussians, camera: Camera, pixel: tuple[int, int], settings: RasterSettings
+) -> Array:
+    """(N,) bool, True for every Gaussian whose footprint may cover the pixel, and for few others.
+
+    The footprint's covariance is J R S S^T R^T J^T + dilation, so its largest eigenvalue is at most
+    |J|^2 s_max^2 + dilation with |J|^2 <= (f/z)^2 (1 + (x/z)^2 + (y/z)^2), and f^2 of an orthographic camera;
+    beyond sqrt(2 ln(1 / alpha_min)) deviations alpha is below the cut-off. A clamped J is only smaller.
+    """
+    with np.errstate(all="ignore"):  # invalid rows are dropped by the view
+        points = gaussians.means @ camera.rotation.T.astype(np.float32)  # rounded: this is a sieve
+        x, y, z = np.ascontiguousarray((points + camera.world_to_camera[:3, 3].astype(np.float32)).T)
+        largest = np.float32(max(camera.fx, camera.fy)) * np.exp(gaussians.log_scales.max(1))
+        if not camera.orthographic:
+            x, y = x / z, y / z
+            largest *= np.sqrt(1 + x * x + y * y) / z
+        variance = largest**2 + np.float32(dilation(camera, settings))
+        reach = np.sqrt(np.float32(2 * np.log(1 / settings.alpha_min)) * variance) + 1
+        across = np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5))
+        down = np.abs(camera.fy * y + np.float32(camera.cy - pixel[1] - 0.5))
+        in_front = (z > 0.999 * settings.near) & (z < 1.001 * farthest(settings))
+        reached: Array = in_front & ~(np.maximum(across, down) > 1.01 * reach)
+    return reached

@@ -387,6 +387,20 @@ def test_pixel_weights_are_a_row_of_w(backend, distance, orthographic):
         np.testing.assert_allclose(got, truth.gather(image)[:, 0], atol=2e-5)
 
 
+def test_pixel_weights_project_few_gaussians():
+    gaussians, seen = random_gaussians(2000, 4, scale_range=(0.005, 0.02)), []
+
+    class Recorder:
+        name = "recorder"
+
+        def view(self, some, camera, settings=INRIA):
+            seen.append(len(some))
+            return load_lifting_rasterizer("cpu").view(some, camera, settings)
+
+    pixel_weights(Scene(gaussians), view_from(3.0), (32, 24), Recorder())
+    assert seen[0] < 200
+
+
 def test_empty_scenes_have_no_pixel_weights():
     rows, weights = pixel_weights(Scene(random_gaussians(20).take(slice(0))), view_from(3.0), (1, 1))
     assert len(rows) == len(weights) == 0
