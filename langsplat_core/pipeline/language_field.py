@@ -401,7 +401,8 @@ def agreed_features(
     for index in processes.share(range(len(views))):
         camera, _ = views[index]
         if not store.has(camera.name, made_by):
-            drawn = draw_patches(rasterizer.view(gaussians, camera, formed), gaussians, tree.patches)
+            view = rasterizer.view(gaussians, camera, formed)
+            drawn = draw_patches(view, gaussians, tree.patches, formed)
             image, mask = photographs[index]
             maps = within(nested_maps(drawn, cuts, LEAST), mask)
             store.save(camera.name, ImageFeatures(maps, embed_regions(image, maps, encoder)), made_by)

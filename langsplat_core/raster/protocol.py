@@ -98,6 +98,11 @@ class LiftingView(View):
         if maps.max(initial=-1) >= count or maps.min(initial=-1) < -1:
             raise ValueError(f"maps: labels {maps.min()} to {maps.max()}, expected -1 to {count - 1}")
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that the view holds beside its Gaussians, about."""
+        return 100 * self.count
+
 
 V = TypeVar("V", bound=View, covariant=True)
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 from langsplat_core.arrays import Array, check_array, logit, rotation_matrices, sigmoid
+from langsplat_core.config import INRIA
 from langsplat_core.progress import Progress, silent
 
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16}  # degree -> coefficients per colour channel
@@ -55,6 +56,12 @@ class Gaussians:
     def take(self, rows: Array) -> "Gaussians":
         """Return the Gaussians at `rows`: indices or a boolean mask of length N."""
         return Gaussians(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    @cached_property
+    def sample(self) -> "Gaussians":
+        """Some of those that can be seen, at most 10 000, evenly taken."""
+        some = self.take(np.arange(0, len(self), len(self) // 10_000 + 1))
+        return some.take(some.valid() & (some.opacity_logits >= logit(np.array(INRIA.alpha_min))))
 
     def valid(self) -> Array:
         """(N,) True where a row can be drawn, see `invalid_rows` for why it cannot."""

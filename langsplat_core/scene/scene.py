@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from langsplat_core.arrays import Array, across, check_array, logit, unit
+from langsplat_core.arrays import Array, across, check_array, unit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene.gaussians import Gaussians
 from langsplat_core.scene.language import LanguageField
@@ -173,7 +173,7 @@ def look_at(
 NEAR = 0.05  # of the depth of the middle of what is seen, or of the radius of what no camera sees
 LEAST_NEAR = 0.01  # the same where things are nearer: what is nearer yet is fog before the eye
 NEAREST, NEAR_OF_NEAREST = 0.01, 0.25  # of what is seen, that passes for the nearest, and of its depth
-NEAR_CAMERAS, NEAR_SAMPLES = 16, 10_000  # that are enough to tell
+NEAR_CAMERAS = 16  # that are enough to tell
 
 
 def near_plane(gaussians: Gaussians, cameras: Sequence[Camera], most: float | None = None) -> float:
@@ -182,9 +182,7 @@ def near_plane(gaussians: Gaussians, cameras: Sequence[Camera], most: float | No
     most: it is no farther; None: it is `NEAR` of the middle's. Published code has 0.2 in every unit
     (`config.INRIA`). Orthographic cameras do not tell.
     """
-    rows = slice(None, None, len(gaussians) // NEAR_SAMPLES + 1)
-    seen = gaussians.valid()[rows] & (gaussians.opacity_logits[rows] >= logit(np.array(INRIA.alpha_min)))
-    points = gaussians.means[rows][seen].astype(np.float64)
+    points = gaussians.sample.means.astype(np.float64)
     telling = [camera for camera in cameras if not camera.orthographic]
     depths = [np.zeros(0)]
     for camera in telling[:: max(-(-len(telling) // NEAR_CAMERAS), 1)]:
@@ -192,7 +190,7 @@ def near_plane(gaussians: Gaussians, cameras: Sequence[Camera], most: float | No
         depths.append(z[camera.in_image(pixels, z)])
     every = np.concatenate(depths)
     if len(every) == 0:
-        return most or NEAR * bounds_of(gaussians)[1]
+        return most or NEAR * bounds_of(gaussians.sample)[1]
     nearest, middle = np.quantile(every, (NEAREST, 0.5))
     return float(min(most or NEAR * middle, max(NEAR_OF_NEAREST * nearest, LEAST_NEAR * middle)))
 

@@ -341,6 +341,11 @@ class CpuView(LiftingView):
             self._over_tiles(splat_tiles, part, parts[-1], alpha)
         return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha[..., 0]
 
+    @property
+    def nbytes(self) -> int:
+        arrays = (self.order, self._depths, *self.tiles)
+        return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
+
     def gather(self, image: Array) -> Array:
         """Return W^T image, (N, C) float32, summed in float64 over tiles."""
         check_array("image", image, (self.camera.height, self.camera.width, "C"))

@@ -375,6 +375,8 @@ def lift_latents(
 # the first gradients about 1e9 times too large, which Adam's second moment must forget before anything
 # moves; from the one-pass mean the same loss is reached much sooner.
 
+KEPT_BYTES = 4e9  # of views that are kept; further ones are projected again at every step
+
 
 def lift_by_gradient(
     rasterizer: LiftingRasterizer,
@@ -402,9 +404,7 @@ def lift_by_gradient(
         (camera, np.asarray(seen.labels, np.int32), plain(codec.encode(seen.vectors)))
         for camera, seen in views
     ]
-    # The geometry is frozen: views are kept as far as memory allows, 100 bytes a Gaussian in each.
-    most = int(4e9 / (100 * max(len(gaussians), 1)))
-    kept = [rasterizer.view(gaussians, camera, settings) for camera, _ in views[:most]]
+    kept: dict[int, LiftingView] = {}
     generator = np.random.default_rng(config.seed)
     order = generator.permutation(len(views))
     for step in range(config.steps):
@@ -412,7 +412,11 @@ def lift_by_gradient(
             order = generator.permutation(len(views))
         index = int(order[step % len(views)])
         camera, labels, latents = targets[index]
-        view = kept[index] if index < len(kept) else rasterizer.view(gaussians, camera, settings)
+        view = kept.get(index)
+        if view is None:  # the geometry is frozen: views are kept as far as memory allows
+            view = rasterizer.view(gaussians, camera, settings)
+            if sum(one.nbytes for one in (view, *kept.values())) <= KEPT_BYTES:
+                kept[index] = view
         loss, gradient = _loss_and_gradient(view, labels, latents, blended(x) if published else x)
         features.grad = torch.from_numpy(plain(by_features(x, gradient) if published else gradient))
         adam.step()

@@ -27,10 +27,11 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel, shared_workers
+from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.io.shapes import base_colours
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingView
-from langsplat_core.raster.reference import project
+from langsplat_core.raster.reference import Footprints, project
 from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.scene.surface import Surface, divide, surface_areas
 from langsplat_core.semantics.masks import within
@@ -320,17 +321,20 @@ SOLID = 0.5  # of a pixel: where the Gaussians cover less, there is nothing
 CELL = 8  # pixels a side, in which patches of one channel keep apart
 
 
-def draw_patches(view: LiftingView, gaussians: Gaussians, patches: Array) -> Array:
+def draw_patches(
+    view: LiftingView, gaussians: Gaussians, patches: Array, settings: RasterSettings = INRIA
+) -> Array:
     """Return the (H, W) int32 patch that most of each pixel is, -1 for none.
 
-    patches: (N,) int32 of the Gaussians, -1 for those of none. Patches whose boxes in the image do not meet
-    share a channel, so that thousands take some dozen.
+    patches: (N,) int32 of the Gaussians, -1 for those of none; settings: the view's. Patches whose boxes in
+    the image do not meet share a channel, so that thousands take some dozen.
     """
     inside = patches >= 0
     if not inside.any():
         return np.full((view.camera.height, view.camera.width), -1, np.int32)
     shown = np.bincount(patches[inside], view.contributions()[inside]) >= 1  # pixel
-    channel_of, owners = _share_channels(_boxes(view.camera, gaussians, patches, len(shown)), shown)
+    boxes = _boxes(project(gaussians, view.camera, settings), view.camera, patches, len(shown))
+    channel_of, owners = _share_channels(boxes, shown)
     channels = np.where(inside, channel_of[patches], -1)
     most = np.zeros((view.camera.height, view.camera.width), np.float32)
     drawn = np.full(most.shape, -1, np.int32)
@@ -344,9 +348,8 @@ def draw_patches(view: LiftingView, gaussians: Gaussians, patches: Array) -> Arr
     return drawn
 
 
-def _boxes(camera: Camera, gaussians: Gaussians, patches: Array, count: int) -> Array:
+def _boxes(footprints: Footprints, camera: Camera, patches: Array, count: int) -> Array:
     """(P, 4) left, top, right, bottom cell of what each patch may paint, the last two exclusive."""
-    footprints = project(gaussians, camera)
     drawn = np.flatnonzero((patches >= 0) & (footprints.opacities > 0))
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     np.minimum.at(low, patches[drawn], footprints.means_px[drawn] - footprints.extents_px[drawn] - 1)

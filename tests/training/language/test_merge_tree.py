@@ -9,7 +9,10 @@ from scipy import sparse
 
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.raster.render import view_of
+from langsplat_core.scene import Scene
 from langsplat_core.scene.surface import build_surface
+from langsplat_core.scene.transform import scaling, transform_scene
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.training.language import merge_tree as module
 from langsplat_core.training.language.lift import PAIR, MaskWeights
@@ -172,12 +175,15 @@ def test_cuts_at_rising_costs_are_nested():
         assert len(np.unique(np.stack([fine, coarse]), axis=1).T) == len(np.unique(fine))
 
 
-def test_pixels_show_their_heaviest_patch():
+@pytest.mark.parametrize("scale", [1, 0.01])
+def test_pixels_show_their_heaviest_patch(scale):
     gaussians, camera = random_gaussians(60, scale_range=(0.1, 0.4)), random_camera(1, 24, 18)
+    scene = transform_scene(Scene(gaussians, cameras=(camera,)), scaling(scale))
     patches = np.random.default_rng(0).integers(-1, 5, 60).astype(np.int32)
-    drawn = draw_patches(CpuRasterizer().view(gaussians, camera), gaussians, patches)
+    view = view_of(scene, scene.cameras[0], CpuRasterizer())
+    drawn = draw_patches(view, scene.gaussians, patches, scene.raster_settings())
     each = (patches[:, None] == np.arange(5)).astype(np.float64)
-    image, alpha = ReferenceRasterizer().view(gaussians, camera).splat(each)
+    image, alpha = view_of(scene, scene.cameras[0], ReferenceRasterizer()).splat(each)
     two = np.sort(image, axis=-1)[..., -2:]
     clear = (two[..., 1] - two[..., 0] > 1e-3) & (np.abs(alpha - SOLID) > 1e-3)
     want = np.where((alpha > SOLID) & (image.max(-1) > 0), image.argmax(-1), -1)
