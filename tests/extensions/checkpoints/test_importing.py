@@ -304,6 +304,15 @@ def test_wrong_elements(tmp_path, index, value, message):
     refused([tmp_path / "c.pth"], message)
 
 
+def test_damaged_autoencoders_are_refused(tmp_path):
+    good, checkpoint = autoencoder(D).state_dict(), langsplat(tmp_path, (1,))[0]
+    missing = {name: value for name, value in good.items() if name != "encoder.3.bias"}
+    infinite = good | {"decoder.4.bias": good["decoder.4.bias"] * torch.nan}
+    for state in (missing, infinite, {"layer.weight": torch.zeros(3, 3)}):
+        torch.save(state, tmp_path / "ae.pth")
+        refused([tmp_path / "ae.pth", checkpoint], "autoencoder('s| of) ")
+
+
 def test_files_that_do_not_go_together(tmp_path):
     ae, levels = best_ckpt(tmp_path), langsplat(tmp_path)
     refused(levels, "3 numbers per Gaussian, latents of LangSplat's autoencoder; name its best_ckpt.pth")
