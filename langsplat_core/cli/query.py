@@ -35,6 +35,7 @@ from langsplat_core.query.instances import Instance
 from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.selection import of_rows
 from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.language import split_phrases
@@ -199,11 +200,13 @@ class QueryScene:
         camera = camera_of(scene, self.camera) if scene.cameras else None
         engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
         unit = unit_of(self.scale or scene.metres_per_unit, scene.origin)
-        found = [self._ask(engine, text, camera) for text in self._askable(engine, camera)]
+        # one after the other: an answer has a number for every Gaussian and level
+        found = (self._ask(engine, text, camera) for text in self._askable(engine, camera))
+        view = None if camera is None else view_of(scene, camera)
         answers, tables = [], []
         for result, tree, of in found:
             understood = None if tree is None else unparse(tree)
-            answer = _answer(result, scene, engine, camera, self.mode) | {"reading": understood}
+            answer = _answer(result, engine, camera, view, self.mode) | {"reading": understood}
             things = engine.instances(result, self.instances) if result.found else ()
             counts = result.found or (isinstance(tree, Counted) and result.verdict == "weak match")
             number = count_things(engine, result) if counts else Number(0, 0, 0)
@@ -341,7 +344,7 @@ def _engine(scene: Scene, load: LoadEncoder, encoder: str, taught: Path | None) 
 
 
 def _answer(
-    result: QueryResult, scene: Scene, engine: QueryEngine, camera: Camera | None, mode: str
+    result: QueryResult, engine: QueryEngine, camera: Camera | None, view: View | None, mode: str
 ) -> dict[str, Any]:
     """One phrase's answer, ready for JSON. Pixel fields are None without cameras."""
     answer: dict[str, Any] = {
@@ -358,8 +361,7 @@ def _answer(
         "pixel_score": None,
         "view": None if camera is None else camera.name,
     }
-    if camera is not None:
-        view = view_of(scene, camera)
+    if view is not None:
         gate = PictureConfig().alpha_gate
         if mode == "paper":
             phrase = engine.text_vectors([result.phrase])
