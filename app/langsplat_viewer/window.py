@@ -212,6 +212,7 @@ class Window:
         params.callbacks.setup_imgui_style = self._workspace.style
         params.callbacks.show_menus = lambda: menus.draw_menus(self.viewer)
         params.callbacks.post_init = self._start
+        params.callbacks.pre_new_frame = self.keyboard.feed
         params.callbacks.show_gui = self._gui
         params.callbacks.before_imgui_render = self._draw
         params.callbacks.confirm_exit = self._may_close
@@ -295,6 +296,7 @@ class Window:
 
     def _gui(self) -> None:
         viewer = self.viewer
+        self.keyboard.keep()
         if self.failure is not None:  # leaving before a first frame would trip an assertion of hello_imgui
             hello_imgui.get_runner_params().app_shall_exit = True
             return
@@ -302,7 +304,6 @@ class Window:
             self._obey()
         if viewer.state.may_close:
             hello_imgui.get_runner_params().app_shall_exit = True
-        self.keyboard.keep()
         viewer.take_results()
         viewpoint.tick(viewer, imgui.get_time())
         opening.follow_beside(viewer)

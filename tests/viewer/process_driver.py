@@ -216,7 +216,7 @@ def leave(path: Path) -> None:
     open_window(path, options, Services(slow_load, lambda encoder_id: FakeEncoder()))
 
 
-def press(*keys: str) -> Iterator[None]:
+def press(window: Window, *keys: str) -> Iterator[None]:
     """Have keys arrive between two frames: "Ctrl+F" or "h"; goes on once all have had their effect."""
     io = imgui.get_io()
     for text in keys:
@@ -228,9 +228,8 @@ def press(*keys: str) -> Iterator[None]:
             io.add_input_character(ord(name))
         io.add_key_event(imgui.Key.mod_ctrl, False)  # people let go of it before the key as often as after it
         io.add_key_event(key, False)
-    for _ in range(8):
-        yield
-    while imgui.get_current_context().input_events_queue.size():
+    yield
+    while window.keyboard.is_waiting:
         yield
     for _ in range(8):
         yield
@@ -244,21 +243,33 @@ def typing(window: Window) -> Iterator[None]:
     while not state.suggestions.phrases:
         yield
     before = state.view
-    yield from press("Ctrl+F", *"hamburger")
+    yield from press(window, "Ctrl+F", *"hamburger")
     assert (state.drafts["##phrase"], state.view is before) == ("hamburger", True)
-    yield from press("escape", "Ctrl+A", "h")  # keys of the scene again
+    yield from press(window, "escape", "Ctrl+A", "h")  # keys of the scene again
     assert state.marks.hidden.all()
-    yield from press(*"u231")
+    held = (imgui.Key.u, "u"), (imgui.Key.slash, "/"), (imgui.Key.h, "h")  # all at once
+    for key, letter in held:
+        imgui.get_io().add_key_event(key, True)
+        imgui.get_io().add_input_character(ord(letter))
+    for _ in range(3):
+        yield
+    for key, _ in held:
+        imgui.get_io().add_key_event(key, False)
+    yield from press(window)
+    assert (state.drafts["##phrase"], state.marks.hidden.any()) == ("h", False)
+    assert not any(imgui.is_key_down(key) for key, _ in held)
+    yield from press(window, "escape", *"231")
     assert not state.marks.hidden.any()
     assert state.session.picture.display == "rgb"
-    yield from press("Ctrl+F", *"mug", "enter", *"plant", "enter", *"bo")
+    state.drafts["##phrase"] = "mug"
+    yield from press(window, "Ctrl+F", "enter", *"plant", "enter", *"bo")
     assert ([query.phrase for query in state.session.queries], state.drafts["##phrase"]) == (
         ["mug", "plant"],
         "bo",
     )
-    yield from press("tab")
+    yield from press(window, "tab")
     assert (state.drafts["##phrase"], state.show_panel) == ("book", True)
-    yield from press("up_arrow")
+    yield from press(window, "up_arrow")
     assert state.drafts["##phrase"] == "plant"
     print("PASSED", flush=True)
 
@@ -270,6 +281,7 @@ def drive(path: Path) -> None:
     window.idles = False
 
     def stepped() -> None:
+        gui()
         try:
             next(steps)
         except StopIteration:
@@ -277,7 +289,6 @@ def drive(path: Path) -> None:
         except AssertionError:
             traceback.print_exc()
             close()
-        gui()
 
     params.callbacks.show_gui = stepped
     immapp.run(params)

@@ -13,18 +13,20 @@ from langsplat_viewer.panels import select, ui
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 
-# imgui gives each frame one press of a key, in their order. What is typed while a text box is about to take
-# the keyboard waits for it: after Ctrl + F the first letters of a phrase would be commands.
+# imgui gives each frame one press of a key, but of several keys that overlap. What follows a command of one
+# letter, and what is typed before a text box has the keyboard, waits: after Ctrl + F the first letters of a
+# phrase would be commands, and its Enter would be lost.
 
 FOCUS_FRAMES = 3, 8  # least and most that a box has to take the keyboard; the one before may still have it
+KEY, TEXT = imgui.internal.InputEventType.key, imgui.internal.InputEventType.text
 
 
 class Keyboard:
-    """Keeps what is typed for a text box that is about to take the keyboard."""
+    """Keeps keys for later frames, in their order."""
 
     def __init__(self, state: ViewerState) -> None:
         self._state = state
-        self._typed: list[int] = []  # characters
+        self._kept = imgui.ImVector_InputEvent()
         self._waited = 0  # frames
 
     @property
@@ -32,18 +34,25 @@ class Keyboard:
         """True while keys are left for the next frames."""
         return self._state.awaits_keyboard or len(imgui.get_current_context().input_events_queue) > 0
 
+    def feed(self) -> None:
+        """Give imgui the keys that belong to the next frame; before it begins."""
+        queue, typing = imgui.get_current_context().input_events_queue, imgui.get_io().want_text_input
+        keeps = self._state.awaits_keyboard and self._waited < FOCUS_FRAMES[not typing]
+        self._state.awaits_keyboard, self._waited = keeps, self._waited + 1 if keeps else 0
+        now, has_text = imgui.ImVector_InputEvent(), False
+        for event in sorted(queue, key=lambda event: event.event_id):
+            keeps |= has_text and event.type == KEY  # not what a held key repeats: that would pile up
+            (self._kept if keeps and event.type in (KEY, TEXT) else now).push_back(event)
+            has_text |= event.type == TEXT and not typing
+        queue.clear()
+        for event in now:
+            queue.push_back(event)
+
     def keep(self) -> None:
-        """Keep what was typed, or give it to the box once that has the keyboard; as a frame begins."""
-        if not self._state.awaits_keyboard:
-            return
-        io, (least, most) = imgui.get_io(), FOCUS_FRAMES
-        self._typed += io.input_queue_characters
-        io.input_queue_characters.clear()
-        self._waited += 1
-        if self._waited > (least if io.want_text_input else most):
-            for character in self._typed:
-                io.input_queue_characters.push_back(character)
-            self._state.awaits_keyboard, self._typed, self._waited = False, [], 0
+        """Put the others back, once it has begun: imgui drops what repeats the last of its queue."""
+        for event in self._kept:
+            imgui.get_current_context().input_events_queue.push_back(event)
+        self._kept.clear()
 
 
 # Pressed keys run commands.
@@ -86,8 +95,9 @@ def handle_keys(viewer: Viewer) -> None:
         settings.put(viewer.state, letters_muted=False)
     typing, muted = imgui.get_io().want_text_input, viewer.state.letters_muted
     pressed = [one for one in COMMANDS if any(_pressed(chord(key), one, typing, muted) for key in one.keys)]
-    for command in pressed if not viewer.state.awaits_keyboard else ():
-        command.act(viewer)
+    for command in pressed:
+        if not viewer.state.awaits_keyboard:  # by one of them, either
+            command.act(viewer)
 
 
 def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool:
@@ -119,9 +129,8 @@ def handle(viewer: Viewer, area: ui.Area) -> None:
         _mouse(viewer, area)
     viewpoint.hover(viewer, _pixel(area))
     handle_keys(viewer)
-    state = viewer.state
-    others = io.want_text_input or io.key_ctrl or state.letters_muted or state.awaits_keyboard
-    if state.view is not None and not others:
+    letters = not (io.want_text_input or io.key_ctrl or viewer.state.letters_muted)
+    if viewer.state.view is not None and letters:
         _fly(viewer)
 
 

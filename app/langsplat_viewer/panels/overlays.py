@@ -326,9 +326,11 @@ def _axes(view: OrbitCamera, area: ui.Area) -> None:
     side = min(hello_imgui.em_size(AXES_EM), area.width, area.height)
     paint, middle = imgui.get_background_draw_list(), (area.corners[1].x - side / 2, area.top + side / 2)
     for (letter, colour), axis in zip(AXES, view.rotation.T, strict=True):
-        end = ImVec2(*(np.array(middle) + 0.35 * side * axis[:2]))
-        paint.add_line(ImVec2(*middle), end, _faded(colour, 1.0), 2.0)
-        paint.add_text(end, _faded(colour, 1.0), letter)
+        way, half = axis[:2] / max(float(np.linalg.norm(axis[:2])), 1e-3), imgui.calc_text_size(letter) / 2
+        end = np.array(middle) + 0.3 * side * axis[:2]
+        paint.add_line(ImVec2(*middle), ImVec2(*end), _faded(colour, 1.0), 2.0)
+        beyond = end + 1.2 * half.y * way  # the middle of the letter, off its line
+        paint.add_text(ImVec2(*beyond) - half, _faded(colour, 1.0), letter)
 
 
 def _ruler(ruler: Ruler, pen: Pen, metres: float | None) -> None:

@@ -181,6 +181,8 @@ def draw_hint(viewer: Viewer, area: ui.Area) -> None:
     state, tool = viewer.state, viewer.state.tools.tool
     if state.session.ruler.measures:
         text = "Ruler: click two points on the surface; Esc ends it"
+        if state.scene is not None and state.scene.metres_per_unit is None:
+            text += ". langsplat scale gives the scene metres"
     elif state.pins_notes:
         text = "Note: click what it is about; Esc leaves"
     elif tool is not None:
