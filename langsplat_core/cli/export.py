@@ -241,7 +241,8 @@ def _extent(scene: Scene) -> str:
     if not len(means):
         return "the scene holds none that lies anywhere"
     ends = scene.in_world(np.stack([means.min(0), means.max(0)]))
-    low, high = (" ".join(f"{number:.9g}" for number in corner) for corner in ends.round(3))
+    digits = 10 if scene.origin.any() else 4
+    low, high = (" ".join(f"{number:.{digits}g}" for number in corner) for corner in ends)
     return f"they lie between {low} and {high}"
 
 

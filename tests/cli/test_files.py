@@ -217,6 +217,14 @@ def test_impossible_edits_write_nothing(words, source, tmp_path, capsys):
     assert sorted(tmp_path.iterdir()) == before
 
 
+def test_empty_crop_tells_the_extent_in_any_unit(scene, tmp_path, capsys):
+    means = np.float32(1e-5) * scene.gaussians.means
+    save_scene(tmp_path / "s.ply", Scene(replace(scene.gaussians, means=means)))
+    said = refusal(capsys, "crop", tmp_path / "s.ply", tmp_path / "out.ply", "--box", 9, 9, 9, 8, 8, 8)
+    numbers = [float(word) for word in said.replace(" and ", " ").split()[-6:]]
+    np.testing.assert_allclose(np.reshape(numbers, (2, 3)), [means.min(0), means.max(0)], rtol=1e-3)
+
+
 @pytest.mark.parametrize("command", ["transform", "crop", "clean"])
 def test_the_original_is_never_replaced(command, source, capsys):
     content = source.read_bytes()
