@@ -153,8 +153,10 @@ PLOT = 640  # units of a drawing's side
 CELLS = 220  # of the map, along its longer side
 
 
-def write_reports(work: Path, report: TrainReport, capture: Capture, gaussians: Gaussians) -> None:
-    """Write the report of a finished training, as JSON and as a page."""
+def write_reports(
+    work: Path, report: TrainReport, capture: Capture, gaussians: Gaussians, near: float | None = None
+) -> None:
+    """Write the report of a finished training, as JSON and as a page; near: as of `evaluate_views`."""
     from langsplat_core.training.radiance.differentiable import evaluate_views  # torch
 
     write_json(work / REPORT, asdict(report))
@@ -164,7 +166,7 @@ def write_reports(work: Path, report: TrainReport, capture: Capture, gaussians: 
     others = [index for name, index in rows.items() if name not in measured]
     most = min(len(others), MOST_VIEWS - len(held_out))
     shown = [others[at] for at in np.linspace(0, len(others) - 1, most).round().astype(int)]
-    scores = [*held_out.values(), *evaluate_views(gaussians, capture, shown)]
+    scores = [*held_out.values(), *evaluate_views(gaussians, capture, shown, near=near)]
     scene = Scene(gaussians, cameras=capture.cameras)
     views = (_view(capture, scene, rows[score.name], score, score.name in held_out) for score in scores)
     more = len(capture) - len(scores)

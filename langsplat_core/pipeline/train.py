@@ -180,7 +180,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
             held_out_views=tuple(scores),
             rehearsed=rehearsed,
         )
-        write_reports(run.work, report, capture, gaussians)
+        write_reports(run.work, report, capture, gaussians, config.radiance.near)
     processes.barrier()
     return read_report(run.work)
 
