@@ -62,13 +62,14 @@ def malformed(path: object, what: str, remedy: str = "copy it again, or export i
 
 # What a reader skips, pads, rounds or guesses is counted by it and said in one line.
 
-LOSSES = SimpleNamespace(strict=False)  # True: of --strict, under which a loss is an error
+STRICTNESS = SimpleNamespace(on=False, last="")  # on: by --strict, a loss is an error; last: what was said
 
 
 def report_loss(message: str, *values: object) -> None:
     """Say in one line what a reader could not take as it was given; InputError under --strict."""
-    if LOSSES.strict:
-        raise InputError(f"{message % values} (refused by --strict)")
+    STRICTNESS.last = message % values
+    if STRICTNESS.on:
+        raise InputError(f"{STRICTNESS.last} (refused by --strict)")
     logging.getLogger("langsplat").warning(message, *values)
 
 

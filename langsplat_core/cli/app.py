@@ -16,7 +16,7 @@ from langsplat_core.cli.arguments import Runnable, with_codec
 from langsplat_core.cli.run import main, parsed
 from langsplat_core.errors import InputError
 
-FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
+FLAGS = ("-q", "--quiet", "-v", "--verbose", "--strict")  # may precede a command
 # Name -> class, imported when the command line needs it; those of extensions follow.
 CORE: Mapping[str, str] = MappingProxyType({
     "train": "train.Train", "query": "query.QueryScene",

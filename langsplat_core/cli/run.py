@@ -26,7 +26,7 @@ from rich.console import Console
 
 from langsplat_core import __version__
 from langsplat_core.cli.arguments import Runnable, check_arguments
-from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
+from langsplat_core.errors import STRICTNESS, InputError, LangSplatError, optional_imports, printable_line
 from langsplat_core.interrupts import SAID, Terminated, raised
 from langsplat_core.io.files import NO_ROOM, shown
 
@@ -48,6 +48,8 @@ class Verbosity:
     """Errors alone: no progress, notes or warnings."""
     verbose: Annotated[_Flag, tyro.conf.arg(aliases=["-v"])] = False
     """Also what each step took, and what was taken from an earlier run."""
+    strict: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Refuse files of which something would be skipped, padded, rounded or guessed, in place of saying so."""
 
     @property
     def level(self) -> int:
@@ -99,6 +101,7 @@ def parsed(program: str, kind: Any, args: Sequence[str], description: str | None
         config=(tyro.conf.CascadeSubcommandArgs,),
     )
     log.setLevel(found.verbosity.level)
+    STRICTNESS.on = found.verbosity.strict
     return found.command
 
 
@@ -110,6 +113,8 @@ def main(program: str, parser: Callable[[], Runnable]) -> int:
         sys.stdout.flush()  # now, while what goes wrong can still be said in a line
     except (LangSplatError, OSError, MemoryError, KeyboardInterrupt) as error:
         return _ended(program, error)
+    finally:
+        STRICTNESS.on = False
     return 0
 
 

@@ -11,7 +11,7 @@ from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import photo_folder
 from langsplat_core.datasets.sfm import add_points, load_photos
 from langsplat_core.datasets.video import kept_frames
-from langsplat_core.errors import InputError
+from langsplat_core.errors import STRICTNESS, InputError
 from langsplat_core.io.files import shown
 from langsplat_core.io.hostile import is_video
 from langsplat_core.progress import Progress, silent
@@ -46,7 +46,7 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
 
 def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
     """Return what `load_capture` does, with the points and the scale that the dataset states, or none."""
-    path = Path(path)
+    path, STRICTNESS.last = Path(path), ""
     check_settings(config, "--dataset.")
     if not os.path.exists(path):  # unlike Path.exists, also no for names that no file system could hold
         raise InputError(f"{shown(path)} does not exist; expected {ACCEPTED}")

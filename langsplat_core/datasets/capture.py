@@ -19,7 +19,7 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.photos import WORKERS, Developed, Photo, View, developer, place
 from langsplat_core.datasets.workspace import Matches
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, report_loss
 from langsplat_core.io.hostile import PictureError
 from langsplat_core.scene import NO_ORIGIN, Camera, moved_pose, origin_of
 
@@ -182,12 +182,11 @@ def _rounded(values: Array) -> Array:
     return rounded
 
 
-def warn_of_lost_points(good: Array, source: str) -> None:
-    """Warn where most of the points of `source` had to be left out; good: (M,) bool, those that were not."""
-    lost = len(good) - good.sum()
-    if 2 * lost > len(good):
+def report_lost_points(good: Array, source: str) -> None:
+    """Say how many points of `source` had to be left out; good: (M,) bool, those that were not."""
+    if lost := len(good) - good.sum():
         share = f"{lost} of {len(good)} points of {source}"
-        log.warning("%s are damaged or badly located: left out; was it written whole?", share)
+        report_loss("%s are damaged or badly located: left out; was it written whole?", share)
 
 
 # Views that are held out from training, to measure it on.

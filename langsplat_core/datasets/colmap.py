@@ -6,8 +6,8 @@ open without the extra that brings pycolmap, too. Layout: https://colmap.github.
 frames (COLMAP >= 3.12) add nothing here, because images.bin still carries every image's own pose.
 """
 
-import logging
 import os
+import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -19,10 +19,11 @@ import numpy as np
 
 from langsplat_core.arrays import Array, rotation_matrices
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets.capture import Capture, capture_of, warn_of_lost_points
+from langsplat_core.datasets.capture import Capture, capture_of, report_lost_points
+from langsplat_core.datasets.colour import Tell
 from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.datasets.photos import Photo, develop, find_photos, finder, mask_beside
-from langsplat_core.errors import FormatError, InputError, printable_line, shortened
+from langsplat_core.errors import FormatError, InputError, printable_line, report_loss, shortened
 from langsplat_core.io.files import shown
 from langsplat_core.io.hostile import decimal_comma, decode_name, decode_text
 from langsplat_core.io.ply import read_cloud
@@ -53,8 +54,6 @@ IMAGE = np.dtype([("id", "<i4"), ("pose", "<f8", 7), ("camera", "<i4")])
 POINT = np.dtype([
     ("id", "<u8"), ("position", "<f8", 3), ("colour", "u1", 3), ("error", "<f8"), ("track", "<u8"),
 ])  # fmt: skip
-
-log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +93,10 @@ def read_model(folder: Path) -> SparseModel:
     if suffix is None:
         raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
     lenses, images = _content(folder / f"cameras{suffix}"), _content(folder / f"images{suffix}")
+    last = {image.name: image for image in images}
+    again = {i.name for i in images if not np.array_equal(i.world_to_camera, last[i.name].world_to_camera)}
+    if again:
+        report_loss("%s: images listed twice, of which the last counts: %s", shown(folder), shortened(again))
     for image in images:
         if image.camera_id not in lenses:
             raise FormatError(
@@ -117,11 +120,20 @@ def _points(folder: Path, suffix: str) -> Array:
     return np.zeros(0, POINT)
 
 
-def _content(path: Path) -> Any:
-    """Return what the reader of a file's name makes of it."""
+def _content(path: Path, say: Callable[..., None] = report_loss) -> Any:
+    """Return what the reader of a file's name makes of it, and say what it passed over."""
+    data = path.read_bytes()
     try:
-        data = path.read_bytes()
-        return _READERS[path.name](decode_text(data, path) if path.suffix == ".txt" else data)
+        if path.suffix == ".bin":
+            return _READERS[path.name](data)
+        text, told = decode_text(data, path), list[str]()
+        found = _READERS[path.name](text, told.append)
+        stated = re.search(r"^#\s*Number of \w+:\s*(\d{1,18})", text, re.MULTILINE)
+        if stated and int(stated[1]) != len(found):
+            told.append(f"has {len(found)} rows, and says that it had {stated[1]}")
+        for what in told:
+            say("%s: %s; was it written whole?", shown(path), what)
+        return found
     except (struct.error, ValueError, IndexError, OverflowError) as error:
         reason = f"{printable_line(error, 160)}{decimal_comma(error)}"
         raise FormatError(f"{path} is no readable COLMAP file ({reason}); export the model again") from None
@@ -202,7 +214,7 @@ def _lines(text: str) -> list[str]:
     return [line.strip() for line in text.split("\n") if not line.startswith("#")]
 
 
-def _text_cameras(text: str) -> dict[int, PhotoIntrinsics]:
+def _text_cameras(text: str, _: Tell) -> dict[int, PhotoIntrinsics]:
     lenses = {}
     for line in filter(None, _lines(text)):
         camera_id, name, width, height, *parameters = line.split()
@@ -210,26 +222,50 @@ def _text_cameras(text: str) -> dict[int, PhotoIntrinsics]:
     return lenses
 
 
-def _text_images(text: str) -> list[ModelImage]:
-    images = []
-    for line in "\n".join(_lines(text)).rstrip().split("\n")[::2]:  # every second one lists 2D points
+def _text_images(text: str, tell: Tell) -> list[ModelImage]:
+    images, stray, bare = [], 0, 0
+    lines = _lines(text)
+    at = 0
+    while at < len(lines):
+        line, at = lines[at], at + 1
+        if _lists_2d_points(line):
+            stray += bool(line)
+            continue
         _, *pose, camera_id, name = line.split(maxsplit=9)
         images.append(_image(name, int(camera_id), np.array(pose, np.float64)))
+        if at < len(lines):  # every second line lists the 2D points of the image before it
+            paired = _lists_2d_points(lines[at])
+            bare, at = bare + (not paired), at + paired
+    if stray or bare:
+        tell(f"{stray} lines belong to no image, and {bare} images lack their 2D points")
     return images
 
 
-def _text_points(text: str) -> Array:
+def _lists_2d_points(line: str) -> bool:
+    """Return True for x, y and a whole number again and again, or nothing; an image ends with its name."""
+    fields = line.split()
+    try:
+        return len(fields) % 3 == 0 and all(int(number) >= -1 for number in (*fields[2:3], *fields[-1:]))
+    except ValueError:
+        return False
+
+
+def _text_points(text: str, tell: Tell) -> Array:
     rows = [line.split() for line in _lines(text) if line]
-    return np.array(
+    points = np.array(
         [
-            (0, list(map(float, row[1:4])), list(map(int, row[4:7])), float(row[7]), len(row[8:]) // 2)
+            (int(row[0]), [*map(float, row[1:4])], [*map(int, row[4:7])], float(row[7]), len(row[8:]) // 2)
             for row in rows
         ],
         POINT,
     )
+    first = np.sort(np.unique(points["id"], return_index=True)[1])
+    if len(first) < len(points):
+        tell(f"{len(points) - len(first)} points are listed twice")
+    return points[first]
 
 
-_READERS: dict[str, Callable[[Any], Any]] = {
+_READERS: dict[str, Callable[..., Any]] = {
     "cameras.bin": _binary_cameras,
     "cameras.txt": _text_cameras,
     "images.bin": _binary_images,
@@ -255,14 +291,15 @@ def find_model(folder: Path) -> Path | None:
         return next((f for f in (*found, sparse) if has_model(f)), None)
     best = max(found, key=_photographs_of)
     name = printable_line(best.name, 60)
-    log.warning("%s has %d models; %s is taken, with most photographs", shown(sparse), len(found), name)
+    report_loss("%s has %d models; %s is taken, with most photographs", shown(sparse), len(found), name)
     return best
 
 
 def _photographs_of(model_folder: Path) -> int:
     """Return the number of photographs with a camera in a model; 0 if it is damaged."""
     try:
-        return len({image.name for image in _content(model_folder / f"images{_suffix(model_folder)}")})
+        images = _content(model_folder / f"images{_suffix(model_folder)}", lambda *_: None)
+        return len({image.name for image in images})
     except FormatError:
         return 0
 
@@ -283,12 +320,15 @@ def load_colmap(folder: Path, model_folder: Path, config: DatasetConfig, progres
         )
     if missing:
         share = f"{len(missing)} of {len(photos)} photographs of the model"
-        log.warning("%s do not exist and are left out: %s", share, shortened(missing))
-    present = len(find_photos(images) or find_photos(images, below=images.name == "images"))
-    if 2 * len(there) < present:
-        share = f"cameras for only {len(there)} of the {present} photographs beside it"
-        log.warning("%s has %s; another model may have more", shown(model_folder), share)
-    return capture_of(develop(there, config, progress), *good_points(model))
+        report_loss("%s do not exist and are left out: %s", share, shortened(missing))
+    present = find_photos(images) or find_photos(images, below=images.name == "images")
+    if without := {path.name for path in present} - {photo.path.name for photo in there}:
+        share = f"cameras for only {len(there)} of the {len(present)} photographs beside it"
+        lost = shortened(without)
+        report_loss(
+            "%s has %s, and another model may have more: without %s", shown(model_folder), share, lost
+        )
+    return capture_of(develop(there, config, progress), *good_points(model, "the COLMAP model"))
 
 
 def located_photos(model: SparseModel, folder: Path) -> list[Photo]:
@@ -301,13 +341,14 @@ def located_photos(model: SparseModel, folder: Path) -> list[Photo]:
     ]
 
 
-def good_points(model: SparseModel) -> tuple[Array, Array]:
-    """Return (M, 3) points and (M, 3) colours without those that are plainly wrong.
+def good_points(model: SparseModel, source: str = "") -> tuple[Array, Array]:
+    """Return (M, 3) points and (M, 3) colours without those that are plainly wrong, reported by their source.
 
     These are not finite, seen by a single image, or reprojected more than 4 pixels off, as COLMAP's mapper
     would not leave them. Unknown errors and tracks count as good.
     """
     points = model.points
     good = np.isfinite(points["position"]).all(1) & ~(points["error"] > 4) & (points["track"] != 1)
-    warn_of_lost_points(good, "the COLMAP model")
+    if source:
+        report_lost_points(good, source)
     return points["position"][good], points["colour"][good]

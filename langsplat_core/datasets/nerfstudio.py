@@ -5,30 +5,28 @@ been applied to both poses and points, so the world is taken as it stands.
 Layout: https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
-import logging
 import math
 import os
 import reprlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets.capture import Capture, capture_of, warn_of_lost_points
+from langsplat_core.datasets.capture import Capture, capture_of, report_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
-from langsplat_core.datasets.photos import Photo, develop, finder, mask_beside
+from langsplat_core.datasets.photos import Photo, develop, find_photos, finder, mask_beside
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted, report_loss, shortened
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file
 from langsplat_core.io.ply import read_cloud
 from langsplat_core.progress import Progress
 from langsplat_core.scene import FARTHEST
 
-log = logging.getLogger("langsplat")
-
+DISTORTING = ("k1", "k2", "k3", "k4", "p1", "p2")
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 JSON_LIMIT = 256 * 1024 * 1024  # bytes; a frame takes about 700
@@ -65,6 +63,9 @@ def _content(file: Path) -> Json:
     frames = top.get("frames") if isinstance(top, dict) else None
     if not isinstance(frames, list) or not frames:
         raise FormatError(f'{file} has no list of "frames"; it is not a nerfstudio dataset')
+    for number, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise FormatError(f'{file}: frame {number} has no "file_path"; it is not a nerfstudio dataset')
     return dict(top)
 
 
@@ -72,11 +73,10 @@ def _photos(file: Path, top: Json, held_out: bool) -> dict[str, Photo]:
     """Return the photographs of a file's frames by their names, those that can be opened."""
     photos: dict[str, Photo] = {}
     missing: list[str] = []
+    guessed: set[str] = set()
     find = finder(file.parent)
     for number, frame in enumerate(top["frames"]):
         where = f"{file}: frame {number}"
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise FormatError(f'{where} has no "file_path"; it is not a nerfstudio dataset')
         label = frame["file_path"]
         try:
             path = _photo_file(find, label)
@@ -92,13 +92,54 @@ def _photos(file: Path, top: Json, held_out: bool) -> dict[str, Photo]:
             lens, pose = _lens({**top, **frame}, size), _pose(frame)
         except ValueError as error:
             raise FormatError(f"{where} ({printable_line(label, 60)}): {error}") from None
-        photos[label] = Photo(path, label, lens, pose, mask=mask, held_out=held_out)
+        guessed.update(_guesses({**top, **frame}))
+        photo = Photo(path, label, lens, pose, mask=mask, held_out=held_out)
+        if not np.array_equal(photos.setdefault(label, photo).world_to_camera, pose):
+            guessed.add("photographs are listed twice, of which the last counts")
+        photos[label] = photo
     if missing:
         lost = f"{len(missing)} of {len(top['frames'])} photographs in {file.name} cannot be opened"
         if not photos and not held_out:
             raise InputError(f"{file}: {lost}: {shortened(missing)}; its paths begin at its folder")
         report_loss("%s and are left out: %s", lost, shortened(missing))
+    if not held_out and (beside := _without_camera(photos, top["frames"])):
+        guessed.add(f"{len(beside)} photographs beside its own have no camera: {shortened(beside)}")
+    for what in sorted(guessed):
+        report_loss("%s: %s", file, what)
     return photos
+
+
+def _without_camera(photos: Mapping[str, Photo], frames: Sequence[Json]) -> set[str]:
+    """Return the names of photographs beside `photos` that no frame names and that are not made of these."""
+    known = {PureWindowsPath(frame["file_path"]).stem for frame in frames}
+    known |= {photo.path.stem for photo in photos.values()}
+    folders = {photo.path.parent for photo in photos.values()}
+    beside = (path for folder in folders for path in find_photos(folder))
+    return {path.name for path in beside if not known & _stems(path.stem)}
+
+
+def _stems(name: str) -> set[str]:
+    """Return a name and what it begins with: r_1_depth_0001 is made of the photograph r_1."""
+    parts = name.split("_")
+    return {"_".join(parts[:count]) for count in range(1, len(parts) + 1)}
+
+
+TOGETHER = (("fl_x", "fl_y"), ("cx", "cy"), ("w", "h"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3", "k4"))
+
+
+def _guesses(values: Json) -> Iterator[str]:
+    """Yield what had to be guessed of a lens; the field of view alone is a whole one."""
+    known = values.keys()
+    groups = [group for group in TOGETHER if known & set(group)]
+    lenses = [group for group in groups if group[0] == "k1"]
+    groups = [group for group in groups if group[0] != "k1" or not any(known >= set(one) for one in lenses)]
+    for absent in ([key for key in group if key not in known] for group in groups):
+        if absent and not (absent == ["fl_y"] and "camera_angle_y" in known):
+            yield f"{', '.join(absent)} not given: taken from the others, or as none"
+    if "fl_x" in known and not known & {"cx", "cy"}:
+        yield "cx and cy not given: the middle of the photograph is taken"
+    if any(values.get(key) for key in DISTORTING) and not known & {"camera_model", "is_fisheye"}:
+        yield "camera_model not given: OPENCV is taken"
 
 
 def _photo_file(find: Callable[[str], Path], label: str) -> Path:
@@ -153,7 +194,7 @@ def _focal(values: Json, axis: str, side: int, default: float | None) -> float:
 
 def _distortion(values: Json) -> Distortion:
     model = values.get("camera_model", "OPENCV")
-    k1, k2, k3, k4, p1, p2 = (_number(values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    k1, k2, k3, k4, p1, p2 = (_number(values, key, 0.0) for key in DISTORTING)
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
         return FisheyeDistortion(k1, k2, k3, k4)
     if model not in PERSPECTIVE:
@@ -190,12 +231,12 @@ def _points(file: Path, name: object) -> tuple[Array, Array]:
         return none
     path = file.parent / name
     if not os.path.isfile(path):
-        log.warning("%s names the points %s, which do not exist", file.name, quoted(name))
+        report_loss("%s names the points %s, which do not exist", file.name, quoted(name))
         return none
     try:
         points, colours = read_cloud(path)
     except FormatError as error:
         raise FormatError(f"{error}; mend it or remove ply_file_path from {file.name}") from None
     finite = np.asarray(np.isfinite(points).all(1))
-    warn_of_lost_points(finite, path.name)
+    report_lost_points(finite, path.name)
     return points[finite], colours[finite]

@@ -416,14 +416,21 @@ def develop(photos: Sequence[Photo], config: DatasetConfig, progress: Progress) 
         raise InputError(f"no photograph can be read: {shortened(broken)}")
     if broken:
         report_loss("%d photographs cannot be used and are left out: %s", len(broken), shortened(broken))
-    for what in dict(told):
-        labels = shortened(label for said, label in told if said == what)
-        report_loss("%d photographs: %s (%s)", sum(said == what for said, _ in told), what, labels)
     cameras, images, files, masks, alphas = zip(*done, strict=True)
+    _report(told, masks)
     cut_out = _cut_out(masks, alphas, config)
     masks = tuple(_counted(mask, alpha, cut_out) for mask, alpha in zip(masks, alphas, strict=True))
     masks = masks if any(mask is not None for mask in masks) else ()
     return Developed(cameras, images, files, masks, cut_out)
+
+
+def _report(told: Sequence[tuple[str, str]], masks: Sequence[Array | None]) -> None:
+    """Say what was guessed, of which photographs, and where masks are missing."""
+    for what in dict(told):
+        labels = [label for said, label in told if said == what]
+        report_loss("%d photographs: %s (%s)", len(labels), what, shortened(labels))
+    if 0 < (masked := sum(mask is not None for mask in masks)) < len(masks):
+        report_loss("%d of %d photographs have a mask; of the others all pixels count", masked, len(masks))
 
 
 def _cut_out(masks: Sequence[Array | None], alphas: Sequence[Array | None], config: DatasetConfig) -> bool:

@@ -35,7 +35,7 @@ from langsplat_core.datasets.workspace import (
     read_matches,
     run_apart,
 )
-from langsplat_core.errors import InputError, shortened
+from langsplat_core.errors import InputError, report_loss, shortened
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
 from langsplat_core.progress import Progress
@@ -83,7 +83,7 @@ def load_photos(
     if lost:
         share = f"{len(files) - found} of {len(files)} photographs"
         what = "could not be located and are left out"
-        log.warning("%s %s (%s); %s", share, what, _listed(lost, 5), matches.advice())
+        report_loss("%s %s (%s); %s", share, what, _listed(lost, 5), matches.advice())
     photos = [
         replace(copy, path=path, label=labels[path], upright=True, mask=mask_beside(path))
         for copy in located_photos(model, workspace / "images")
@@ -212,9 +212,10 @@ MAX_ANGLE = 75.0  # degrees between the axes of views that are matched
 
 def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Progress) -> Capture:
     """Return the capture with points triangulated from the photographs at `views`, or random ones."""
+    log.info("the dataset has no points; they are triangulated")
     points, colours = _triangulated(capture, views, work, progress)
     if len(points) < MIN_POINTS:
-        log.warning("only %d points could be triangulated; %d are random", len(points), RANDOM_POINTS)
+        report_loss("only %d points could be triangulated; %d are random", len(points), RANDOM_POINTS)
         generator = np.random.default_rng(0)
         cameras, images = [capture.cameras[i] for i in views], [capture.images[i] for i in views]
         masks = [capture.mask(i) for i in views]

@@ -87,7 +87,7 @@ def _write(container: Any, folder: Path, count: int, progress: Progress) -> int:
     if not 0.25 <= aspect <= 4:
         raise ValueError(f"pixels of {stream.sample_aspect_ratio}")
     told: set[str] = set()
-    for frame in _decoded(container, stream):
+    for frame in _decoded(container, stream, told.add):
         share = (float(frame.time or first) - first) / max(last - first, 1e-9)
         span = min(int(share * count), count - 1)
         for done in [number for number in best if number < span]:
@@ -98,12 +98,12 @@ def _write(container: Any, folder: Path, count: int, progress: Progress) -> int:
             best[span] = (sharp, frame)
     for _, frame in best.values():
         _save(frame, aspect, folder, told.add)
-    for what in told:
+    for what in sorted(told):
         report_loss("%s: %s", container.name, what)
     return len(list(folder.iterdir()))
 
 
-def _decoded(container: Any, stream: Any) -> Iterator[Any]:
+def _decoded(container: Any, stream: Any, tell: Tell) -> Iterator[Any]:
     """Yield every image that can be decoded: a recording that broke off has a last one that cannot."""
     import av
 
@@ -111,7 +111,7 @@ def _decoded(container: Any, stream: Any) -> Iterator[Any]:
         try:
             yield from packet.decode()
         except av.InvalidDataError:
-            continue
+            tell("some of its images cannot be decoded and are left out")
 
 
 def sharpness(frame: Any) -> float:

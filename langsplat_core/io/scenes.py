@@ -20,7 +20,7 @@ from msgspec import Struct
 
 from langsplat_core import registry
 from langsplat_core.config import CodecConfig
-from langsplat_core.errors import InputError
+from langsplat_core.errors import STRICTNESS, InputError, report_loss
 from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import sidecar as language_files
 from langsplat_core.io.files import atomic_path, check_output_file, locked, shown, write_json
@@ -147,6 +147,8 @@ def load_scene(path: Path | str) -> Scene:
             scene, language=language_files.read_language(sidecar, scene.gaussians.means, scene.origin)
         )
     except InputError as error:
+        if STRICTNESS.on:
+            raise
         return replace(scene, unread=(*scene.unread, str(error)))
 
 
@@ -160,12 +162,12 @@ def load_without_language(path: Path | str) -> Scene:
         read = camera_files.read_cameras(cameras)
         return replace(scene, cameras=tuple(camera.moved(-scene.origin) for camera in read))
     except InputError as error:
-        log.warning("opened without its cameras: %s", error)
+        report_loss("opened without its cameras: %s", error)
         return replace(scene, unread=(*scene.unread, str(error)))
 
 
 def _read(path: Path) -> Scene:
-    """Read the scene's own file; warn where most of it cannot be drawn."""
+    """Read the scene's own file; say what of it cannot be drawn."""
     if not exists(path):
         raise InputError(f"{path}: no such file; check the spelling and the folder")
     row = format_of(path)
@@ -204,7 +206,7 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
         single = world.astype(np.float32)
     if ((single == world) | ~np.isfinite(world)).all():
         step = np.spacing(np.abs(scene.origin).max(), dtype=np.float32)
-        log.warning(
+        report_loss(
             "%s: positions were rounded to steps of %g units, as float32 holds them so far from zero; export "
             "them as double, or about an origin near them",
             *(path, step),
@@ -213,14 +215,10 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
 
 
 def warn_of_undrawable(path: Path, gaussians: Gaussians) -> None:
-    """Log a warning where most of the Gaussians that were read from `path` cannot be drawn."""
-    count = len(gaussians)
-    looked_at = gaussians.take(np.arange(0, count, max(1, count // 4096)))  # enough to tell, evenly taken
-    if 2 * looked_at.valid().sum() < len(looked_at):
-        reasons = looked_at.invalid_rows()
-        share = sum(reasons.values()) / len(looked_at)
-        told = f"{share:.0%} of the {count} Gaussians cannot be drawn ({', '.join(reasons)})"
-        log.warning("%s: %s; is the file damaged?", path, told)
+    """Say how many of the Gaussians that were read from `path` cannot be drawn, and why."""
+    if reasons := gaussians.invalid_rows():
+        share = f"{sum(reasons.values())} of the {len(gaussians)} Gaussians"
+        report_loss("%s: %s cannot be drawn (%s); is the file damaged?", path, share, ", ".join(reasons))
 
 
 # ---- writing ----

@@ -17,7 +17,7 @@ import numpy as np
 from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
-from langsplat_core.errors import InputError
+from langsplat_core.errors import STRICTNESS, InputError
 from langsplat_core.io.files import check_output_folder, shown, write_json
 from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
@@ -195,8 +195,9 @@ def _photographs(run: _Run) -> Capture:
     """Return the photographs that have cameras, enough for a scene."""
     capture = load_capture(run.dataset, run.config.dataset, run.work, run.progress)
     if len(capture) < FEWEST_VIEWS and not run.config.dataset.allow_few_cameras:
+        why = f" ({STRICTNESS.last})" if STRICTNESS.last else ""
         raise InputError(
-            f"{shown(run.dataset)}: only {len(capture)} photographs have cameras, and a scene needs "
+            f"{shown(run.dataset)}: only {len(capture)} photographs have cameras{why}, and a scene needs "
             f"{FEWEST_VIEWS}; take more, or go on with --dataset.allow-few-cameras"
         )
     return capture

@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets import load_capture, load_photographs
+from langsplat_core.datasets import Capture, load_capture, load_photographs
 from langsplat_core.datasets.capture import split_views
 from langsplat_core.datasets.colmap import LENSES, find_model, good_points, lens_of, read_model
 from langsplat_core.datasets.intrinsics import (
@@ -28,7 +28,7 @@ from langsplat_core.datasets.intrinsics import (
     undistorted_points,
 )
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import STRICTNESS, FormatError, InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import NO_ORIGIN, moved_pose
 from tests.support.photographs import (
@@ -49,6 +49,7 @@ pytestmark = pytest.mark.long
 PARAMS = [190.0, 188.0, 103.0, 74.0, -0.1, 0.02, 0.001, -0.001]
 LENS = PhotoIntrinsics(200, 150, *PARAMS[:4], BrownDistortion(*PARAMS[4:]))
 WHOLE = DatasetConfig(max_side=200)
+SMALL_LENS = PhotoIntrinsics(40, 30, 38.0, 37.6, 20.6, 14.8, BrownDistortion(-0.1, 0.02, 0.001, -0.001))
 
 
 def write_dataset(
@@ -226,7 +227,7 @@ NERFSTUDIO_LENS = PhotoIntrinsics(
 )
 GLOBAL = {
     "w": 160, "h": 120, "fl_x": 150.0, "fl_y": 148.0, "cx": 83.0, "cy": 58.0,
-    "k1": -0.1, "k2": 0.02, "p1": 0.001, "p2": -0.001,
+    "k1": -0.1, "k2": 0.02, "p1": 0.001, "p2": -0.001, "camera_model": "OPENCV",
 }  # fmt: skip
 
 
@@ -501,6 +502,102 @@ def test_text_of_every_maker_is_read(
     assert len(caplog.messages) == said
     assert len(got) == len(want)
     assert got.points.tolist() == want.points.tolist()
+
+
+# Changes that leave a dataset well-formed: the same comes out, or a line, or an error.
+
+
+def changed_lines(text: str, rng: np.random.Generator) -> str:
+    """A text with one line dropped, doubled, or swapped with another."""
+    lines = text.split("\n")
+    at, other = (int(row) for row in rng.choice(len(lines), 2, replace=False))
+    kind = rng.integers(3)
+    if kind == 2:
+        lines[at], lines[other] = lines[other], lines[at]
+    else:
+        lines[at : at + 1] = [lines[at]] * (2 * int(kind))
+    return "\n".join(lines)
+
+
+def changed_json(text: str, rng: np.random.Generator) -> str:
+    """A transforms.json with one entry or frame dropped, or frames doubled or in another order."""
+    top = json.loads(text)
+    frames: list[dict[str, Any]] = top["frames"]
+    at = int(rng.integers(len(frames)))
+    match rng.integers(5):
+        case 0:
+            del top[str(rng.choice(sorted(top.keys() - {"frames"})))]
+        case 1:
+            del frames[at]
+        case 2:
+            frames.append(frames[at])
+        case 3:
+            frames.append({**frames[at], "transform_matrix": frames[at - 1]["transform_matrix"]})
+        case _:
+            top["frames"] = frames[::-1]
+    return json.dumps(top)
+
+
+def summary(capture: Capture) -> list[Any]:
+    """All that a training sees of a capture, whatever the order of points."""
+    shown = [
+        (c.name, c.intrinsics, c.world_to_camera.tolist(), image.tobytes())
+        for c, image in zip(capture.cameras, capture.images, strict=True)
+    ]
+    return [shown, sorted(np.hstack([capture.points, capture.colours]).tolist())]
+
+
+@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("reader", ["cameras.txt", "images.txt", "points3D.txt", "transforms.json"])
+def test_a_changed_dataset_gives_the_same_or_a_line(
+    reader: str, seed: int, whole: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (file,) = whole.glob(f"**/{reader}")
+    folder = whole / ("nerfstudio" if reader == "transforms.json" else "colmap")
+    want = summary(load_photographs(folder, CONFIG, whole))
+    caplog.clear()
+    before = file.read_text()
+    change = changed_json if reader == "transforms.json" else changed_lines
+    try:
+        file.write_text(change(before, np.random.default_rng(seed)))
+        found = summary(load_photographs(folder, CONFIG, whole))
+        assert found == want or caplog.messages
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(STRICTNESS, "on", True)
+            if caplog.messages:
+                with pytest.raises(InputError, match="--strict"):
+                    load_photographs(folder, CONFIG, whole)
+            else:
+                load_photographs(folder, CONFIG, whole)
+    except InputError:
+        pass
+    finally:
+        file.write_text(before)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same photographs and cameras as a COLMAP model in text and as a transforms.json."""
+    folder = tmp_path_factory.mktemp("whole")
+    matrices = poses(4)
+    for name in ("colmap", "nerfstudio"):
+        write_photos(folder / name / "images", SMALL_LENS, matrices)
+    params = [SMALL_LENS.fx, SMALL_LENS.fy, SMALL_LENS.cx, SMALL_LENS.cy, -0.1, 0.02, 0.001, -0.001]
+    names = [f"view_{index}.png" for index in range(4)]
+    model = colmap_reconstruction("OPENCV", (40, 30), params, names, matrices)
+    for index in range(10):
+        track = pycolmap.Track()
+        model.add_point3D(np.array([3.0, 0.2 * index, 0.0]), track, np.array([index, 2, 3], np.uint8))
+    (folder / "colmap/sparse/0").mkdir(parents=True)
+    model.write_text(folder / "colmap/sparse/0")
+    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+    frames = [
+        {"file_path": f"images/{name}", "transform_matrix": opengl_pose(matrix)}
+        for name, matrix in zip(names, matrices, strict=True)
+    ]
+    top = {**dict(zip(keys, params, strict=True)), "w": 40, "h": 30, "camera_model": "OPENCV"}
+    rewrite(folder / "nerfstudio", {**top, "frames": frames})
+    return folder
 
 
 def test_decimal_commas_are_refused_by_name(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ from tests.support.file_samples import (
     sog_files,
     write_folder,
 )
+from tests.support.processes import refusal, run
 from tests.support.scenes import random_camera, random_extras, random_gaussians
 
 N = 60
@@ -250,15 +251,19 @@ def test_loader_refuses_what_is_no_scene(tmp_path):
             load_scene(tmp_path / name)
 
 
-def test_a_mostly_undrawable_scene_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    gaussians = random_gaussians(N)
-    for broken, told in ((N // 2, False), (N // 2 + 1, True)):
-        gaussians.means[:broken] = np.nan
-        write_ply(tmp_path / "a.ply", gaussians)
-        caplog.clear()
-        assert len(load_scene(tmp_path / "a.ply").gaussians) == N
-        assert bool(caplog.messages) == told
-    assert f"52% of the {N} Gaussians cannot be drawn (position not finite)" in caplog.messages[0]
+def test_undrawable_gaussians_are_counted_and_refused_by_strict(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gaussians, path = random_gaussians(N), tmp_path / "a.ply"
+    write_ply(path, gaussians)
+    assert run("--strict", "inspect", path) == 0
+    gaussians.means[:2] = np.nan
+    write_ply(path, gaussians)
+    caplog.clear()
+    assert len(load_scene(path).gaussians) == N
+    assert f"2 of the {N} Gaussians cannot be drawn (position not finite)" in caplog.messages[0]
+    assert "--strict" in refusal(capsys, "inspect", path, "--strict")
+    assert run("inspect", path) == 0
 
 
 # A scene whose companions are broken opens without them, and says why.

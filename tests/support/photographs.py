@@ -168,7 +168,7 @@ def write_colmap(folder: Path, form: str = "bin") -> Path:
 def write_nerfstudio(folder: Path, **top: object) -> None:
     write_picture(folder / "a.png")
     frame = {"file_path": "a.png", "transform_matrix": IDENTITY}
-    text = json.dumps({"fl_x": 50.0, "frames": [frame], **top})
+    text = json.dumps({"fl_x": 50.0, "fl_y": 50.0, "cx": 20.0, "cy": 15.0, "frames": [frame], **top})
     (folder / "transforms.json").write_text(text, encoding="utf-8-sig")  # some editors add the mark
 
 
