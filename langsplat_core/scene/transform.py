@@ -92,7 +92,9 @@ def moving(offset: Array) -> Similarity:
 
 
 def scaling(factor: float) -> Similarity:
-    """Return the scaling by `factor` about the origin."""
+    """Return the scaling by `factor` about the origin. InputError beyond 1e-12 to 1e12."""
+    if not 1e-12 <= factor <= 1e12:
+        raise InputError(f"a scale of {factor:g}; take 1e-12 to 1e12")
     return Similarity(np.eye(3), np.zeros(3), float(factor))
 
 
