@@ -36,7 +36,7 @@ class Listing:
 
     folder: Path
     entries: tuple[FolderEntry, ...] = ()  # folders first, each kind by name
-    left_out: int = 0  # more than `MOST`
+    left_out: int = 0  # more than `MOST_LISTED`
     problem: str = ""  # why there are none, one line
 
 

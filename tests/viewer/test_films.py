@@ -447,6 +447,9 @@ def program(run_viewer):
 
 
 def test_a_film_is_a_folder_of_pictures(program, folder):
+    (folder / "film").mkdir()
+    for left in ("film.json", "frame-00007.png"):  # by a longer film
+        (folder / "film" / left).write_bytes(b"")
     code, out, err = program(
         "blobs.ply", "--path", "path.json", "--out", "film", "--fps", "4", "--size", "32x24", "--query", "mug"
     )

@@ -10,6 +10,7 @@ import pytest
 
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
+from langsplat_viewer import disk
 from langsplat_viewer.actions import editing, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.disk import list_folder
@@ -172,7 +173,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_listing_has_folders_first_and_only_scenes(folder):
+def test_listing_has_folders_first_and_only_scenes(folder, monkeypatch):
     listing = list_folder(folder)
     listed = [(entry.path.name, entry.is_file, entry.size) for entry in listing.entries]
     files = [("a.ply", True, 5), ("sog folder", True, 0), ("Z.SPZ", True, 5)]
@@ -180,6 +181,8 @@ def test_listing_has_folders_first_and_only_scenes(folder):
     assert not listing.problem
     assert "No such file" in list_folder(folder / "gone").problem
     assert "Not a directory" in list_folder(folder / "notes.txt").problem
+    monkeypatch.setattr(disk, "MOST_LISTED", 3)
+    assert list_folder(folder) == replace(listing, entries=listing.entries[:3], left_out=1)
 
 
 def test_browser_enters_folders_and_opens_scenes(viewer, folder):
