@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -59,6 +60,27 @@ def unit(vectors: Array, epsilon: float = 1e-6) -> Array:
 def across(direction: Array) -> Array:
     """(3,) -> (3,) a direction at a right angle to it, of any length but zero."""
     return np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
+
+
+def decimals_of(lengths: Array, least: int) -> int:
+    """Return the decimals that lengths in any unit are rounded to: `least`, more for small ones.
+
+    The largest of them keeps at least `least` significant digits.
+    """
+    largest = np.abs(lengths).max(initial=0.0)
+    return least if not 0 < largest < 0.1 else least - int(np.floor(np.log10(largest)))
+
+
+def length_text(lengths: ArrayLike, between: str = " ", least: int = 3, origin: Array | float = 0.0) -> str:
+    """Return lengths as text, all with as many decimals: see `decimals_of`; places from an origin with it."""
+    values = np.atleast_1d(np.asarray(lengths, np.float64))
+    decimals = decimals_of(values, least)
+    return between.join(f"{value:.{decimals}f}" for value in values + origin)
+
+
+def near_power(length: float) -> float:
+    """Return the power of two nearest to `length` > 0, a unit to compute in that rounds nothing."""
+    return float(np.exp2(np.round(np.log2(length))))
 
 
 def mean_squared_error(a: Array, b: Array) -> float:

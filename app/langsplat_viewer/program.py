@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, length_text
 from langsplat_core.cli.run import main, parsed
 from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.errors import InputError
@@ -185,8 +185,8 @@ def _answers(
 
 def answer_line(result: QueryResult, origin: Array = NO_ORIGIN) -> str:
     """Return the answer as a line for people and for scripts, its place in the world."""
-    shown = None if result.verdict == "not here" or result.place is None else origin + result.place
-    place = "none" if shown is None else "({})".format(", ".join(f"{v:.3f}" for v in shown))
+    shown = None if result.verdict == "not here" else result.place
+    place = "none" if shown is None else f"({length_text(shown, ', ', origin=origin)})"
     verdict: str = result.verdict
     if result.probability is not None:
         verdict += f" ({100 * result.probability:.0f} %)"

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import tyro
 from rich.table import Table
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, length_text
 from langsplat_core.cli.arguments import EncoderOption, Level, TrainedScene
 from langsplat_core.cli.query import Unit, basis_fields, camera_of, in_world, unit_of
 from langsplat_core.cli.run import OutputConsole, print_json
@@ -126,7 +126,7 @@ def _print_inventory(entries: list[dict[str, Any]]) -> None:
         sure = _percent(entry).strip(" %") or "-"
         names = (entry["phrase"], ", ".join(entry["also"]), entry["level"], sure)
         for number, spot in enumerate(entry["spots"]):
-            centre = " ".join(f"{value:.2f}" for value in spot["centre"])
+            centre = length_text(spot["centre"], least=2)
             start = names if number == 0 else ("", "", "", "")
             table.add_row(*start, f"{100 * spot['share']:.2f}", centre)
     console = OutputConsole()

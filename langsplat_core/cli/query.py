@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, length_text
 from langsplat_core.cli.arguments import (
     EncoderOption,
     JsonOption,
@@ -59,11 +59,11 @@ class Unit:
 
     def format(self, values: Array, between: str = " ") -> str:
         """Lengths in world units as numbers of this unit, joined by `between`."""
-        return between.join(f"{self.length * value:.3f}" for value in values)
+        return length_text(self.length * np.asarray(values), between)
 
     def place(self, place: Array) -> str:
         """Return a place in the scene as numbers of this unit, in the world."""
-        return self.format(self.origin + place)
+        return length_text(self.length * place, origin=self.length * self.origin)
 
 
 def unit_of(metres_per_unit: float | None, origin: Array) -> Unit:

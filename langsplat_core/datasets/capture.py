@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.distance import pdist
 
-from langsplat_core.arrays import Array, check_array
+from langsplat_core.arrays import Array, check_array, near_power
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.photos import WORKERS, Developed, Photo, View, developer, place
 from langsplat_core.datasets.workspace import Matches
@@ -23,7 +23,7 @@ from langsplat_core.errors import InputError, report_loss
 from langsplat_core.io.hostile import PictureError
 from langsplat_core.scene import NO_ORIGIN, Camera, moved_pose, origin_of
 
-DECIMALS = 9  # of world units: what a digest tells apart, far above rounding and far below a pixel
+DECIMALS = 9  # of the cameras' extent: what a digest tells apart, far above rounding and far below a pixel
 
 log = logging.getLogger("langsplat")
 
@@ -77,15 +77,15 @@ class Capture:
         count to `DECIMALS`, so that a work folder is taken up on another processor too, whose products of
         matrices differ in their last digits.
         """
-        digest = hashlib.blake2b(digest_size=16)
+        digest, length = hashlib.blake2b(digest_size=16), near_power(self.extent())
         for camera, image in ((self.cameras[i], self.images[i]) for i in indices):
             digest.update(repr((camera.name, camera.intrinsics)).encode())
-            digest.update(_rounded(camera.world_to_camera).tobytes())
+            digest.update(_rounded(camera.world_to_camera / (1, 1, 1, length)).tobytes())
             digest.update(np.ascontiguousarray(image).data)
         for mask in (self.mask(i) for i in indices):
             digest.update(b"" if mask is None else np.packbits(mask).tobytes())
         digest.update(b"cut out" * self.cut_out)
-        digest.update(_rounded(self.points).tobytes())
+        digest.update(_rounded(self.points / length).tobytes())
         digest.update(self.colours.tobytes())
         return digest.hexdigest()
 
@@ -129,7 +129,7 @@ class Capture:
     def extent(self) -> float:
         """Return INRIA's scene scale: 1.1 times the largest distance of a camera from their mean, > 0."""
         centres = np.array([camera.position for camera in self.cameras])
-        return max(1.1 * float(np.linalg.norm(centres - centres.mean(0), axis=1).max()), 1e-6)
+        return max(1.1 * float(np.linalg.norm(centres - centres.mean(0), axis=1).max()), 1e-30)
 
 
 def centred(capture: Capture) -> Capture:
@@ -312,7 +312,7 @@ def look_distance(cameras: Sequence[Camera]) -> float:
     """
     positions = np.array([camera.position for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])
-    spread = max(float(np.linalg.norm(positions - positions.mean(0), axis=1).max()), 1e-3)
+    spread = max(float(np.linalg.norm(positions - positions.mean(0), axis=1).max()), 1e-30)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     pull = 1e-3 * np.eye(3)
     centre = np.linalg.solve(

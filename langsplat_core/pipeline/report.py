@@ -276,7 +276,7 @@ def _from_above(scene: Scene, held_out: Container[str]) -> str:
     gaussians = scene.gaussians.take(np.flatnonzero(scene.gaussians.valid()))
     points, places = gaussians.means.astype(np.float64) @ axes.T, eyes @ axes.T
     low, high = places.min(0), places.max(0)
-    margin = max(float((high - low).max()), 1e-6)
+    margin = max(float((high - low).max()), 1e-30)
     if len(points):
         near, far = np.quantile(points, (0.05, 0.95), axis=0)
         low, high = np.clip(near, low - margin, low), np.clip(far, high, high + margin)

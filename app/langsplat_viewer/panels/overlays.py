@@ -8,7 +8,7 @@ import moderngl
 import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, length_text
 from langsplat_core.config import ColourMap
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, Drawing, mapped, painted
 from langsplat_core.query.describe import LevelWords
@@ -483,8 +483,8 @@ def pointed_figures(hover: Hover, origin: Array = NO_ORIGIN) -> list[str]:
     lines = [
         f"{phrase}: {value:.2f}" for phrase, value in zip(hover.phrases, hover.found.relevancy, strict=True)
     ]
-    x, y, z = origin + hover.found.position
-    return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth:.2f} away"]
+    place = length_text(hover.found.position, "  ", 2, origin)
+    return [*lines, f"at {place}, {length_text(hover.found.depth, least=2)} away"]
 
 
 def _faded(colour: Iterable[float], alpha: float) -> int:

@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, length_text
 from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, painted
 from langsplat_core.query.answers import QueryResult
@@ -207,7 +207,7 @@ def _details(viewer: Viewer, query: Query) -> None:
     ):
         queries.explain(viewer, query)
     if place is not None:
-        imgui.text_colored(ui.muted(), "at " + "  ".join(f"{v:.2f}" for v in place))
+        imgui.text_colored(ui.muted(), "at " + length_text(place, "  ", 2))
         ui.tip("Where it is relevant most; world units")
     if answer.problem:
         ui.small_wrapped(answer.problem, ui.bad())

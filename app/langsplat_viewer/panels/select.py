@@ -297,7 +297,8 @@ def _box_handles(viewer: Viewer, seen: tuple[Any, Any]) -> None:
     """Draw the box of the panel with handles on its corners and edges."""
     form, unit = viewer.state.edit_form, gizmo.Matrix6([-0.5, -0.5, -0.5, 0.5, 0.5, 0.5])
     corners = np.array([form.low, form.high])
-    matrix = np.diag([*np.maximum(np.ptp(corners, axis=0), 1e-6), 1.0])
+    sides = np.ptp(corners, axis=0)
+    matrix = np.diag([*np.maximum(sides, max(1e-6 * sides.max(), 1e-30)), 1.0])
     matrix[:3, 3] = corners.mean(0)
     edited = gizmo.Matrix16(_columns(matrix))
     operation, mode = gizmo.OPERATION.bounds, gizmo.MODE.local

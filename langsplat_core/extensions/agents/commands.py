@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, decimals_of
 from langsplat_core.cli.arguments import EncoderOption
 from langsplat_core.cli.describe import outline_lines, outline_of
 from langsplat_core.cli.query import Unit, camera_of, unit_of
@@ -184,7 +184,10 @@ def _unit(scene: Scene) -> Unit:
 
 
 def _places(values: Array | None, unit: Unit) -> Any:
-    return None if values is None else np.round(unit.length * (unit.origin + values), 4).tolist()
+    if values is None:
+        return None
+    decimals = decimals_of(unit.length * values, 4)
+    return np.round(unit.length * (unit.origin + values), decimals).tolist()
 
 
 def towards(scene: Scene, answer: QueryResult) -> Camera:
@@ -199,7 +202,7 @@ def towards(scene: Scene, answer: QueryResult) -> Camera:
         middle, reach = (low + high) / 2, BACK * float(np.linalg.norm(high - low)) / 2
         away = scene.framing_camera(SIZE).position - middle
         return look_at(
-            middle + reach * away / max(float(np.linalg.norm(away)), 1e-9), middle, scene.up(), SIZE
+            middle + reach * away / max(float(np.linalg.norm(away)), 1e-300), middle, scene.up(), SIZE
         )
 
     def seen(camera: Camera) -> float:

@@ -294,7 +294,7 @@ def write_grid(folder: Path, plan: FloorMap) -> None:
         Image.fromarray(np.ascontiguousarray(grey.T[::-1])).save(path, "PPM")
     x, y = plan.origin
     lines = ["image: map.pgm", "mode: trinary", f"resolution: {plan.resolution}"]
-    lines += [f"origin: [{x:.6f}, {y:.6f}, 0.0]", "negate: 0"]
+    lines += [f"origin: [{x:.9g}, {y:.9g}, 0.0]", "negate: 0"]
     lines += [f"{name}: {value}" for name, value in THRESHOLDS.items()]
     with atomic_path(folder / "map.yaml") as path:
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -304,7 +304,7 @@ def write_collider(path: Path, occupancy: Occupancy) -> None:
     """Write everything that is occupied as squares, a Wavefront OBJ in metres."""
     corners, squares = collider(occupancy)
     with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
-        np.savetxt(file, corners, "v %.4f %.4f %.4f")
+        np.savetxt(file, corners, "v %.9g %.9g %.9g")
         np.savetxt(file, squares + 1, "f %d %d %d %d")
 
 

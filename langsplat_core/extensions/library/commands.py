@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import tyro
 from PIL import Image
 
+from langsplat_core.arrays import length_text
 from langsplat_core.cli.arguments import EncoderOption, JsonOption, OutFile, TrainedScene
 from langsplat_core.cli.query import Unit, in_world, once, unit_of
 from langsplat_core.cli.run import print_json
@@ -203,7 +204,9 @@ def _in_words(change: Change, unit: Unit) -> str:
     at = f"{unit.place(change.centre)} {unit.name}"
     if change.kind == "moved":
         assert change.moved is not None
-        by = f"{unit.length * change.distance:.2f} {unit.name} ({unit.format(change.moved)})"
+        by = (
+            f"{length_text(unit.length * change.distance, least=2)} {unit.name} ({unit.format(change.moved)})"
+        )
         return f"moved: {name} by {by}, now at {at}"
     if change.colours is not None:
         before, now = change.colours

@@ -377,7 +377,7 @@ def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
         if channel == len(owners):
             owners.append(np.full((rows, columns), -1, np.int32))
         owners[channel][place] = patch
-    return channel_of, np.array(owners, np.int32).reshape(-1, rows, columns)
+    return channel_of, np.array(owners, np.int32).reshape(len(owners), rows, columns)
 
 
 def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> Array:

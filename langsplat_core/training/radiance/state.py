@@ -87,7 +87,8 @@ def _neighbour_distance(points: Array) -> Array:
     if len(points) < 2:
         return np.ones(len(points))
     distances, _ = cKDTree(points).query(points, k=min(4, len(points)))
-    return np.sqrt(np.maximum((distances[:, 1:] ** 2).mean(1), 1e-7))  # the bound is INRIA's
+    mean = np.sqrt((distances[:, 1:] ** 2).mean(1))
+    return np.maximum(mean, max(1e-3 * float(np.median(mean)), 1e-30))  # INRIA: 3e-4 in every unit
 
 
 # Parameters, Adam's moments and statistics. All of it has one row per Gaussian, so that adding and removing
