@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from langsplat_core.arrays import Array, ViewScore, psnr
+from langsplat_core.arrays import Array, ViewScore, near_power, psnr
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import BackendError
@@ -142,11 +142,15 @@ def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor],
     """Return the (GRID, GRID) mean depths of what a camera sees of the `values`, NaN where little is."""
     small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
     z = camera.project(values["means"].detach().cpu().numpy())[1].clip(0).astype(np.float32)
-    grey = torch.from_numpy(np.repeat((z[:, None, None] - 0.5) / C0, 3, axis=2)).to(values["means"].device)
+    length = near_power(
+        max(float(np.median(z)), 1e-30)
+    )  # of a unit in which colours keep the digits of depths
+    shade = np.repeat((z[:, None, None] / np.float32(length) - 0.5) / C0, 3, axis=2)
+    grey = torch.from_numpy(shade.astype(np.float32)).to(values["means"].device)
     with torch.no_grad():
         rendered = renderer.render({**values, "sh_dc": grey}, small, 0)
     depth, alpha = patch_means(rendered.image)[..., 0], patch_means(rendered.alpha[..., None])[..., 0]
-    return np.where(alpha > 0.5, depth / np.maximum(alpha, 1e-6), np.nan)
+    return np.where(alpha > 0.5, length * depth / np.maximum(alpha, 1e-6), np.nan)
 
 
 Backend = Literal["auto", "cpu", "cuda"]
