@@ -12,7 +12,7 @@ from langsplat_core.io.gltf import GltfWriter
 from langsplat_core.io.ply import CHANNELS, POSITION, write_table
 from langsplat_core.io.quantised import to_bytes
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_core.scene.transform import AXES, C0, moving, scaling, turning
+from langsplat_core.scene.transform import AXES, C0, moving, scaling, turned_origin, turning
 
 POINT_SUFFIXES = (".ply",)
 MESH_SUFFIXES = (".ply", ".glb")
@@ -79,8 +79,9 @@ def write_mesh(path: Path | str, mesh: MeshLike, scene: Scene) -> None:
 
 def gltf_axes(scene: Scene) -> Array:
     """Return (4, 4) from the scene to the axes of glTF: y up, in metres where the scale is known."""
-    upright = turning(scene.up(), AXES["y"]).then(scaling(scene.metres_per_unit or 1.0))
-    return moving(scene.origin).then(upright).matrix
+    upright = turning(scene.up(), AXES["y"])
+    place = moving(turned_origin(upright.rotation, scene.origin))
+    return upright.then(place).then(scaling(scene.metres_per_unit or 1.0)).matrix
 
 
 def check_suffix(path: Path | str, suffixes: Sequence[str]) -> Path:

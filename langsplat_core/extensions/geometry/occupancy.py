@@ -17,6 +17,7 @@ from langsplat_core.extensions.geometry.planes import Room
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import NO_ORIGIN, Scene
+from langsplat_core.scene.transform import turned_origin
 
 MOST_CELLS = 60_000_000  # of a grid
 SIDE = 240  # pixels of the longer side of the depth images
@@ -92,7 +93,7 @@ def map_axes(room: Room, metres: float, origin: Array = NO_ORIGIN) -> Array:
     first /= np.linalg.norm(first)
     made = np.eye(4)
     made[:3, :3] = metres * np.stack([first, np.cross(room.up, first), room.up])
-    made[:3, 3] = made[:3, :3] @ origin
+    made[:3, 3] = metres * turned_origin(made[:3, :3] / metres, origin)
     made[2, 3] = -metres * room.ground
     return made
 

@@ -38,6 +38,7 @@ from langsplat_core.scene.transform import (
     IDENTITY,
     Similarity,
     moving,
+    place_scene,
     rotation_quaternion,
     transform_scene,
     turning,
@@ -274,14 +275,18 @@ def test_merge_refuses_scenes_of_two_encoders():
 # On files.
 
 
-def test_scenes_are_laid_onto_each_other_and_merged(tmp_path, capsys):
-    room = box_room(3)
+@pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (500_123.25, 5_412_345.5, 0.0)], ids=["near", "UTM"])
+def test_scenes_are_laid_onto_each_other_and_merged(tmp_path, capsys, at):
+    room = place_scene(box_room(3), moving(np.array(at)))
     turn = moving(np.array([0.7, -0.4, 0.2]))
     save_scene(tmp_path / "a.ply", room)
-    save_scene(tmp_path / "b.ply", transform_scene(room, turn))
+    save_scene(tmp_path / "b.ply", place_scene(room, turn))
     assert run("register", tmp_path / "b.ply", tmp_path / "a.ply", "--out", tmp_path / "to.json") == 0
     found = np.array(json.loads((tmp_path / "to.json").read_text())["matrix"])
-    np.testing.assert_allclose(found @ turn.matrix, np.eye(4), atol=0.02)
+    corners = at + np.eye(3)
+    np.testing.assert_allclose(
+        turn.points(corners) @ found[:3, :3].T + found[:3, 3], corners, rtol=0, atol=0.02
+    )
     told = ("--transform", tmp_path / "to.json")
     assert run("merge", tmp_path / "a.ply", tmp_path / "b.ply", "--out", tmp_path / "both.ply", *told) == 0
     assert "as told" in capsys.readouterr().out
@@ -371,6 +376,9 @@ def test_axes_of_a_map_are_metres_with_the_ground_at_nought():
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, 9 * np.eye(3), atol=1e-12)
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(27)
     np.testing.assert_allclose(matrix[:3, :3] @ (2.0 * up) + matrix[:3, 3], [0, 0, 0], atol=1e-12)
+    tilt = np.array([0.001, 0.0, 1.0])
+    far = map_axes(Room(tilt / np.linalg.norm(tilt), 0.0, None), 3.0, np.array([5e5, 5e6, 300.0]))
+    np.testing.assert_allclose(far[:2, 3], [1.5e6, 1.5e7])  # where it is on a map of the world
     sideways = map_axes(Room(np.array([1.0, 0, 0]), 0.0, None), 1.0)
     assert np.isfinite(sideways).all()
 

@@ -38,6 +38,7 @@ from langsplat_core.query.grammar import named
 from langsplat_core.query.rule import judge, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene.transform import place_scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.relevancy import bundled_vocabulary
 from tests.support.fakes import CENTRES, NAMES, PER_BLOB, WORDS, FakeEncoder, axis, named_scene
@@ -300,11 +301,11 @@ def test_noise_and_exposure_are_no_changes(scene):
 @pytest.mark.parametrize("number", range(3))
 def test_gone_and_appeared_are_each_other_backwards(scene, number):
     rows = (MUG, BOOK, PLANT)[number]
-    fewer = noisy(without(scene, rows))
+    fewer = place_scene(noisy(without(scene, rows)), origin=np.array([30.0, 0.0, -8.0]))  # in the same world
     for pair, kind in (((scene, fewer), "gone"), ((fewer, scene), "appeared")):
         (change,) = compared(*pair)
         assert change.kind == kind
-        np.testing.assert_allclose(change.centre, CENTRES[number], atol=0.1)
+        np.testing.assert_allclose(pair[0].in_world(change.centre), CENTRES[number], atol=0.1)
         assert change.share > 0.8
 
 
