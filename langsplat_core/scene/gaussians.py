@@ -61,7 +61,7 @@ class Gaussians:
     def sample(self) -> "Gaussians":
         """Some of those that can be seen, at most 10 000, evenly taken."""
         some = self.take(np.arange(0, len(self), len(self) // 10_000 + 1))
-        return some.take(some.valid() & (some.opacity_logits >= logit(np.array(INRIA.alpha_min))))
+        return some.take(some.valid() & (some.opacity_logits >= float(logit(np.array(INRIA.alpha_min)))))
 
     def valid(self) -> Array:
         """(N,) True where a row can be drawn, see `invalid_rows` for why it cannot."""
