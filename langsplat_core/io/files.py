@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import re
+import shutil
 import stat
 import sys
 import tempfile
@@ -27,29 +28,68 @@ os.umask(_UMASK)  # the only way to ask is to change it
 def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary name beside `path`; on a clean exit it is renamed to `path`, else removed.
 
-    The temporary name keeps the suffix, because some writers choose the format by it. Where the disk takes no
-    more, an OSError with `path` comes out, whatever the writer said.
+    The temporary name keeps the suffix, because some writers choose the format by it. A symbolic link stays
+    one, and a file its mode and group and, where it may be written, its other names. Where the disk takes no
+    more, an OSError with `path` comes out, whatever the writer said; none names the temporary file.
     """
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
     suffix = target.suffix if len(os.fsencode(target.suffix)) <= 64 else ""  # else the name may be too long
-    handle, name = tempfile.mkstemp(prefix=".writing-", suffix=suffix, dir=target.parent)
+    place = Path(os.path.realpath(target)) if os.path.islink(target) else target
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        handle, name = tempfile.mkstemp(prefix=".writing-", suffix=suffix, dir=place.parent)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(target)) from None
     os.close(handle)
     temporary = Path(name)
     try:
         yield temporary
-        temporary.chmod(0o666 & ~_UMASK)  # mkstemp makes private files; ours are ordinary ones
-        temporary.replace(target)
+        if not (place.is_file() and place.stat().st_nlink > 1 and _filled(place, temporary)):
+            _take_rights(temporary, place)
+            temporary.replace(place)
     except LangSplatError as error:  # which may name what is written: by the name that the user knows
         error.args = tuple(str(part).replace(str(temporary), str(target)) for part in error.args)
         raise
     except Exception as error:
         cause = _no_room(error, temporary)
+        if cause is None and isinstance(error, OSError) and error.errno and error.filename == name:
+            cause = error
         if cause is None:
             raise
         raise OSError(cause.errno, cause.strerror, str(target)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _take_rights(temporary: Path, place: Path) -> None:
+    """Give a temporary file the mode and group of the file that it replaces, or those of a new one."""
+    try:
+        before = place.stat()
+    except OSError:
+        temporary.chmod(0o666 & ~_UMASK)  # mkstemp makes private files; ours are ordinary ones
+        return
+    with suppress(OSError, AttributeError):  # a group that one is not of; Windows
+        os.chown(temporary, -1, before.st_gid)
+    temporary.chmod(stat.S_IMODE(before.st_mode))
+
+
+def _filled(place: Path, temporary: Path) -> bool:
+    """Write a file's content into one with other names, which keeps them; False where one may not."""
+    try:
+        file = place.open("r+b")
+    except OSError:
+        return False
+    with file, temporary.open("rb") as source:
+        size, before = os.fstat(source.fileno()).st_size, os.fstat(file.fileno()).st_size
+        try:
+            if size > before and hasattr(os, "posix_fallocate"):  # what has no room leaves the old content
+                os.posix_fallocate(file.fileno(), 0, size)
+        except OSError:
+            file.truncate(before)
+            raise
+        shutil.copyfileobj(source, file)
+        file.truncate(size)
+    return True
 
 
 def write_json(path: Path, content: object) -> None:

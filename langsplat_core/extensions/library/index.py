@@ -10,6 +10,7 @@ The index is a safetensors file: the scenes as JSON in its metadata, and for eac
 encoder, `N.`, its canonical vectors, the `Columns` of all its scenes and their thumbnails.
 """
 
+import hashlib
 import logging
 import math
 import os
@@ -22,6 +23,7 @@ from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
+import platformdirs
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from scipy.sparse import csr_matrix
@@ -274,12 +276,13 @@ def update_library(
     The index is written where anything is different; an interrupted call keeps what it had read. A damaged
     index costs a warning, and is made again. Raises InputError without scenes.
     """
-    index = folder / INDEX if index is None else index
+    index = index_of(folder) if index is None else index
     paths = {path.relative_to(folder).as_posix(): path for path in scenes_in(folder)}
     if not paths:
         raise InputError(f"{folder}: no scene with a language field in it; `langsplat train` makes them")
     stamps = {name: stamp_of(path) for name, path in paths.items()}
-    kept, listed = _kept(index, folder, stamps)
+    before = index if exists(index) else folder / INDEX
+    kept, listed = _kept(before, folder, stamps)
     fresh = [name for name in paths if name not in kept]
     try:
         for done, name in enumerate(fresh):
@@ -291,7 +294,15 @@ def update_library(
                 kept = _kept(index, folder, stamps, logging.DEBUG)[0] | kept
                 write_library(index, [kept[name] for name in paths if name in kept])
     progress("reading scenes", 1.0)
-    return read_library(index, folder)
+    return read_library(index if exists(index) else before, folder)
+
+
+def index_of(folder: Path) -> Path:
+    """Return where the index of a folder lies: in it, or in the user's cache where it cannot be written."""
+    if os.access(folder, os.W_OK):
+        return folder / INDEX
+    digest = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:16]
+    return platformdirs.user_cache_path("langsplat-viewer", appauthor=False) / f"library-{digest}"
 
 
 def _kept(

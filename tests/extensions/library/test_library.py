@@ -195,6 +195,17 @@ STATEMENTS = {
 }
 
 
+def test_folder_that_cannot_be_written_has_its_index_in_the_cache(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != folder)
+    found = update_library(folder, load_encoder=load)
+    assert not (folder / INDEX).exists()
+    (index,) = (tmp_path / "cache").rglob("library-*")
+    before = index.stat().st_mtime_ns
+    assert len(update_library(folder, load_encoder=load).scenes) == len(found.scenes)
+    assert index.stat().st_mtime_ns == before
+
+
 @pytest.mark.parametrize("name", STATEMENTS)
 def test_index_with_a_false_statement_is_refused(folder, name):
     update_library(folder, load_encoder=load)
