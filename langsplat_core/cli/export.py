@@ -161,9 +161,16 @@ class Convert:
             raise InputError(f"--to {self.to}: choose one of {', '.join(('scene', *exporters))}")
         exporter: Exporter = registry.part("exporters", self.to)
         check_output_folder(self.out)
-        request = ExportRequest(self.sources, lambda: replace(self._read(), path=self.source), self.out)
+
+        def load() -> Scene:
+            scene = replace(self._read(), path=self.source)
+            if scene.origin.any():
+                where = " ".join(f"{value:.10g}" for value in scene.origin)
+                print(f"{self.out}: positions are relative to {where}, for which checkpoints have no room")
+            return scene
+
         with TerminalProgress() as progress:
-            lines = exporter.write(request, progress)
+            lines = exporter.write(ExportRequest(self.sources, load, self.out), progress)
         print(*lines, sep="\n")
 
 
