@@ -143,7 +143,7 @@ class Grid:
 def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None) -> Grid:
     """Return a level grid below almost all of the scene.
 
-    Its lines are round lengths apart and at round distances from the world's origin: in metres where the
+    Its lines are round lengths apart and at round distances from the scene's origin: in metres where the
     scene has a scale, else in world units.
     """
     scale = metres_per_unit or 1.0

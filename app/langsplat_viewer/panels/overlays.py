@@ -312,7 +312,7 @@ def _names(named: list[Named], area: ui.Area) -> None:
 
 
 def _grid(grid: overlays.Grid, pen: Pen) -> None:
-    """Draw the lines on the ground, each with its distance from the world's origin."""
+    """Draw the lines on the ground, each with its distance from the scene's origin."""
     _lines(pen.segments(grid.segments)[0], GRID, 1.0)
     paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32((*GRID[:3], 1.0))
     for text, point in grid.marks:

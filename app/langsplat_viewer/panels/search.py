@@ -207,7 +207,7 @@ def _details(viewer: Viewer, query: Query) -> None:
     ):
         queries.explain(viewer, query)
     if place is not None:
-        imgui.text_colored(ui.muted(), "at " + length_text(place, "  ", 2))
+        imgui.text_colored(ui.muted(), "at " + length_text(place, "  ", 2, viewer.state.origin))
         ui.tip("Where it is relevant most; world units")
     if answer.problem:
         ui.small_wrapped(answer.problem, ui.bad())
