@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from datetime import timedelta
@@ -34,6 +34,9 @@ T = TypeVar("T")
 Arrays = Mapping[str, Array]
 
 
+DIGEST = "digest"  # name beside the arrays of a stage
+
+
 def stage_key(name: str, version: int, *inputs: Any) -> str:
     """Return a short name such as ``radiance-7293f2d8d936`` that changes with any setting or input.
 
@@ -48,14 +51,19 @@ def stage_key(name: str, version: int, *inputs: Any) -> str:
 def kept(path: Path, make: Callable[[], Arrays]) -> Arrays:
     """Return the arrays of a stage, read from `path` (*.npz) where they were made before.
 
-    Else they are made and stored there, whole or not at all. Raises FormatError for a damaged file.
+    Else they are made and stored there, whole or not at all. Raises FormatError for a damaged file, and for
+    one whose arrays are not those that were stored: later stages believe their shapes and numbers.
     """
     if path.exists():
         log.debug("%s: kept from an earlier run", path.name)
-        return read_arrays(path)
+        found = dict(read_arrays(path))
+        stated = str(found.pop(DIGEST, ""))  # none in work folders of earlier versions
+        if stated and stated != _digest(found.items()):
+            raise FormatError(f"{path}: changed since it was written; delete it and run again")
+        return found
     made = make()
     with atomic_path(path) as temporary:
-        np.savez(temporary, allow_pickle=False, **made)
+        np.savez(temporary, allow_pickle=False, **made, **{DIGEST: np.array(_digest(made.items()))})
     return made
 
 
@@ -82,9 +90,12 @@ def read_arrays(path: Path) -> Arrays:
 
 def digest_of(data: Gaussians | ImageFeatures) -> str:
     """Return a digest of every number of Gaussians, or of the masks and vectors of a photograph."""
+    return _digest((entry.name, getattr(data, entry.name)) for entry in fields(data))
+
+
+def _digest(arrays: Iterable[tuple[str, Array]]) -> str:
     digest = hashlib.blake2b(digest_size=16)
-    for entry in fields(data):
-        array = getattr(data, entry.name)
+    for _, array in arrays:
         digest.update(repr((array.shape, array.dtype.str)).encode())
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()

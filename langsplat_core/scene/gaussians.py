@@ -35,7 +35,8 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = np.ascontiguousarray(getattr(self, field.name), dtype=np.float32)
+            with np.errstate(over="ignore", invalid="ignore"):  # of doubles in files: such rows are not drawn
+                value = np.ascontiguousarray(getattr(self, field.name), dtype=np.float32)
             object.__setattr__(self, field.name, value)
         dims = check_array("means", self.means, ("N", 3))
         check_array("log_scales", self.log_scales, ("N", 3), dims)

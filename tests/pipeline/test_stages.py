@@ -10,14 +10,15 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch.distributed
 
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
-from langsplat_core.errors import InputError
-from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use, stage_key
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, kept, sole_use, stage_key
 from langsplat_core.progress import Report
 from tests.support.photographs import colmap_reconstruction, poses, write_photos
 from tests.support.processes import resize, small_disk
@@ -36,6 +37,17 @@ def test_stage_key_names_stage_version_and_inputs() -> None:
     keys.add(stage_key("lift", 2, "b"))
     assert len(keys) == 4
     assert stage_key("lift", 2, "a") in keys
+
+
+def test_stored_arrays_that_changed_are_refused(tmp_path: Path) -> None:
+    made = {"a": np.arange(6.0).reshape(2, 3), "b": np.zeros(0, np.int32)}
+    path = tmp_path / "stage.npz"
+    kept(path, lambda: made)
+    found = kept(path, dict)
+    assert {name: array.tolist() for name, array in found.items()} == {n: a.tolist() for n, a in made.items()}
+    np.savez(path, **{**np.load(path), "a": made["a"][:1]})
+    with pytest.raises(FormatError, match="changed since"):
+        kept(path, dict)
 
 
 def test_lock_names_its_owner_and_expires_with_it(tmp_path: Path) -> None:

@@ -583,7 +583,7 @@ def photograph(path: Path) -> float:
     width, height = picture_size(path)
     for upright in (False, True):
         picture = read_photo(path, upright)
-        assert picture.mode == "RGB"
+        assert picture.mode in ("RGB", "RGBA")
         assert {*picture.size} == {width, height}
     return 1.0
 
