@@ -51,6 +51,15 @@ def test_rows_of_several_chunks_are_read(put, encode):
     assert_same(read_ply(put(encode(want))), want)
 
 
+def test_names_of_cloudcompare_are_read(put):
+    want = random_gaussians(20, sh_degree=1)
+    data = plain_ply(want)
+    for name in inria_names(1)[6:]:
+        data = data.replace(f" {name}\n".encode(), f" scalar_{name}\n".encode(), 1)
+    assert data.count(b"scalar_") == len(inria_names(1)) - 6
+    assert_same(read_ply(put(data)), want)
+
+
 def test_rows_that_cannot_be_drawn_are_kept(tmp_path):
     want = random_gaussians(8)
     want.means[0], want.log_scales[1], want.quats_wxyz[2] = np.nan, -np.inf, 0
