@@ -355,7 +355,7 @@ def written(case: Case) -> Found:
             save_scene(path, replace(case.scene, path=path))
             again = replace(load_scene(path), cameras=case.scene.cameras)
         except InputError:  # its own limits are said, not crossed
-            assert suffix == ".spz"
+            assert suffix in (".spz", ".sog")
         drawn[suffix] = Image(render(again, again.cameras[3]).colours, 38.0)
     return drawn
 

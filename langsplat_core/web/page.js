@@ -304,7 +304,8 @@ class Page {
     const [style, word] = OUTCOMES[outcome];
     const sure = probability === null ? "" : `, ${Math.round(100 * probability)} %`;
     const unit = this.meta.metres_per_unit === 1 ? " m" : "";
-    const place = answer.place?.map((length) => length.toFixed(2)).join(" ");
+    const digits = Math.min(Math.max(2 - Math.floor(Math.log10(this.meta.radius)), 2), 20);
+    const place = answer.place?.map((length) => length.toFixed(digits)).join(" ");
     const count = this.shown.length;
     const places = `${count} ${count > 1 ? "places" : "place"}`;
     const where = `${places}, level ${levels[answer.level]}; at ${place}${unit}`;
