@@ -92,10 +92,13 @@ def read_npy(path: Path) -> Array:
         return _parse(file, size, str(path))
 
 
-def read_npz(path: Path) -> dict[str, Array]:
-    """Return the arrays in an .npz file, by their names without .npy. Raises as `read_npy` does."""
+def read_npz(path: Path, free: int = FREE) -> dict[str, Array]:
+    """Return the arrays in an .npz file, by their names without .npy. Raises as `read_npy` does.
+
+    free: bytes that they may take however small the file is.
+    """
     arrays = {}
-    with opened_archive(path, ".npz file") as archive:
+    with opened_archive(path, ".npz file", free) as archive:
         for member in archive.names:
             data = archive.read(member, 2**31)
             name = member.removesuffix(".npy")
@@ -262,10 +265,10 @@ MOST_DIRECTORY = 4 << 20  # bytes, in 40 000 names; zipfile makes objects of ten
 class Archive:
     """The members of an open archive."""
 
-    def __init__(self, archive: zipfile.ZipFile, path: Path, size: int) -> None:
+    def __init__(self, archive: zipfile.ZipFile, path: Path, size: int, free: int) -> None:
         self._archive, self.path, self.size = archive, path, size  # size of the file, bytes
         self.names = archive.namelist()
-        self._room = Allowance(path, size)
+        self._room = Allowance(path, size, free=free)
 
     def read(self, name: str, limit: int) -> bytes:
         """Return the content of a member.
@@ -289,8 +292,8 @@ class Archive:
 
 
 @contextmanager
-def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
-    """Open the archive in a file; `kind` is for messages ("SOG archive").
+def opened_archive(path: Path, kind: str, free: int = FREE) -> Iterator[Archive]:
+    """Open the archive in a file; `kind` is for messages ("SOG archive"), `free` as of `read_npz`.
 
     Raises InputError where the file cannot be opened, and FormatError for whatever zipfile raises inside the
     block.
@@ -300,7 +303,7 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
         try:
             _check_directory(file, size)
             with zipfile.ZipFile(file) as archive:
-                yield Archive(archive, path, size)
+                yield Archive(archive, path, size, free)
         except LangSplatError:
             raise
         except Exception as error:  # noqa: BLE001  any at all, see the top of this file

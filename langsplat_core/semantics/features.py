@@ -47,6 +47,9 @@ class ImageFeatures:
             )
 
 
+LARGEST_LABELS = 96 << 20  # bytes: of photographs of 4000 x 4000 px, however well they compress
+
+
 class FeatureStore:
     """A folder with one file per photograph, never pickled and never half written.
 
@@ -99,7 +102,7 @@ class FeatureStore:
     def _read(self, name: str) -> tuple[ImageFeatures, str]:
         """Return the features and the key they were saved with. Raises InputError and FormatError."""
         path = self.path(name)
-        arrays = read_npz(path)
+        arrays = read_npz(path, LARGEST_LABELS)
         try:
             key, labels, vectors = arrays["key"], arrays["labels"], arrays["vectors"]
             if (key.dtype.kind, labels.dtype.kind, vectors.dtype.kind) != ("U", "i", "f") or key.ndim:
