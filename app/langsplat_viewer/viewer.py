@@ -226,14 +226,14 @@ class Viewer:
         done: Callable[[T], None],
         failed: Callable[[str], None] | None = None,
     ) -> None:
-        """Have the worker do `work` with the scene's engine; what it finds is dropped with the scene."""
+        """Have the worker do `work` with the engine; what comes of it is dropped with the scene."""
         engine, scene = self.engine, self.state.scene
 
         def here(then: Callable[[Any], None]) -> Callable[[Any], None]:
             return lambda found: then(found) if self.state.scene is scene else None
 
         if engine is not None:
-            report = here(failed or self.say_error)
+            report = here(failed) if failed else self.say_error
             self.run(label, lambda progress: work(engine, progress), here(done), report)
 
     def searchable(self) -> QueryEngine | None:

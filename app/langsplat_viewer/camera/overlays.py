@@ -125,8 +125,8 @@ def round_length(length: float) -> float:
     return min((factor * power for factor in (1, 2, 5, 10)), key=lambda value: abs(math.log(value / length)))
 
 
-def length_text(units: float, metres_per_unit: float | None) -> str:
-    """Return a length in world units, and in metres where the scene has a scale."""
+def measured(units: float, metres_per_unit: float | None) -> str:
+    """Return as text a length in world units, and in metres where the scene has a scale."""
     text = f"{units:.4g} units"
     return text if metres_per_unit is None else f"{units * metres_per_unit:.4g} m ({text})"
 

@@ -208,9 +208,9 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
         paint.pop_clip_rect()
     if "cube" in shown:  # as files call them
         _axes(state.view, area)
-    foot = [] if grid is None else [f"grid {overlays.length_text(grid.spacing, metres)}"]
+    foot = [] if grid is None else [f"grid {overlays.measured(grid.spacing, metres)}"]
     if state.view.orthographic:
-        span = overlays.length_text(state.view.span_in(*state.size), metres)
+        span = overlays.measured(state.view.span_in(*state.size), metres)
         foot.append(f"orthographic, {span} across the shorter side")
     line = imgui.get_text_line_height()
     for number, text in enumerate(foot, 1):
@@ -343,7 +343,7 @@ def _ruler(ruler: Ruler, pen: Pen, metres: float | None) -> None:
         _lines(segments, RULER, 2.0)
         for segment in segments:
             x, y = segment.mean(0) + 8
-            text_on_shade(overlays.length_text(ruler.length, metres), x, y, pen.area)
+            text_on_shade(overlays.measured(ruler.length, metres), x, y, pen.area)
 
 
 def _notes(notes: Sequence[Note], pen: Pen) -> None:
