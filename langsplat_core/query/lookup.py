@@ -151,5 +151,7 @@ def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
 
     window = max(1, min(window, *relevancy.shape))
     smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")
-    row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
+    # Of those as high the middle one: which is higher by its last digits follows from the unit of lengths.
+    tied = np.argwhere(smooth >= smooth.max() - 1e-6)
+    row, column = tied[np.square(tied - tied.mean(0)).sum(1).argmin()]
     return int(column), int(row), float(smooth[row, column])
