@@ -76,19 +76,21 @@ class Gaussians:
     @cached_property
     def _faults(self) -> Array:
         """(N,) uint8 number, from 1, of the first of `FAULTS` that a row has; 0: none."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            length_squared = (self.quats_wxyz.astype(np.float64) ** 2).sum(1)
-            sound_colour = (np.abs(self.sh) <= LARGEST_COEFFICIENT).all((1, 2))
-        sound = (
-            np.isfinite(self.means).all(1),
-            (self.log_scales <= 80).all(1),  # exp(88.7) overflows float32; NaN compares False
-            np.isfinite(length_squared) & (length_squared > 1e-24),
-            ~np.isnan(self.opacity_logits),
-            sound_colour,
-        )
         faults = np.zeros(len(self), np.uint8)
-        for number in range(len(FAULTS), 0, -1):
-            faults[~sound[number - 1]] = number
+        for start in range(0, len(self), 8192):  # what is compared is not held of all at once
+            rows = slice(start, start + 8192)
+            with np.errstate(over="ignore", invalid="ignore"):
+                length_squared = (self.quats_wxyz[rows].astype(np.float64) ** 2).sum(1)
+                sound_colour = (np.abs(self.sh[rows]) <= LARGEST_COEFFICIENT).all((1, 2))
+            sound = (
+                np.isfinite(self.means[rows]).all(1),
+                (self.log_scales[rows] <= 80).all(1),  # exp(88.7) overflows float32; NaN compares False
+                np.isfinite(length_squared) & (length_squared > 1e-24),
+                ~np.isnan(self.opacity_logits[rows]),
+                sound_colour,
+            )
+            for number in range(len(FAULTS), 0, -1):
+                faults[rows][~sound[number - 1]] = number
         return faults
 
 
