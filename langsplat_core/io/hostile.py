@@ -115,7 +115,9 @@ def _parse(file: BinaryIO, size: int, name: str, whole: bytes | None = None) -> 
     try:
         if form.read_magic(file) != (1, 0):  # as NumPy writes all but records of thousands of columns
             raise ValueError("version")
-        shape, in_columns, dtype = form.read_array_header_1_0(file)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # a header of Python 2, which NumPy mends with a warning
+            shape, in_columns, dtype = form.read_array_header_1_0(file)
         plain = (dtype.kind in "iuf" and dtype.itemsize <= 8) or (dtype.kind == "U" and dtype.itemsize > 0)
         if not plain or dtype.subdtype is not None or min(shape, default=0) < 0:
             raise ValueError(dtype)
