@@ -2,6 +2,7 @@
 
 import errno
 import io
+import logging
 import struct
 import sys
 import zlib
@@ -291,7 +292,7 @@ def test_transparency_is_a_mask_or_an_empty_background(
     assert bool(counted[15, 20]) != inside
     assert bool(counted[8, 20]) == capture.cut_out  # the thing's edge
     assert (capture.images[0][15 if inside else 0, 20] == 0).all()
-    assert len(caplog.messages) == (alpha == "auto")
+    assert sum(record.levelno > logging.INFO for record in caplog.records) == (alpha == "auto")  # a guess
     again = capture.read_at([0], 30)
     assert again.cut_out == capture.cut_out
     assert again.mask(0) is not None
