@@ -106,6 +106,14 @@ def test_place_ignores_crumbs():
     assert result.box[1][0] < 30
 
 
+@pytest.mark.parametrize(("finer", "level"), [(0.3, 2), (0.9, 1)])
+def test_thing_is_whole_unless_a_part_fits_clearly_better(finer, level):
+    relevancy = np.full((3, 3 * PER_BLOB), 0.3, np.float32)
+    relevancy[:2, :PER_BLOB] = sigmoid(1.0 + finer)
+    relevancy[2, :PER_BLOB] = sigmoid(1.0)
+    assert asked(relevancy, blobs(), language(), "regions").level == level
+
+
 @pytest.mark.parametrize(
     ("below", "verdict"), [(0.1, "found"), (-0.5, "weak match"), (-1.5, "not here"), (9.0, "found")]
 )
