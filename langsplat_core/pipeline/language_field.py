@@ -372,7 +372,7 @@ def agreed_features(
     views: Views,
     photographs: Sequence[tuple[Array, Array | None]],
     encoder: ImageEncoder,
-    rasterizer: LiftingRasterizer,
+    config: TrainConfig,
     work: Path,
     progress: Progress,
     processes: ProcessGroup | None = None,
@@ -383,9 +383,10 @@ def agreed_features(
     What is finished is kept in `work`.
     """
     processes = processes or ProcessGroup()
-    inputs = digest_of(gaussians), [digest_of(features) for _, features in views]
+    rasterizer = load_lifting_rasterizer(config.lift.backend)
+    formed = _formation(gaussians, views, config.radiance)
+    inputs = digest_of(gaussians), [digest_of(features) for _, features in views], formed
     folder = work / stage_key("rough-memberships", VERSION, *inputs)
-    formed = _formation(gaussians, views, RadianceConfig())
     mask_weights = kept_mask_weights(gaussians, views, folder, rasterizer, processes, progress, formed)
     counts = [len(features.vectors) for _, features in views]
     eyes = np.stack([camera.position for camera, _ in views])

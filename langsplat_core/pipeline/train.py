@@ -38,7 +38,6 @@ from langsplat_core.pipeline.report import (
 )
 from langsplat_core.pipeline.stages import ProcessGroup, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import place_scene
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, Encoder, load_encoder
@@ -140,9 +139,8 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
 
     if not mask_source.agrees:
         with run.timed("masks that agree"):
-            rasterizer = load_lifting_rasterizer(config.lift.backend)
             photographs = [(capture.images[i], capture.mask(i)) for i in train]
-            features = agreed_features(gaussians, views, photographs, encoder, rasterizer, *shared)
+            features = agreed_features(gaussians, views, photographs, encoder, config, *shared)
             views = StoredViews(views.cameras, features)
 
     with run.timed("language field"):

@@ -257,7 +257,7 @@ class Room:
         store = FeatureStore(self.folder / f"features-{outlines}-none")
         rough = zip(cameras, describe_capture(photographs, names, source, None, store, shared), strict=True)
         images, work = [(image, None) for image in photographs], self.folder / f"agreed-{self.weights}"
-        return agreed_features(self.gaussians, list(rough), images, encoder, CpuRasterizer(), work, shared)
+        return agreed_features(self.gaussians, list(rough), images, encoder, self.settings, work, shared)
 
     def field(self, variant: Variant, fresh: bool = False) -> tuple[LanguageField, CodecReport, float]:
         """The language field, what its codec loses, and seconds; `fresh` takes nothing that was kept."""

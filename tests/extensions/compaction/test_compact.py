@@ -141,13 +141,18 @@ def test_a_scene_without_cameras_is_seen_from_a_ring(scene, tmp_path):
         np.testing.assert_allclose(pixel[0], (camera.width / 2, camera.height / 2), atol=1e-6)
 
 
-@pytest.mark.parametrize(("loss", "out"), [(0.3, "scene.ply"), (0.3, "out.xyz"), (1e-6, "out.splat")])
-def test_what_cannot_be_written_is_one_line(source, tmp_path, capsys, loss, out):
+@pytest.mark.parametrize(
+    ("loss", "out", "named"),
+    [(0.3, "scene.ply", "scene.ply"), (0.3, "out.xyz", ".xyz"), (1e-6, "out.splat", "format")],
+)
+def test_compact_refuses_unwritable_outputs(source, tmp_path, capsys, loss, out, named):
     """The source itself, an unknown format, and one whose eight bits alone cost more."""
     before = contents(tmp_path)
     command = Compact(source, out=tmp_path / out, config=replace(CONFIG, max_psnr_loss=loss))
     assert command_line.main("langsplat", lambda: command) == 2
-    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("langsplat: ")
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.startswith("langsplat: ")
+    assert named in said
     assert contents(tmp_path) == before
 
 
