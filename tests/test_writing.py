@@ -243,6 +243,9 @@ def test_two_windows_keep_what_each_changed(tmp_path: Path) -> None:
     save_preferences(tmp_path, Preferences("light", 1.5), Preferences(ui_scale=1.5))
     save_preferences(tmp_path, Preferences("dark", 2.0), Preferences("dark", 1.5))
     assert load_preferences(tmp_path) == Preferences("light", 2.0)
+    for new in "ab":
+        save_preferences(tmp_path, Preferences(recent=(new, "old")), Preferences(recent=("old",)))
+    assert load_preferences(tmp_path).recent == ("b", "a", "old")
 
 
 def test_bookmarks_kept_at_once_are_all_there(tmp_path: Path) -> None:
@@ -251,6 +254,10 @@ def test_bookmarks_kept_at_once_are_all_there(tmp_path: Path) -> None:
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda name: Shelf(tmp_path).write(name, (Bookmark("door", pose, 1.0),)), names))
     assert all(Shelf(tmp_path).read(name) for name in names)
+    door, window, stair = (Bookmark(name, pose, 1.0) for name in ("door", "window", "stair"))
+    Shelf(tmp_path).write(names[0], (door, window), (door,))
+    Shelf(tmp_path).write(names[0], (stair,), (door,))
+    assert [mark.name for mark in Shelf(tmp_path).read(names[0])] == ["stair", "window"]
 
 
 @pytest.mark.parametrize("size", [3, 300_000])

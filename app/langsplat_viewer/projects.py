@@ -32,10 +32,12 @@ from langsplat_viewer.camera.flight import FOV_LIMITS, LONGEST, SAME_TIME, SPAN_
 from langsplat_viewer.session import (
     LONGEST_NOTE,
     MOST_BOOKMARKS,
+    MOST_RECENT,
     SCALES,
     SLOTS,
     Bits,
     Bookmark,
+    Move,
     Point,
     Preferences,
     Session,
@@ -46,7 +48,7 @@ SIZE_LIMIT = 64 * 1024 * 1024  # bytes of any of these files
 NONSENSE = InputError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError
 
 
-def _plain(value: object) -> Any:
+def plain(value: object) -> Any:
     """Return a part of a session as JSON has it. What is None or infinite is left out: it is the default."""
 
     def stated(value: Any) -> Any:
@@ -106,6 +108,54 @@ def _read(path: Path, what: str, decode: Callable[[Any], T]) -> T:
 def _write(path: Path, content: object) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+
+
+# Two windows that write one file: what each of them made since it read the file is kept.
+
+KEYS = {"queries": "phrase", "bookmarks": "name"}  # that tell the entries of a list
+# What is merged of a session, with the number of levels of names that are merged one by one; all else is
+# settings, and as the window that writes has them.
+MADE = {"queries": 1, "bookmarks": 1, "notes": 1, "marks": 1, "things": 2, "moves": 0, "keyframes": 0}
+
+
+def _both(old: Any, own: Any, other: Any, levels: int, clashes: list[object]) -> Any:
+    """Return two changes of `old` as one, all of them JSON; `own`, and a clash, where one value has two."""
+    if own == other or other == old:
+        return own
+    if own == old:
+        return other
+    if levels == 0:
+        clashes.append(own)
+        return own
+    old, own, other = old or {}, own or {}, other or {}
+    names = dict.fromkeys((*own, *other))
+    found = {n: _both(old.get(n), own.get(n), other.get(n), levels - 1, clashes) for n in names}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _by_key(name: str, value: Any) -> Any:
+    """Return the value of a session's field as JSON, where `MADE` names one level of a list as a dict."""
+    if not isinstance(value, list) or MADE[name] == 0:
+        return value
+    return {entry[KEYS[name]] if name in KEYS else json.dumps(entry): entry for entry in value}
+
+
+def _merged(before: Session, own: Session, other: Session, count: int) -> tuple[Session, bool]:
+    """Return `own` with what is new in `other`, both changed from `before`, and whether that is all of it."""
+    clashes: list[object] = []
+    states = [plain(session) for session in (before, own, other)]
+    merged = dict(states[1])
+    for name, levels in MADE.items():
+        old, new, others = (_by_key(name, state[name]) for state in states)
+        made = _both(old, new, others, levels, clashes if name != "queries" else [])  # a cut or a colour
+        merged[name] = list(made.values()) if isinstance(states[1][name], list) and levels else made
+    for query in merged["queries"]:
+        if own.query(query["phrase"]) is None:
+            query.pop("slot", None)  # its colour is taken by another
+    try:
+        return _checked(_converted(merged, Session, count)), not clashes
+    except NONSENSE:  # more of something than a session holds
+        return own, False
 
 
 # Poses, in paths and bookmarks flat beside what else an entry has:
@@ -180,7 +230,7 @@ def _check_keyframes(keyframes: tuple[Keyframe, ...]) -> None:
 
 def write_flight(path: Path | str, flight: Flight) -> None:
     """Write `flight`, whole or not at all."""
-    keyframes = [_flat(_plain(key)) for key in flight.keyframes]
+    keyframes = [_flat(plain(key)) for key in flight.keyframes]
     _write(Path(path), {PATH_MARK: PATH_VERSION, "keyframes": keyframes})
 
 
@@ -201,22 +251,30 @@ class Shelf:
         """Read the bookmarks of a scene. InputError where the file makes no sense."""
         return self._read(scene)[1]
 
-    def write(self, scene: Path, bookmarks: tuple[Bookmark, ...]) -> None:
-        """Keep the bookmarks of a scene beside those of others.
+    def write(
+        self, scene: Path, bookmarks: tuple[Bookmark, ...], before: tuple[Bookmark, ...] = ()
+    ) -> tuple[Bookmark, ...]:
+        """Keep the bookmarks of a scene beside those of others; return those that are kept.
 
-        InputError where the file that is there makes no sense: it stays as it is. OSError where it cannot be
-        written.
+        before: as they were; what another window changed since then stays. InputError where the file that is
+        there makes no sense, or they are too many: it stays as it is. OSError where it cannot be written.
         """
         if self.folder is None:
-            return
+            return bookmarks
         self.folder.mkdir(parents=True, exist_ok=True)
         with locked(self.folder):
-            scenes, _ = self._read(scene)
+            scenes, there = self._read(scene)
             scenes.pop(str(scene.absolute()), None)
-            if bookmarks:
-                scenes[str(scene.absolute())] = [_flat(_plain(bookmark)) for bookmark in bookmarks]
+            old, own, other = (_by_key("bookmarks", plain(part)) for part in (before, bookmarks, there))
+            kept = list(_both(old, own, other, 1, []).values())
+            if len(kept) > MOST_BOOKMARKS:
+                raise InputError(f"with another window's there are more than {MOST_BOOKMARKS}: delete one")
+            if kept:
+                scenes[str(scene.absolute())] = [_flat(dict(entry)) for entry in kept]
             last = dict(list(scenes.items())[-MOST_SCENES:])
             _write(self.folder / BOOKMARKS, {"version": 1, "scenes": last})
+        merged: tuple[Bookmark, ...] = _converted(kept, tuple[Bookmark, ...])
+        return merged
 
     def _read(self, scene: Path) -> tuple[dict[str, list[Any]], tuple[Bookmark, ...]]:
         """Return the entries of all scenes, and the bookmarks of one."""
@@ -269,11 +327,35 @@ class Project(msgspec.Struct, omit_defaults=True):
     left_out: tuple[str, ...] = ()  # of a project of an earlier version, a line each
 
 
-def write_project(path: Path, project: Project) -> None:
-    """Write a project, whole or not at all."""
+def write_project(path: Path, project: Project, apart: Path, before: Project | None = None) -> Project:
+    """Write a project, whole or not at all; return what the file holds now.
+
+    before: what it held when it was last read or written here. What another window has made since then is
+    taken over. Of what both changed `project` counts, and the other's file is kept as `apart`.
+    """
     folder, scene = path.absolute().parent, Path(project.scene)
     named = scene.relative_to(folder).as_posix() if scene.is_relative_to(folder) else str(scene)
-    _write(path, {"format": FORMAT, "version": VERSION, **_plain(project), "scene": named})
+    with locked(folder):
+        if path.exists():
+            other, whole = _of_same_scene(path, project), False
+            if other is not None:
+                start = Session() if before is None else before.session
+                session, whole = _merged(start, project.session, other.session, project.gaussians)
+                project = msgspec.structs.replace(project, session=session)
+            if not whole:
+                with atomic_path(apart) as temporary:
+                    temporary.write_bytes(path.read_bytes())
+        _write(path, {"format": FORMAT, "version": VERSION, **plain(project), "scene": named})
+        return read_project(path)
+
+
+def _of_same_scene(path: Path, project: Project) -> Project | None:
+    """Return the project in a file, None where that is none of the same scene."""
+    with suppress(InputError):
+        other = read_project(path)
+        if (other.scene, other.gaussians, other.origin) == (project.scene, project.gaussians, project.origin):
+            return other
+    return None
 
 
 def read_project(path: Path) -> Project:
@@ -318,7 +400,7 @@ def _checked(session: Session) -> Session:
     things = session.things
     return replace(
         session,
-        moves=tuple(replace(move, to=similarity(move.to.matrix)) for move in session.moves),
+        moves=tuple(map(_rigid, session.moves)),
         things=replace(things, names={n: _line(name) for n, name in things.names.items()}),
         notes=tuple(replace(note, text=_line(note.text)) for note in session.notes),
         bookmarks=tuple(replace(mark, name=_line(mark.name)) for mark in session.bookmarks),
@@ -327,6 +409,15 @@ def _checked(session: Session) -> Session:
 
 def _line(text: str) -> str:
     return printable_line(text, LONGEST_NOTE)
+
+
+def _rigid(move: Move) -> Move:
+    """Return a move whose matrix is a similarity: itself where it is one, so that files can be compared."""
+    matrix = move.to.matrix
+    exact = similarity(matrix)
+    return (
+        move if np.allclose(exact.matrix, matrix, 1e-12, 1e-12 * move.to.scale) else replace(move, to=exact)
+    )
 
 
 def _from_version_1(top: dict[str, Any]) -> dict[str, Any]:
@@ -355,7 +446,7 @@ def _from_version_1(top: dict[str, Any]) -> dict[str, Any]:
         "notes": top["notes"],
         "ruler": {"points": top["ruler"]},
         "marks": top["marks"],
-        "moves": [{"to": _plain(similarity(move["matrix"])), "of": move["of"]} for move in top["moves"]],
+        "moves": [{"to": plain(similarity(move["matrix"])), "of": move["of"]} for move in top["moves"]],
         "things": {**top["things"], "names": dict(top["things"]["names"])},
     }
     return {**top, "view": _nested(top["view"]), "session": session}
@@ -403,6 +494,13 @@ def save_preferences(folder: Path, preferences: Preferences, before: Preferences
             pairs = ((entry.name, getattr(preferences, entry.name)) for entry in fields(preferences))
             changed = {name: value for name, value in pairs if value != getattr(before, name)}
             with suppress(InputError):  # a file that makes no sense is written anew
-                preferences = replace(load_preferences(folder, preferences), **changed)
+                there = load_preferences(folder, preferences)
+                if "recent" in changed:
+                    new = [path for path in preferences.recent if path not in before.recent]
+                    recent = dict.fromkeys(
+                        (*(new or preferences.recent[:1]), *there.recent, *preferences.recent)
+                    )
+                    changed["recent"] = tuple(recent)[:MOST_RECENT]
+                preferences = replace(there, **changed)
         with atomic_path(folder / FILE_NAME) as temporary:
             temporary.write_bytes(msgspec.json.format(msgspec.json.encode(preferences), indent=1))

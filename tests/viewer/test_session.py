@@ -284,6 +284,43 @@ def test_project_restores_the_whole_session(opened, saved, again):
     assert saving.save_project(again, Path("/nowhere")) == saved  # where it came from
 
 
+def test_two_windows_save_one_project_and_lose_nothing(saved, opened, again):
+    """What each made is in the file and both windows; where both edited one thing there is a second file."""
+    settings.pin_at(opened, 0.4, 0.5)
+    viewpoint.add_bookmark(opened, "left")
+    opened.put(things=Things({3: "atlas"}))
+    assert saving.save_project(opened) == saved
+    settings.pin_at(again, 0.3, 0.5)
+    viewpoint.add_bookmark(again, "right")
+    again.put(things=Things({2: "cup"}))
+    queries.remove(again, "plant")
+    ask(again, "lamp")
+    act(saving.save_project, again)
+    assert [bookmark.name for bookmark in again.state.session.bookmarks] == ["right", "left"]
+    assert again.state.saved == again.state.session
+    act(saving.save_project, opened)
+    session = opened.state.session
+    assert (len(session.notes), session.things.names) == (3, {3: "atlas", 2: "cup"})
+    assert {bookmark.name for bookmark in session.bookmarks} == {"left", "right"}
+    assert phrases(opened) == ["mug", "book", "mug or book", "lamp"]
+    assert session.query("lamp").slot is None
+    assert sorted(path.name for path in saved.parent.glob("*.langsplat")) == [saved.name]
+
+    act(editing.transform, opened, moving(np.array([0.0, 2.0, 0.0])))
+    editing.take(again, blob("mug"))
+    act(editing.transform, again, moving(np.array([1.0, 0.0, 0.0])))
+    for window in (opened, again):
+        act(saving.save_project, window)
+    apart = saved.with_name("blobs-001-other-001.langsplat")
+    assert apart.name in errors(again)[-1]
+    assert len(read_project(apart).session.moves) == len(read_project(saved).session.moves) == 2
+    assert read_project(saved).session.moves[1].to.translation[0] == 1
+    saved.write_text("damaged")
+    act(saving.save_project, again)
+    assert saved.with_name("blobs-001-other-002.langsplat").read_text() == "damaged"
+    assert len(read_project(saved).session.moves) == 2
+
+
 def test_places_in_files_are_in_the_world(opened, saved, again, monkeypatch, tmp_path):
     """A scene that is read about another origin is shown, noted and filmed where it was."""
     path, view = saving.save_path(opened, tmp_path), saving.save_view(opened, tmp_path)

@@ -178,7 +178,7 @@ def return_to(viewer: Viewer, visit: SceneState) -> None:
         state.camera_index = visit.camera_index
     session, saved = visit.session.moved(offset).found_again(now=state.session), visit.saved.moved(offset)
     state.saved = replace(state.session, things=saved.things, notes=saved.notes)
-    state.project = visit.project
+    state.project, state.project_read = visit.project, visit.project_read
     take_session(viewer, session if visit.count == state.count else replace(session, things=Things()))
 
 
@@ -385,7 +385,7 @@ def _restore(viewer: Viewer, project: Project, path: Path) -> None:
         take_session(viewer, replace(session, moves=()))
     view = viewpoint.bookmarked_view(project.view.moved(offset), state.extent)
     state.view = view if project.intrinsics is None else replace(view, intrinsics=project.intrinsics)
-    state.saved, state.project = state.session, path
+    state.saved, state.project, state.project_read = state.session, path, project
     state.preferences = state.preferences.with_recent(path)
     if project.panels:
         state.preferences = replace(state.preferences, panels=project.panels)

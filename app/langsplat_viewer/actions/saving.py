@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import save_scene
@@ -20,13 +20,14 @@ from langsplat_core.io.shapes import write_points
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
-from langsplat_viewer.actions.editing import has_scene, has_selection
+from langsplat_viewer.actions.editing import adopt, has_scene, has_selection
 from langsplat_viewer.actions.viewpoint import path_motion
 from langsplat_viewer.camera.flight import pose_of
+from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import say_compiling
-from langsplat_viewer.projects import PATHS, PROJECTS, Project, write_flight, write_project
+from langsplat_viewer.projects import MADE, PATHS, PROJECTS, Project, plain, write_flight, write_project
 from langsplat_viewer.rendering.renderer import open_renderer
-from langsplat_viewer.session import Bookmark
+from langsplat_viewer.session import Bookmark, Session
 from langsplat_viewer.state import Leaving, flight_of
 from langsplat_viewer.viewer import Viewer
 
@@ -213,11 +214,34 @@ def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
         intrinsics=state.view.intrinsics,
         panels=state.preferences.panels or (),
     )
-    if viewer.save(path, lambda: write_project(path, project)) is None:
+    apart = output.free_name(path.parent, f"{path.name.removesuffix(PROJECTS)}-other", PROJECTS)
+    written: list[Project] = []
+
+    def write() -> None:
+        written.append(write_project(path, project, apart, state.project_read))
+
+    if viewer.save(path, write) is None:
         return None
-    state.project, state.saved = path, state.session
+    state.project, state.project_read = path, written[0]
+    if apart.exists():
+        viewer.say_error(f"{path.name} had other content than was read or written here: kept as {apart.name}")
+    _take_over(viewer, written[0].session)
+    state.saved = state.session
     state.preferences = state.preferences.with_recent(path)
     return path
+
+
+def _take_over(viewer: Viewer, written: Session) -> None:
+    """Show what another window has made in the same project."""
+    session = viewer.state.session
+    made = {name: getattr(written, name) for name in MADE}
+    if plain(written) == plain(session):
+        return
+    try:
+        adopt(viewer, replace(session, **made))
+        viewer.state.say("with what another window has saved in it meanwhile")
+    except LangSplatError as error:
+        viewer.say_error(f"not shown, although saved: {one_line(error)}")
 
 
 # Another scene, or none: what was deleted and not saved is asked about first.

@@ -452,11 +452,14 @@ def read_bookmarks(viewer: Viewer, path: Path, origin: Array) -> tuple[Bookmark,
 
 
 def _keep(viewer: Viewer, bookmarks: tuple[Bookmark, ...]) -> None:
-    state = viewer.state
+    state, before = viewer.state, viewer.state.session.bookmarks
     viewer.put(bookmarks=bookmarks)
     if state.path is None:
         return
+    now, then = (tuple(mark.moved(state.origin) for mark in part) for part in (bookmarks, before))
     try:
-        viewer.shelf.write(state.path, tuple(bookmark.moved(state.origin) for bookmark in bookmarks))
+        kept = viewer.shelf.write(state.path, now, then)
+        if len(kept) > len(bookmarks):  # another window's, too
+            viewer.put(bookmarks=tuple(mark.moved(-state.origin) for mark in kept))
     except (OSError, InputError) as error:
         viewer.say_error(f"bookmarks not kept: {one_line(error)}")
