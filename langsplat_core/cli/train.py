@@ -21,7 +21,7 @@ from langsplat_core.config import (
     check_settings,
     with_preset,
 )
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, printable_line
 from langsplat_core.io.hostile import read_text
 from langsplat_core.progress import Progress, TerminalProgress, line_progress, silent
 
@@ -130,9 +130,9 @@ def with_file(args: Sequence[str]) -> list[str]:
         with contextlib.redirect_stderr(complaint):
             check_settings(tyro.cli(train_command(words), prog=name, args=alone, add_help=False))
     except SystemExit:
-        raise InputError(f"{name}: {one_line(complaint.getvalue())}") from None
+        raise InputError(f"{name}: {printable_line(one_line(complaint.getvalue()), 200)}") from None
     except (ValueError, InputError) as error:  # a TOMLDecodeError is a ValueError
-        raise InputError(f"{name}: cannot be used as --config: {error}") from None
+        raise InputError(f"{name}: cannot be used as --config: {printable_line(error, 200)}") from None
     return [args[0], *words, "--config", name, *args[1:]]  # an option, so that no list takes the dataset
 
 

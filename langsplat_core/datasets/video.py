@@ -73,6 +73,8 @@ def extract_frames(video: Path, out: Path, count: int, progress: Progress = sile
 def _write(container: Any, folder: Path, count: int, progress: Progress) -> int:
     """Write the sharpest images of an opened video; return their number."""
     stream = container.streams.video[0]
+    if stream.codec_context is None:
+        raise ValueError("of an unknown codec")
     stream.thread_type = "AUTO"
     if stream.codec_context.width * stream.codec_context.height > MOST_PIXELS:
         raise ValueError(f"{stream.codec_context.width}x{stream.codec_context.height} pixels")

@@ -153,7 +153,8 @@ def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the spelling and the folder") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise InputError(f"{path}: cannot be opened ({error}); check its name and permissions") from None
+        reason = getattr(error, "strerror", None) or error  # without the name, which may be long
+        raise InputError(f"{path}: cannot be opened ({reason}); check its name and permissions") from None
 
 
 class FromFile(str):
@@ -162,7 +163,8 @@ class FromFile(str):
 
 def is_plain_name(name: object) -> bool:
     """Return whether a name in a file is one of a file beside it: a path could lead out of its folder."""
-    return isinstance(name, str) and name not in ("", ".", "..") and not set(name) & set("/\\:\0")
+    fits = isinstance(name, str) and 0 < len(name) < 256  # what file systems have room for
+    return fits and name not in (".", "..") and not set(str(name)) & set("/\\:\0")
 
 
 def exists(path: Path) -> bool:

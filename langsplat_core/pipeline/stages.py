@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.features import ImageFeatures
@@ -62,8 +62,10 @@ def kept(path: Path, make: Callable[[], Arrays]) -> Arrays:
             raise FormatError(f"{path}: changed since it was written; delete it and run again")
         return found
     made = make()
+    # The digest first, so that it is not lost together with an array at the end.
+    arrays: Arrays = {DIGEST: np.array(_digest(made.items())), **made}
     with atomic_path(path) as temporary:
-        np.savez(temporary, allow_pickle=False, **made, **{DIGEST: np.array(_digest(made.items()))})
+        np.savez(temporary, allow_pickle=False, **arrays)
     return made
 
 
@@ -75,7 +77,7 @@ def open_array(path: Path) -> Array:
         except ValueError:  # an array without elements cannot be mapped
             return np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise FormatError(f"{path}: damaged ({error}); delete it and run again") from None
+        raise _damaged(path, error) from None
 
 
 def read_arrays(path: Path) -> Arrays:
@@ -83,9 +85,16 @@ def read_arrays(path: Path) -> Arrays:
     try:
         # Not by `read_npz`, which takes no array of more than 2 GB, and thrice its memory.
         with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
+            arrays = {name: file[name] for name in file.files}
+            if not arrays or not all(isinstance(array, np.ndarray) for array in arrays.values()):
+                raise ValueError("it holds none, or more than arrays")
+            return arrays
     except Exception as error:  # noqa: BLE001  zipfile and NumPy may raise any
-        raise FormatError(f"{path}: damaged ({error}); delete it and run again") from None
+        raise _damaged(path, error) from None
+
+
+def _damaged(path: Path, error: Exception) -> FormatError:
+    return FormatError(f"{path}: damaged ({printable_line(error, 80)}); delete it and run again")
 
 
 def digest_of(data: Gaussians | ImageFeatures) -> str:

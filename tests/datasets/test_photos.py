@@ -42,6 +42,7 @@ from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene, look_at
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
+from tests.support.file_kinds import TEXTS
 from tests.support.photographs import (
     CONFIG,
     mask_file,
@@ -542,17 +543,6 @@ def test_damaged_videos_end_in_a_line_or_give_what_can_be_read(clip: Path, tmp_p
 def test_containers_of_videos_are_read(suffix: str, tmp_path: Path) -> None:
     video = write_video(tmp_path / f"a{suffix}", [scene(k) for k in range(12)])
     assert len(extract_frames(video, tmp_path / "out", 4)) == 4
-
-
-STREAM = b"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 5004 RTP/AVP 96\n"
-STREAM += b"a=rtpmap:96 H264/90000\n"
-PLAYLIST = b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nclip.mp4\n#EXT-X-ENDLIST\n"
-TEXTS = [
-    STREAM,
-    PLAYLIST,
-    b"ffconcat version 1.0\nfile clip.mp4\n",
-    b"YUV4MPEG2 W8 H8 F25:1\n" + b"FRAME\n" * 9,
-]
 
 
 @pytest.mark.parametrize("content", [b"", b"no video at all" * 50, *TEXTS])

@@ -33,7 +33,7 @@ from langsplat_core.io.ply import GREY, read_cloud
 from langsplat_core.io.scenes import formats, load_gaussians
 from langsplat_core.io.spz import read_spz_scene
 from langsplat_core.progress import silent
-from tests.support.file_kinds import KINDS, STRICT, FileKind, fuzz, tried
+from tests.support.file_kinds import KINDS, STRICT, FileKind, few_and_many, tried
 from tests.support.file_samples import assert_refused, glb, sog_files, spz_bytes, write_folder, zipped
 from tests.support.scenes import random_gaussians
 
@@ -389,23 +389,7 @@ def test_a_file_of_a_terabyte_of_zeros_is_refused(tmp_path, bounded):
 # Every input format, among them every row of the table of scene formats, against thousands of damaged files:
 # read, or refused in one line, and nothing else.
 
-SEEDS, MUTANTS = (1, 2), 3000  # of the slow tier; of a kind and seed
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", KINDS)
-def test_many_mutants_are_read_or_refused(tmp_path: Path, name: str, request: pytest.FixtureRequest) -> None:
-    seed = request.config.getoption("--seed")
-    for used in SEEDS if seed is None else (seed,):
-        folder = tmp_path / str(used)
-        folder.mkdir()
-        fuzz(KINDS[name], folder, MUTANTS, used)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", KINDS)
-def test_a_few_mutants_are_read_or_refused(tmp_path: Path, name: str) -> None:
-    fuzz(KINDS[name], tmp_path, 60, seed=0)
+test_a_few_mutants_are_read_or_refused, test_many_mutants_are_read_or_refused = few_and_many(KINDS)
 
 
 def test_every_scene_format_is_among_the_kinds() -> None:

@@ -1,8 +1,10 @@
 """Every kind of input file that is damaged in tests: good samples, seeded mutations of binary and of text
 formats, how the files are read, and what a reader may do with a damaged one."""
 
+import copy
 import gzip
 import io
+import json
 import logging
 import re
 import struct
@@ -13,33 +15,47 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
+import av
 import numpy as np
+import pytest
 from PIL import Image
 
 from langsplat_core.arrays import unit
-from langsplat_core.config import DatasetConfig
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.describe import outline_lines, outline_of
+from langsplat_core.cli.query import unit_of
+from langsplat_core.config import DatasetConfig, check_settings
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.datasets.photos import read_photo
+from langsplat_core.datasets.photos import optics, place, read_photo
+from langsplat_core.datasets.video import extract_frames
 from langsplat_core.display.displays import latent_colours
-from langsplat_core.errors import InputError, printable_line
+from langsplat_core.errors import InputError, LangSplatError, printable_line
 from langsplat_core.extensions.benchmarks.raster_speed import peak_memory, restart_peak
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import write_gltf
 from langsplat_core.io.hostile import picture_size
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.io.sidecar import read_language, write_language
+from langsplat_core.io.sidecar import Words, read_language, read_words, write_language, write_words
+from langsplat_core.pipeline.stages import kept
 from langsplat_core.progress import silent
+from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.inventory import scene_inventory
 from langsplat_core.raster.render import render
-from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene import Gaussians, Scene, TaughtWord
+from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.features import FeatureStore, ImageFeatures
+from langsplat_core.semantics.relevancy import read_vocabulary
 from tests.support.file_samples import (
     ascii_ply,
     compressed_ply,
@@ -52,7 +68,7 @@ from tests.support.file_samples import (
     zipped,
 )
 from tests.support.photographs import write_colmap, write_nerfstudio
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import random_camera, random_gaussians, tree_of
 
 HEADER = 600  # bytes at the beginning in which half of the mutations fall
 INTEGERS = (0, 1, -1, *(2**k + d for k in (7, 8, 15, 16, 24, 31, 32, 53, 63) for d in (-1, 0)))
@@ -172,13 +188,85 @@ MUTATIONS: tuple[Mutation, ...] = (
 )
 
 
-# Damage below a wrapping that would notice it: members of archives, gzip streams, chunks of PNG.
+# Damage below a wrapping that would notice it: values of JSON, parts of safetensors and .glb, members of
+# archives, gzip streams, chunks of PNG.
 
+ODDS = (
+    *(None, True, -1, 0, 2**31, 2**63, 10**400, 1e-320, 1e308, float("nan"), float("inf")),
+    *("", "0", "\0", "\ud800", "\u2028", "a" * 5000, "../../x", "~nosuchuser/x", "someone/model"),
+    *([], {}, [[]], [0.0] * 3, [1] * 99),
+)
 CHUNKS = (*(b"IHDR", b"PLTE", b"tRNS", b"iCCP", b"tEXt"), *(b"zTXt", b"iTXt", b"eXIf", b"acTL", b"fcTL"))
 
 
 def _half(inner: Mutation) -> Mutation:
     return lambda data, others, rng: (inner if rng.random() < 0.6 else mutant)(data, others, rng)
+
+
+def _in(value: object) -> Iterator[tuple[Any, Any]]:
+    """Yield every container in a JSON value with each of its keys."""
+    for key in (
+        range(len(value)) if isinstance(value, list) else list(value) if isinstance(value, dict) else ()
+    ):
+        yield value, key
+        yield from _in(value[key])
+
+
+@_half
+def in_json(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """One to three values, at any depth, are removed, doubled, or become others, some of the same file."""
+    top = json.loads(data)
+    for _ in range(int(rng.integers(1, 4))):
+        places = list(_in(top))
+        if not places:
+            break
+        (owner, key), (other, there) = (places[i] for i in rng.integers(len(places), size=2))
+        match int(rng.integers(5)):
+            case 0:
+                del owner[key]
+            case 1 if isinstance(owner, list):
+                owner.insert(key, owner[key])
+            case 2:
+                owner[key] = copy.deepcopy(other[there])
+            case _:
+                owner[key] = copy.deepcopy(ODDS[int(rng.integers(len(ODDS)))])
+    return json.dumps(top).encode()
+
+
+def _of_text(text: bytes, rng: np.random.Generator) -> bytes:
+    return (in_json if text[:1] in (b"[", b"{") else mutant)(text, [], rng)
+
+
+@_half
+def in_safetensors(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """A text of the metadata, what is stated of a tensor, or numbers are damaged, in a whole file."""
+    start = 8 + int.from_bytes(data[:8], "little")
+    header, body = json.loads(data[8:start]), data[start:]
+    about, which = header["__metadata__"], rng.random()
+    if which < 0.5:
+        name = str(rng.choice(list(about)))
+        about[name] = _of_text(about[name].encode(), rng).decode(errors="replace")
+    elif which < 0.9:
+        body = mutant(body, [], rng)[: len(body)].ljust(len(body), b"\0")
+    text = json.dumps(header).encode()
+    if which >= 0.9:
+        text = in_json(text, [], rng)
+    return len(text).to_bytes(8, "little") + text + body
+
+
+@_half
+def in_glb(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """What is stated of the arrays, or their numbers, in a whole file."""
+    size = int.from_bytes(data[12:16], "little")
+    content, binary = data[20 : 20 + size], data[28 + size :]
+    if rng.random() < 0.7:
+        content = in_json(content, [], rng)
+    else:
+        binary = mutant(binary, [], rng)
+    content += b" " * (-len(content) % 4)
+    chunks = struct.pack("<I4s", len(content), b"JSON") + content
+    chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return data[:8] + struct.pack("<I", 12 + len(chunks)) + chunks
 
 
 @_half
@@ -190,7 +278,8 @@ def in_zip(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> by
     same = [member for member in members.values() if len(member) > 100]
     methods = [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
     method = methods[int(rng.choice([0, 0, 1, 1, 1, 1, 1, 2, 3]))]
-    members[name] = (in_png if members[name][:4] == b"\x89PNG" else mutant)(members[name], same, rng)
+    ways = {b"\x89": in_png, b"{": in_json}
+    members[name] = ways.get(members[name][:1], mutant)(members[name], same, rng)
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", method) as archive:
         for other, content in members.items():
@@ -314,6 +403,7 @@ class FileKind:
     samples: Callable[[Path], list[bytes]]  # also writes what has to lie beside them into the folder
     read: Callable[[Path], float]  # the share of sound content, in [0, 1]; below a half a warning is due
     damage: Mutation = mutant
+    share: float = 1.0  # of the mutants that others get, where each takes long
 
 
 def fuzz(kind: FileKind, folder: Path, count: int, seed: int) -> Outcome:
@@ -362,7 +452,7 @@ def _verdict(kind: FileKind, path: Path, said: list[str], outcome: Outcome) -> s
                     for one in warned
                     if "/PIL/" not in one.filename  # which `io.hostile` silences
                 ]
-    except InputError as error:
+    except LangSplatError as error:
         return f"warning: {given[0]}" if given else _bad_line(str(error))
     except Exception as error:  # noqa: BLE001  which is what is looked for
         last = traceback.extract_tb(error.__traceback__)[-1]
@@ -424,27 +514,57 @@ def drawable_share(gaussians: Gaussians) -> float:
 
 
 def sidecars(folder: Path) -> list[bytes]:
-    """Of every codec; version 2."""
+    """Of every codec, with a tree and a taught word; version 2."""
     made = []
     for kind in ("codebook", "autoencoder", "linear"):
-        write_language(folder / "made", random_field(len(SCENE), kind), SCENE.means)
+        field = random_field(len(SCENE), kind)
+        taught = (taught_word("mine", field.codec.vector_dim),)
+        field = replace(field, tree=tree_of(Scene(SCENE, field)), taught=taught)
+        write_language(folder / "made", field, SCENE.means)
         made.append((folder / "made").read_bytes())
     return made
 
 
+def taught_word(name: str, dims: int) -> TaughtWord:
+    vectors = unit(np.random.default_rng(3).normal(size=(2, dims))).astype(np.float32)
+    return TaughtWord(name, 2, vectors, np.array([0.25, 0.5], np.float32))
+
+
 def searched(path: Path) -> float:
-    """Asks a field and draws the answer and what its latents look like: numbers that can be read may still be
+    """Asks a field, describes it, and draws the answer and its latents: numbers that can be read may still be
     none to reckon with."""
     field = read_language(path, SCENE.means)
     vector = unit(np.random.default_rng(0).normal(size=field.codec.vector_dim)).astype(np.float32)
     scene = Scene(SCENE, replace(field, phrasebook={"cup": vector}))
-    engine = QueryEngine(scene)
+    engine = QueryEngine(scene, load_text_encoder)
     answer = engine.run("cup")
     engine.instances(answer)
+    describer = Describer(engine, ["cup"])
+    scene_inventory(describer)
+    outline_lines(outline_of(describer), unit_of(None, scene.origin))
     values = np.concatenate([answer.relevancy.T, *latent_colours(field)], axis=1)
     drawn = render(scene, scene.framing_camera((32, 24)), values)
     assert np.isfinite(values).all()
     assert np.isfinite(drawn.values).all()
+    if field.taught:
+        engine.run(field.taught[0].name)
+    with suppress(LangSplatError):  # of an encoder that is not that of the vectors
+        engine.run("saucer")
+    return 1.0
+
+
+def word_files(folder: Path) -> list[bytes]:
+    field = random_field(len(SCENE))
+    words = tuple(taught_word(name, field.codec.vector_dim) for name in ("mine", "Tür"))
+    write_words(folder / "made", Words("demo", field.canonical, words))
+    return [(folder / "made").read_bytes()]
+
+
+def asked_words(path: Path) -> float:
+    words = read_words(path)
+    engine = QueryEngine(Scene(SCENE, random_field(len(SCENE))), words=words)
+    for word in words.words:
+        assert np.isfinite(engine.run(word.name).relevancy).all()
     return 1.0
 
 
@@ -456,6 +576,57 @@ def camera_files(folder: Path) -> list[bytes]:
 def camera_list(path: Path) -> float:
     for camera in read_cameras(path):
         assert np.isfinite([*camera.position, camera.intrinsics.fov_degrees]).all()
+    return 1.0
+
+
+def vocabularies(_: Path) -> list[bytes]:
+    return [b"# mine\ncup\nred mug\n", "Tür\r\ncafé\r\n".encode(), "cup\n".encode("utf-16")]
+
+
+def encoded(path: Path) -> float:
+    known, vectors = QueryEngine(_demo(), load_text_encoder).known_vectors(read_vocabulary(path))
+    assert len(known) == len(vectors)
+    return 1.0
+
+
+@cache
+def _demo() -> Scene:
+    return load_scene(Path(str(files("langsplat_assets"))) / "demo" / "scene.ply")
+
+
+def settings_files(_: Path) -> list[bytes]:
+    return [
+        b'preset = "quick"\n[radiance]\nsteps = 100\nexposure = "on"\n[masks]\nbox-nms = 0.5\n',
+        b'profile = "paper"\n[codec]\nkind = "linear"\nlatent-dim = 4\n[dataset]\nallow-few-cameras = true\n',
+    ]
+
+
+def trained_by(path: Path) -> float:
+    check_settings(parse(["train", "photographs", "--config", str(path), "--out", "s.ply"]))
+    return 1.0
+
+
+def origins(folder: Path) -> list[bytes]:
+    (folder / "a.ply").write_bytes(plain_ply(SCENE))
+    return [b'{"origin": [1e6, -2.5, 0]}', b'{"origin": [0, 0, 1e-9]}']
+
+
+def beside_scene(path: Path) -> float:
+    scene = load_scene(path.parent / "a.ply")
+    if scene.unread:
+        raise InputError(scene.unread[0])
+    assert np.isfinite(scene.world_gaussians().means).all()
+    return scene_share(path.parent / "a.ply")
+
+
+def stages(folder: Path) -> list[bytes]:
+    arrays = {"values": np.ones((5, 3), np.float32), "rows": np.arange(4)}
+    kept(folder / "made.npz", lambda: arrays)
+    return [(folder / "made.npz").read_bytes()]
+
+
+def kept_stage(path: Path) -> float:
+    assert set(kept(path, dict)) == {"values", "rows"}
     return 1.0
 
 
@@ -601,7 +772,46 @@ def photograph(path: Path) -> float:
         picture = read_photo(path, upright)
         assert picture.mode in ("RGB", "RGBA")
         assert {*picture.size} == {width, height}
+    optics(path), place(path)
     return 1.0
+
+
+# Whose first bytes choose a demuxer that asks the network or reads other files.
+STREAM = b"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 5004 RTP/AVP 96\n"
+STREAM += b"a=rtpmap:96 H264/90000\n"
+PLAYLIST = b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nclip.mp4\n#EXT-X-ENDLIST\n"
+TEXTS = [
+    STREAM,
+    PLAYLIST,
+    b"ffconcat version 1.0\nfile clip.mp4\n",
+    b"YUV4MPEG2 W8 H8 F25:1\n" + b"FRAME\n" * 9,
+]
+
+
+def video_files(folder: Path) -> list[bytes]:
+    made = []
+    for suffix, codec in ((".mp4", "mpeg4"), (".mkv", "mpeg4"), (".avi", "mjpeg"), (".ts", "mpeg4")):
+        with av.open(str(folder / f"made{suffix}"), "w") as container:
+            stream = container.add_stream(codec, rate=10)
+            stream.width, stream.height = 48, 32
+            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            for seed in range(6):
+                image = np.random.default_rng(seed).integers(0, 256, (32, 48, 3), dtype=np.uint8)
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            container.mux(stream.encode())
+        made.append((folder / f"made{suffix}").read_bytes())
+    return made
+
+
+def or_text(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """Of each tenth, a text that is no video."""
+    return mutant(TEXTS[int(rng.integers(len(TEXTS)))] if rng.random() < 0.1 else data, others, rng)
+
+
+def filmed(path: Path) -> float:
+    with TemporaryDirectory(dir=path.parent) as folder:
+        frames = extract_frames(path, Path(folder) / "out", 4)
+        return float(bool([photograph(frame) for frame in frames]))
 
 
 def _photographs(kind: str, damage: Mutation = mutant) -> FileKind:
@@ -625,12 +835,16 @@ KINDS = {
         f"SPZ {v}": _scenes("a.spz", spz_bytes(SCENE, v), spz_bytes(PLAIN, v), damage=in_gzip)
         for v in (1, 2, 3, 4)
     },
-    ".glb": _scenes("a.glb", gltf_bytes(SCENE), gltf_bytes(PLAIN)),
-    ".gltf": _scenes("a.gltf", gltf_bytes(random_gaussians(3), ".gltf")),
+    ".glb": _scenes("a.glb", gltf_bytes(SCENE), gltf_bytes(PLAIN), damage=in_glb),
+    ".gltf": _scenes("a.gltf", gltf_bytes(random_gaussians(3), ".gltf"), damage=in_json),
     ".splat": _scenes("a.splat", splat_bytes(SCENE), splat_bytes(PLAIN)),
-    "sidecar": FileKind("a.langsplat.safetensors", sidecars, searched),
-    "cameras.json": FileKind("a.cameras.json", camera_files, camera_list),
-    "transforms.json": FileKind("transforms.json", transforms, beside_transforms),
+    "sidecar": FileKind("a.langsplat.safetensors", sidecars, searched, in_safetensors),
+    "taught words": FileKind("a.safetensors", word_files, asked_words, in_safetensors),
+    "vocabulary": FileKind("a.txt", vocabularies, encoded),
+    "settings": FileKind("a.toml", settings_files, trained_by),
+    "origin.json": FileKind("a.origin.json", origins, beside_scene, in_json),
+    "cameras.json": FileKind("a.cameras.json", camera_files, camera_list, in_json),
+    "transforms.json": FileKind("transforms.json", transforms, beside_transforms, in_json),
     "point-cloud PLY": FileKind("cloud.ply", cloud_folder, beside_transforms, in_ply_header),
     **{
         f"COLMAP {part}.{form}": colmap(f"{part}.{form}")
@@ -638,9 +852,36 @@ KINDS = {
         for part in ("cameras", "images", "points3D")
     },
     ".features.npz": FileKind("a.features.npz", feature_files, stored_features, in_zip),
+    "stage of training": FileKind("a.npz", stages, kept_stage, in_zip),
+    "video": FileKind("a.mp4", video_files, filmed, or_text),
     "PNG": _photographs("PNG", in_png),
     **{kind: _photographs(kind) for kind in ("JPEG", "WEBP", "TIFF", "BMP", "AVIF")},
 }
 # In which a byte that is missing cannot go unseen, nor can another format's file be taken for one.
 STRICT = ["INRIA PLY", "compressed PLY", "SOG", "SPZ 3", "SPZ 4", ".splat"]
 STRICT += ["sidecar", "cameras.json"]
+
+# The two tests of a table of kinds, bound to names in the module that tests their readers.
+
+SEEDS, MUTANTS = (1, 2), 3000  # of the slow tier; of a kind and seed
+
+
+def few_and_many(kinds: dict[str, FileKind]) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Return the test of 60 mutants of each kind, and that of thousands."""
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("name", kinds)
+    def few(tmp_path: Path, name: str) -> None:
+        fuzz(kinds[name], tmp_path, int(20 + 40 * kinds[name].share), seed=0)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("name", kinds)
+    def many(tmp_path: Path, name: str, request: pytest.FixtureRequest) -> None:
+        seed = request.config.getoption("--seed")
+        for used in SEEDS if seed is None else (seed,):
+            folder = tmp_path / str(used)
+            folder.mkdir()
+            outcome = fuzz(kinds[name], folder, int(kinds[name].share * MUTANTS), used)
+            print(f"| {name}, seed {used} | {outcome.tried} | {outcome.loaded} | {outcome.warned} |")
+
+    return few, many

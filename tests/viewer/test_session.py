@@ -7,6 +7,8 @@ import tracemalloc
 import weakref
 import zlib
 from base64 import b64encode
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -14,7 +16,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.errors import LangSplatError
+from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.scene.transform import moving, place_scene
 from langsplat_viewer import options
@@ -29,11 +31,13 @@ from langsplat_viewer.projects import (
     load_preferences,
     read_flight,
     read_project,
+    save_preferences,
 )
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.session import Note, Preferences, Query, Ruler, Things
 from langsplat_viewer.viewer import GESTURE, MOST_STEPS, Services, Viewer
 from tests.support.fakes import FakeEncoder
+from tests.support.file_kinds import FileKind, few_and_many, in_json
 from tests.support.windowless import (
     SCENES,
     FakeSurface,
@@ -42,10 +46,12 @@ from tests.support.windowless import (
     ask,
     blob,
     errors,
+    go,
     load,
     marked,
     open_scene,
     phrases,
+    render_image,
     result,
     settle,
 )
@@ -228,7 +234,11 @@ def test_history_of_a_million_gaussians_takes_little_memory(viewer):
 def saved(opened, tmp_path, monkeypatch) -> Path:
     """The file of a project with something of everything in it."""
     monkeypatch.chdir(tmp_path)
-    Path("blobs.ply").touch()  # what is in it comes from `windowless.load`
+    return save_session(opened, tmp_path)
+
+
+def save_session(opened: Viewer, folder: Path) -> Path:
+    (folder / "blobs.ply").touch()  # what is in it comes from `windowless.load`
     ask(opened, "mug", "book", "plant", "mug or book")
     queries.set_cut(opened, "book", 0.6)
     queries.hide(opened, "plant")
@@ -245,19 +255,27 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
     settings.pin_at(opened, 0.5, 0.5)
     settings.write_note(opened, opened.state.session.notes[0], 'a "note" <b>of</b> 1987')
     opened.state.preferences = replace(opened.state.preferences, panels=("Search", "Notes"))
-    path = saving.save_project(opened, tmp_path)
+    path = saving.save_project(opened, folder)
     assert path is not None
     assert path.name == "blobs-001.langsplat"
     return path
 
 
+@contextmanager
+def new_viewer(folder: Path | None = None) -> Iterator[Viewer]:
+    """Nothing is open; bookmarks are kept in `folder`."""
+    services = Services(load, lambda encoder_id: FakeEncoder())
+    made = Viewer(services, surface=FakeSurface(), shelf=Shelf(folder))
+    yield made
+    made.worker.close()
+
+
 @pytest.fixture
 def again(saved):
     """Another viewer with the project open."""
-    made = Viewer(Services(load, lambda encoder_id: FakeEncoder()), surface=FakeSurface())
-    act(opening.open_file, made, saved)
-    yield made
-    made.worker.close()
+    with new_viewer() as made:
+        act(opening.open_file, made, saved)
+        yield made
 
 
 def test_project_restores_the_whole_session(opened, saved, again):
@@ -455,6 +473,57 @@ def test_damaged_file_is_refused_in_one_line(saved, name):
     assert all(text.startswith(f"{path}: ") and text.isprintable() for text in refused)
     remedies = ("; save it anew", "; mend or delete it", "export it anew")
     assert [text for text in refused if not text.endswith(remedies)] == []
+
+
+# Damaged at random, opened, drawn, and gone through.
+
+
+def session_files(name: str) -> Callable[[Path], list[bytes]]:
+    """Return what makes files `name`, of this version and, moved to the folder, of version 1."""
+
+    def samples(folder: Path) -> list[bytes]:
+        with new_viewer(folder) as made:
+            open_scene(made, folder / "blobs.ply")
+            viewpoint.add_bookmark(made)
+            save_session(made, folder)
+            viewpoint.move(made, lambda view: orbit(view, 0.4, 0.1))
+            viewpoint.add_keyframe(made)
+            saving.save_path(made, folder)
+            save_preferences(folder, made.state.preferences)
+        old = (SAVED / name.replace("blobs-001", "version1")).read_text()
+        return [(folder / name).read_bytes(), old.replace("/scenes", str(folder)).encode()]
+
+    return samples
+
+
+def opened_again(path: Path) -> float:
+    with new_viewer(path.parent) as made:
+        if path.name == "preferences.json":
+            made.state.preferences = load_preferences(path.parent)
+            settings.take_preferences(made)
+        scene = path.with_name("blobs.ply")
+        act(opening.open_file, made, path if path.suffix == ".langsplat" else scene)
+        if path.name.endswith(".path.json"):
+            viewpoint.load_path(made, path)
+        if problems := set(errors(made)) - {NO_GROUPS, NOT_COMPARED}:
+            raise InputError(max(problems, key=len))
+        shown = [made.state.request((32, 24))]
+        for bookmark in made.state.session.bookmarks:
+            go(viewpoint.go_to_bookmark, made, bookmark)
+            shown.append(made.state.request((32, 24)))
+        if made.state.session.keyframes:
+            viewpoint.scrub(made, viewpoint.path_seconds(made) / 3)
+            shown.append(made.state.request((32, 24)))
+        for request in shown:
+            render_image(request, "cpu")
+    return 1.0
+
+
+KINDS = {
+    name: FileKind(name, session_files(name), opened_again, in_json, share=0.2)
+    for name in ("blobs-001.langsplat", "blobs-001.path.json", "bookmarks.json", "preferences.json")
+}
+test_a_few_mutants_are_read_or_refused, test_many_mutants_are_read_or_refused = few_and_many(KINDS)
 
 
 def test_project_with_impossible_values_is_refused(saved):

@@ -41,6 +41,7 @@ from langsplat_core.progress import silent
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import render
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene, cameras
+from tests.support.file_kinds import FileKind, few_and_many, in_json
 from tests.support.photographs import SIZE, block, lerf_frame, mask_map, ovs_view, rectangle, silhouette
 from tests.support.processes import refusal, run
 from tests.support.scenes import random_camera, random_gaussians, random_values
@@ -54,6 +55,22 @@ def lerf(tmp_path):
     lerf_frame(labels, "frame_00002", [*mugs, ("old camera", rectangle(8, 8, 9, 9)), ("nothing", [])])
     lerf_frame(labels, "frame.00041", [("mug", rectangle(0, 0, 3, 3))])
     return tmp_path
+
+
+def label_files(folder):
+    mug = ("mug", rectangle(1, 2, 5, 6))
+    return [lerf_frame(folder / "label" / "kitchen", "a", [mug, ("nothing", [])]).read_bytes()]
+
+
+def drawn(path):
+    for frame in only_scene(read_lerf_ovs(path.parents[2])).frames:
+        for label in frame.labels:
+            label.truth.draw(frame.size)
+    return 1.0
+
+
+KINDS = {"labels": FileKind("label/kitchen/a.json", label_files, drawn, in_json)}
+test_a_few_mutants_are_read_or_refused, test_many_mutants_are_read_or_refused = few_and_many(KINDS)
 
 
 def only_scene(benchmark):

@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from langsplat_core.extensions.checkpoints.importing import read_foreign
-from tests.support.file_kinds import FileKind, drawable_share, fuzz, mutant
+from langsplat_core.io.ply import write_ply
+from tests.support.file_kinds import FileKind, drawable_share, few_and_many, in_zip, mutant
 from tests.support.file_samples import autoencoder, geometry, save_model, tensor, training_state
 from tests.support.processes import Ended, convert_each
 from tests.support.scenes import random_gaussians
@@ -229,26 +230,25 @@ def autoencoders(folder: Path) -> list[bytes]:
     return [(folder / "made").read_bytes()]
 
 
+def clusters(folder: Path) -> list[bytes]:
+    """Of OpenGaussian; the scene lies beside."""
+    write_ply(folder / "plain.ply", SCENE)
+    index = np.arange(20) % 7 - 1
+    np.savez(folder / "made.npz", leaf_feat=np.eye(6, 24, dtype=np.float32), leaf_ind=index)
+    return [(folder / "made.npz").read_bytes()]
+
+
 def imported(path: Path) -> float:
-    beside = path.with_name("latents_1.pth")
-    scene = read_foreign([path, *[beside] * beside.exists()])
+    beside = (path.with_name(name) for name in ("latents_1.pth", "plain.ply"))
+    scene = read_foreign([path, *(other for other in beside if other.exists())])
     for level in (level for level in range(3) if scene.levels[level] is not None):
         scene.rows(level, np.arange(len(scene.scene.gaussians)))
     return drawable_share(scene.scene.gaussians)
 
 
-KINDS = {name: FileKind("a.pth", made, imported) for name, made in
-         (("checkpoint", checkpoints), ("autoencoder", autoencoders))}  # fmt: skip
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", KINDS)
-def test_a_few_mutants_are_read_or_refused(tmp_path: Path, name: str) -> None:
-    fuzz(KINDS[name], tmp_path, 60, seed=0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("name", KINDS)
-def test_many_mutants_are_read_or_refused(tmp_path: Path, name: str, seed: int) -> None:
-    fuzz(KINDS[name], tmp_path, 3000, seed)
+KINDS = {
+    "checkpoint": FileKind("a.pth", checkpoints, imported),
+    "autoencoder": FileKind("a.pth", autoencoders, imported),
+    "clusters": FileKind("a.npz", clusters, imported, in_zip),
+}
+test_a_few_mutants_are_read_or_refused, test_many_mutants_are_read_or_refused = few_and_many(KINDS)

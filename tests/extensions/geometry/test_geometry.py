@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.geometry.commands import read_transform
 from langsplat_core.extensions.geometry.mesh import Mesh, close_holes, fuse, surface_depth
 from langsplat_core.extensions.geometry.occupancy import (
     FloorMap,
@@ -31,7 +32,7 @@ from langsplat_core.extensions.geometry.registration import agreement, merge, qu
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.scene import NO_NODE, Gaussians, Scene, TaughtWord, look_at
+from langsplat_core.scene import NO_NODE, NO_ORIGIN, Gaussians, Scene, TaughtWord, look_at
 from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.transform import (
     AXES,
@@ -44,6 +45,7 @@ from langsplat_core.scene.transform import (
     turning,
 )
 from tests.support.fakes import FakeEncoder, blob_scene, named_scene
+from tests.support.file_kinds import FileKind, drawable_share, few_and_many, in_json
 from tests.support.file_samples import random_field
 from tests.support.processes import refusal, run
 from tests.support.scenes import FLOOR, WALL, box_room, random_camera, random_gaussians
@@ -273,6 +275,21 @@ def test_merge_refuses_scenes_of_two_encoders():
 
 
 # On files.
+
+
+def transform_files(_):
+    turned = np.eye(4)
+    turned[:3, :3], turned[:3, 3] = 0.5 * Rotation.from_rotvec([0.3, 1, 0]).as_matrix(), (1, 2, 3)
+    return [json.dumps({"matrix": matrix.tolist(), "scale": 1.0}).encode() for matrix in (np.eye(4), turned)]
+
+
+def laid_over(path):
+    moved = place_scene(Scene(random_gaussians(20)), read_transform(path), NO_ORIGIN)
+    return drawable_share(moved.gaussians)
+
+
+KINDS = {"transform": FileKind("to.json", transform_files, laid_over, in_json)}
+test_a_few_mutants_are_read_or_refused, test_many_mutants_are_read_or_refused = few_and_many(KINDS)
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (500_123.25, 5_412_345.5, 0.0)], ids=["near", "UTM"])

@@ -42,6 +42,7 @@ from langsplat_core.scene.transform import place_scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.relevancy import bundled_vocabulary
 from tests.support.fakes import CENTRES, NAMES, PER_BLOB, WORDS, FakeEncoder, axis, named_scene
+from tests.support.file_kinds import FileKind, few_and_many, in_safetensors
 from tests.support.file_samples import FIELDS
 from tests.support.processes import refusal, run
 from tests.support.scenes import unturned_gaussians
@@ -271,6 +272,25 @@ def test_indices_out_of_range_are_refused(folder, column):
 
 
 # What changed between two scenes.
+
+
+def indices(folder: Path) -> list[bytes]:
+    save_scene(folder / "all.ply", named_scene())
+    save_scene(folder / "few.ply", without(named_scene(), PLANT))
+    update_library(folder, load_encoder=load)
+    return [(folder / INDEX).read_bytes()]
+
+
+def asked(index: Path) -> float:
+    library = read_library(index, index.parent)
+    for answered in find(library, "plant", load, at_most=1):
+        for hit in answered.hits:
+            assert hit.verdict
+    return 1.0
+
+
+KINDS = {"index of find": FileKind(INDEX, indices, asked, in_safetensors, share=0.1)}
+test_a_few_mutants_are_read_or_refused, test_many_mutants_are_read_or_refused = few_and_many(KINDS)
 
 
 def with_gaussians(scene: Scene, **changed: Array) -> Scene:
