@@ -1,7 +1,7 @@
 """Errors a user can cause, each with a message of one line: what is wrong, and how to mend it."""
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType, SimpleNamespace
 
@@ -62,6 +62,7 @@ def malformed(path: object, what: str, remedy: str = "copy it again, or export i
 
 # What a reader skips, pads, rounds or guesses is counted by it and said in one line.
 
+Tell = Callable[[str], None]  # takes such a loss, for the line of its file
 STRICTNESS = SimpleNamespace(on=False, last="")  # on: by --strict, a loss is an error; last: what was said
 
 
@@ -71,6 +72,18 @@ def report_loss(message: str, *values: object) -> None:
     if STRICTNESS.on:
         raise InputError(f"{STRICTNESS.last} (refused by --strict)")
     logging.getLogger("langsplat").warning(message, *values)
+
+
+def report_losses(path: object, told: Iterable[str]) -> None:
+    """Say in one line all that a reader told of a file, empty texts aside; nothing where that is none."""
+    if lost := "; ".join(filter(None, told)):
+        report_loss("%s: %s", path, printable_line(lost, 240))
+
+
+def unread(what: str, names: Iterable[object]) -> str:
+    """Return, for `report_losses`, that things of a name are passed over; "" where there are none."""
+    listed = shortened(map(str, names), 3, 80)
+    return listed and f"{what} {listed} not read".lstrip()
 
 
 class BackendError(LangSplatError):

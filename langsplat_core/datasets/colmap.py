@@ -20,10 +20,17 @@ import numpy as np
 from langsplat_core.arrays import Array, rotation_matrices
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.capture import Capture, capture_of, report_lost_points
-from langsplat_core.datasets.colour import Tell
 from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.datasets.photos import Photo, develop, find_photos, finder, mask_beside
-from langsplat_core.errors import FormatError, InputError, printable_line, report_loss, shortened
+from langsplat_core.errors import (
+    FormatError,
+    InputError,
+    Tell,
+    printable_line,
+    report_loss,
+    report_losses,
+    shortened,
+)
 from langsplat_core.io.files import shown
 from langsplat_core.io.hostile import decimal_comma, decode_name, decode_text
 from langsplat_core.io.ply import read_cloud
@@ -120,19 +127,20 @@ def _points(folder: Path, suffix: str) -> Array:
     return np.zeros(0, POINT)
 
 
-def _content(path: Path, say: Callable[..., None] = report_loss) -> Any:
+def _content(path: Path, quiet: bool = False) -> Any:
     """Return what the reader of a file's name makes of it, and say what it passed over."""
-    data = path.read_bytes()
+    data, told = path.read_bytes(), list[str]()
     try:
         if path.suffix == ".bin":
-            return _READERS[path.name](data)
-        text, told = decode_text(data, path), list[str]()
-        found = _READERS[path.name](text, told.append)
-        stated = re.search(r"^#\s*Number of \w+:\s*(\d{1,18})", text, re.MULTILINE)
+            found, stated = _READERS[path.name](data, told.append), None
+        else:
+            text = decode_text(data, path)
+            found = _READERS[path.name](text, told.append)
+            stated = re.search(r"^#\s*Number of \w+:\s*(\d{1,18})", text, re.MULTILINE)
         if stated and int(stated[1]) != len(found):
             told.append(f"has {len(found)} rows, and says that it had {stated[1]}")
-        for what in told:
-            say("%s: %s; was it written whole?", shown(path), what)
+        if told and not quiet:
+            report_losses(shown(path), [*told, "was it written whole?"])
         return found
     except (struct.error, ValueError, IndexError, OverflowError) as error:
         reason = f"{printable_line(error, 160)}{decimal_comma(error)}"
@@ -169,7 +177,9 @@ def _image(name: str, camera_id: int, pose: Array) -> ModelImage:
 # Binary files: a number, and as many records.
 
 
-def _records(data: bytes, kind: Any, rest: Callable[[Any, int], int]) -> Iterator[tuple[Any, bytes]]:
+def _records(
+    data: bytes, kind: Any, rest: Callable[[Any, int], int], tell: Tell
+) -> Iterator[tuple[Any, bytes]]:
     """Yield every record with the bytes behind it; rest: how many, by the record and where it ends."""
     end = 8
     for _ in range(*struct.unpack_from("<Q", data)):
@@ -179,31 +189,43 @@ def _records(data: bytes, kind: Any, rest: Callable[[Any, int], int]) -> Iterato
         if end > len(data):
             raise ValueError("the file ends inside a record")
         yield record, data[begin:end]
+    if end < len(data):
+        tell(f"{len(data) - end} bytes behind its last record are not read")
 
 
-def _binary_cameras(data: bytes) -> dict[int, PhotoIntrinsics]:
+def _binary_cameras(data: bytes, tell: Tell) -> dict[int, PhotoIntrinsics]:
     rows = {number: (name, 8 * len(keys.split())) for name, (number, _, keys) in LENSES.items()}
-    lenses = {}
-    for camera, parameters in _records(data, CAMERA, lambda camera, _: rows.get(camera["lens"], ("", 0))[1]):
+    lenses: dict[int, PhotoIntrinsics] = {}
+
+    def rest(camera: Any, _: int) -> int:
+        return rows.get(camera["lens"], ("", 0))[1]
+
+    for camera, parameters in _records(data, CAMERA, rest, tell):
         name, _ = rows.get(camera["lens"], (f"number {camera['lens']}", 0))
         size = int(camera["width"]), int(camera["height"])
-        lenses[int(camera["id"])] = lens_of(name, *size, np.frombuffer(parameters))
+        _add(lenses, int(camera["id"]), lens_of(name, *size, np.frombuffer(parameters)), tell)
     return lenses
 
 
-def _binary_images(data: bytes) -> list[ModelImage]:
+def _add(lenses: dict[int, PhotoIntrinsics], number: int, lens: PhotoIntrinsics, tell: Tell) -> None:
+    if lenses.setdefault(number, lens) != lens:
+        tell(f"camera {number} is listed twice, and the last counts")
+    lenses[number] = lens
+
+
+def _binary_images(data: bytes, tell: Tell) -> list[ModelImage]:
     def rest(_: Any, begin: int) -> int:
         end = data.index(b"\0", begin) + 1
         return int(end + 8 + 24 * struct.unpack_from("<Q", data, end)[0] - begin)
 
     return [
         _image(decode_name(behind.partition(b"\0")[0]), int(image["camera"]), image["pose"])
-        for image, behind in _records(data, IMAGE, rest)
+        for image, behind in _records(data, IMAGE, rest, tell)
     ]
 
 
-def _binary_points(data: bytes) -> Array:
-    points = _records(data, POINT, lambda point, _: 8 * int(point["track"]))
+def _binary_points(data: bytes, tell: Tell) -> Array:
+    points = _records(data, POINT, lambda point, _: 8 * int(point["track"]), tell)
     return np.array([point for point, _ in points], POINT)
 
 
@@ -214,11 +236,12 @@ def _lines(text: str) -> list[str]:
     return [line.strip() for line in text.split("\n") if not line.startswith("#")]
 
 
-def _text_cameras(text: str, _: Tell) -> dict[int, PhotoIntrinsics]:
-    lenses = {}
+def _text_cameras(text: str, tell: Tell) -> dict[int, PhotoIntrinsics]:
+    lenses: dict[int, PhotoIntrinsics] = {}
     for line in filter(None, _lines(text)):
         camera_id, name, width, height, *parameters = line.split()
-        lenses[int(camera_id)] = lens_of(name, int(width), int(height), np.array(parameters, np.float64))
+        lens = lens_of(name, int(width), int(height), np.array(parameters, np.float64))
+        _add(lenses, int(camera_id), lens, tell)
     return lenses
 
 
@@ -298,7 +321,7 @@ def find_model(folder: Path) -> Path | None:
 def _photographs_of(model_folder: Path) -> int:
     """Return the number of photographs with a camera in a model; 0 if it is damaged."""
     try:
-        images = _content(model_folder / f"images{_suffix(model_folder)}", lambda *_: None)
+        images = _content(model_folder / f"images{_suffix(model_folder)}", quiet=True)
         return len({image.name for image in images})
     except FormatError:
         return 0

@@ -7,7 +7,6 @@ HDR, HLG and PQ, are taken to the diffuse white of BT.2408; what is brighter bec
 
 import io
 import struct
-from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 from PIL import Image, ImageCms
 
 from langsplat_core.arrays import Array
+from langsplat_core.errors import Tell
 
 UNSPECIFIED, LINEAR, PQ, HLG = 2, 8, 16, 18
 # Displays show all of these as they show sRGB: BT.709, BT.601, BT.1361, sRGB, BT.2020 of 10 and of 12 bits.
@@ -31,7 +31,6 @@ PRIMARIES = dict.fromkeys((1, UNSPECIFIED, 4, 5, 6, 7), SRGB) | {
     12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *D65),  # Display P3
 }
 CHUNKS = 64  # of a PNG before its pixels
-Tell = Callable[[str], None]
 
 
 def as_srgb(image: Image.Image, coded: tuple[float, Any] | None, tell: Tell) -> Image.Image:

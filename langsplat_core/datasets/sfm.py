@@ -28,6 +28,7 @@ from langsplat_core.datasets.photos import (
 from langsplat_core.datasets.workspace import (
     FAILURES,
     MASKS,
+    UNREADABLE,
     CameraGroup,
     Matches,
     Pair,
@@ -35,7 +36,7 @@ from langsplat_core.datasets.workspace import (
     read_matches,
     run_apart,
 )
-from langsplat_core.errors import InputError, report_loss, shortened
+from langsplat_core.errors import InputError, printable_line, report_loss, shortened
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
 from langsplat_core.progress import Progress
@@ -61,7 +62,7 @@ def load_photos(
     contents = [(labels[path], _content(path)) for path in paths]
     masked = [(labels[path], _content(mask)) for path in paths if (mask := mask_beside(path))]
     workspace = open_workspace(work, ["photographs", 4, SIDE, contents, *([masked] if masked else [])])
-    files = numbered(paths)
+    files, before = numbered(paths), has_model(workspace / "sparse")
     if not has_model(workspace / "sparse"):
         try:
             run_apart(_locate, workspace, files, workspace=workspace, progress=progress)
@@ -80,8 +81,10 @@ def load_photos(
             f"only {found} of {len(files)} photographs could be located together "
             f"({_listed(lost, 10)}); {matches.joined()}{matches.advice()}{anyway}"
         )
+    if not before:
+        lost.pop(UNREADABLE, None)  # which the process has told of, with the reasons
     if lost:
-        share = f"{len(files) - found} of {len(files)} photographs"
+        share = f"{sum(map(len, lost.values()))} of {len(files)} photographs"
         what = "could not be located and are left out"
         report_loss("%s %s (%s); %s", share, what, _listed(lost, 5), matches.advice())
     photos = [
@@ -175,7 +178,8 @@ def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> l
             f"only {count} photographs can be read; at least {MIN_PHOTOS} are needed: {shortened(broken)}"
         )
     if broken:
-        log.warning("%d photographs cannot be read: %s", len(broken), shortened(broken))
+        share = f"{len(broken)} of {len(files)} photographs"
+        report_loss("%s cannot be read and are left out: %s", share, shortened(broken))
     return [
         CameraGroup(tuple(names), "SIMPLE_RADIAL", side=max(size)) for (size, _), names in members.items()
     ]
@@ -213,9 +217,9 @@ MAX_ANGLE = 75.0  # degrees between the axes of views that are matched
 def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Progress) -> Capture:
     """Return the capture with points triangulated from the photographs at `views`, or random ones."""
     log.info("the dataset has no points; they are triangulated")
-    points, colours = _triangulated(capture, views, work, progress)
+    points, colours, why = _triangulated(capture, views, work, progress)
     if len(points) < MIN_POINTS:
-        report_loss("only %d points could be triangulated; %d are random", len(points), RANDOM_POINTS)
+        report_loss("only %d points could be triangulated%s; %d are random", len(points), why, RANDOM_POINTS)
         generator = np.random.default_rng(0)
         cameras, images = [capture.cameras[i] for i in views], [capture.images[i] for i in views]
         masks = [capture.mask(i) for i in views]
@@ -225,7 +229,8 @@ def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Pro
 
 def _triangulated(
     capture: Capture, views: Sequence[int], work: Path, progress: Progress
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, str]:
+    """Return points, their colours, and why there are none, for people; "" where nothing failed."""
     workspace = open_workspace(work, ["known poses", 3, SIDE, capture.digest(views)])
     try:
         if not has_model(workspace / "sparse"):
@@ -234,10 +239,9 @@ def _triangulated(
             run_apart(
                 _match_and_triangulate, workspace, names, cameras, workspace=workspace, progress=progress
             )
-        return good_points(read_model(workspace / "sparse"))
+        return *good_points(read_model(workspace / "sparse")), ""
     except (*FAILURES, InputError) as error:
-        log.warning("points could not be triangulated: %s", str(error).splitlines()[0])
-        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), f" ({printable_line(error, 200)})"
 
 
 def _match_and_triangulate(

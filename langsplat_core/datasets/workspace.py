@@ -75,6 +75,7 @@ def disk_full(folder: Path) -> OSError:
 FEWEST_MATCHES = 15  # that COLMAP's mapper works with
 FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
 MOST_TOLD = 3  # groups and gaps in a message
+UNREADABLE = "cannot be read"  # why a photograph has no camera
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class Matches:
     def why(self, row: int) -> str:
         """Return the reason why a photograph has no camera."""
         if self.features[row] < 0:
-            return "cannot be read"
+            return UNREADABLE
         if self.features[row] < FEWEST_FEATURES:
             return "too few features (plain, dark, blurred or tiny)"
         neighbours = {

@@ -1,9 +1,9 @@
 """A function in a process of its own, for native libraries that abort where they should raise.
 
 The process is a fresh interpreter, which knows nothing of this one but what it is given: the function, named
-by its module, and arguments, which are pickled. Progress and messages come back while it runs. It ends with
-this process, however that ends (native code that holds the interpreter ends its call first), and at once
-where the work is cancelled.
+by its module, and arguments, which are pickled, how much is said, and whether a loss is an error (--strict).
+Progress and messages come back while it runs. It ends with this process, however that ends (native code that
+holds the interpreter ends its call first), and at once where the work is cancelled.
 
 Not `concurrent.futures.ProcessPoolExecutor`: its processes import the caller's ``__main__`` anew, which a
 script without a guard does not survive; it does not say how a process ended, nor the last that it printed;
@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
-from langsplat_core.errors import printable_line
+from langsplat_core.errors import STRICTNESS, printable_line
 from langsplat_core.progress import Progress, Report
 
 _SERVE = "from langsplat_core.io.apart import serve; serve()"
@@ -64,7 +64,7 @@ def run(
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            pickle.dump((log.getEffectiveLevel(), function, arguments), process.stdin)
+            pickle.dump((log.getEffectiveLevel(), STRICTNESS.on, function, arguments), process.stdin)
             process.stdin.flush()
             while True:
                 match pickle.load(process.stdout):
@@ -74,7 +74,8 @@ def run(
                         log.log(*message)
                     case "error", error:
                         raise error
-                    case _, result:
+                    case _, (result, loss):
+                        STRICTNESS.last = loss or STRICTNESS.last
                         return result
         except (EOFError, pickle.UnpicklingError, BrokenPipeError):  # it ended within or before a message
             code = process.wait()
@@ -111,14 +112,14 @@ def serve() -> None:
         given.read(1)  # nothing, once the caller's end of the pipe is closed
         os._exit(1)
 
-    level, function, arguments = pickle.load(given)
+    level, STRICTNESS.on, function, arguments = pickle.load(given)
     log.addHandler(Handler())
     log.setLevel(level)
     log.propagate = False
     threading.Thread(target=end_with_caller, daemon=True).start()
     progress = Progress(lambda at: send("progress", (at.stage, at.fraction, at.note, dict(at.metrics))))
     try:
-        send("result", function(*arguments, progress))
+        send("result", (function(*arguments, progress), STRICTNESS.last))
     except Exception as error:  # noqa: BLE001  raised there instead
         try:
             pickle.loads(pickle.dumps(error))

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Raw, Struct
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import malformed
+from langsplat_core.errors import malformed, quoted, report_losses, unread
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, decode_json, read_file
 from langsplat_core.scene import FARTHEST, Camera
@@ -48,9 +48,22 @@ class _Entry(Struct):
 
 
 def read_cameras(path: Path | str) -> tuple[Camera, ...]:
-    """Return the cameras in the file, in its order. Raises InputError and FormatError."""
+    """Return the cameras in the file, in its order; what is passed over or guessed is reported.
+
+    Raises InputError and FormatError.
+    """
     path = Path(path)
-    entries = decode_json(read_file(path, SIZE_LIMIT), list[_Entry], path)
+    text = read_file(path, SIZE_LIMIT)
+    entries = decode_json(text, list[_Entry], path)
+    stated = decode_json(text, list[dict[str, Raw]], path)
+    known = {*_Entry.__struct_encode_fields__, "id"}
+    told = [unread("entries", {quoted(name, 40) for one in stated for name in one if name not in known})]
+    if half := sum((entry.cx is None) != (entry.cy is None) for entry in entries):
+        told.append(f"{half} cameras have one of cx and cy alone, and the middle is taken for the other")
+    poses = {(entry.img_name, entry.position, entry.rotation) for entry in entries if entry.img_name}
+    if again := len(poses) - len({name for name, *_ in poses}):
+        told.append(f"{again} cameras have the name of another")
+    report_losses(path, told)
     return tuple(_camera(entry, f"{path}: camera {index}") for index, entry in enumerate(entries))
 
 

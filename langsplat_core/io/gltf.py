@@ -6,7 +6,8 @@ left, up, front where the PLY is right, down, front: half a turn about z, which 
 place primitives; all Gaussians of the default scene are read, in the order of its nodes. A primitive may hold
 an .spz file instead (KHR_gaussian_splatting_compression_spz and _spz_2).
 
-Drafts of the extension stored SCALE as logarithms: a file with a negative scale is taken for such a one.
+Drafts of the extension stored SCALE as logarithms: a file with a negative scale is taken for such a one. What
+of a file is none of this is passed over, which is said.
 Source: Khronos' public specification of the extension, release candidate of 2026.
 """
 
@@ -23,9 +24,17 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
-from langsplat_core.errors import InputError, malformed, quoted
+from langsplat_core.errors import InputError, malformed, quoted, report_losses, unread
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import FREE, SMALL_RATIO, Allowance, decode_json, is_plain_name, read_file
+from langsplat_core.io.hostile import (
+    FREE,
+    SMALL_RATIO,
+    Allowance,
+    decode_json,
+    is_plain_name,
+    other_entries,
+    read_file,
+)
 from langsplat_core.io.quantised import mirrored, to_bytes
 from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene, about_origin
@@ -46,6 +55,7 @@ JSON_LIMIT = 16 << 20  # bytes; ours has 10 kB
 MOST_NODES = 1 << 16
 SIGNS = np.array([-1, -1, 1], np.float32)  # left up front to right down front, and back
 SRGB = "srgb_rec709_display"
+HOW = ("ellipse", "cameraDistance", "perspective")  # are Gaussians drawn here: kernel, order, projection
 
 # What is read of the JSON; entries that are not named here are passed over.
 
@@ -76,6 +86,9 @@ class _Packed(Struct, rename="camel"):
 
 class _Splatting(Struct, rename="camel"):
     color_space: str = SRGB
+    kernel: str = HOW[0]
+    sorting_method: str = HOW[1]
+    projection: str = HOW[2]
     extensions: dict[str, _Packed] = {}
 
 
@@ -96,6 +109,7 @@ class _Node(Struct):
     rotation: tuple[Number, Number, Number, Number] = (0, 0, 0, 1)
     scale: tuple[Number, Number, Number] = (1, 1, 1)
     translation: tuple[Number, Number, Number] = (0, 0, 0)
+    extensions: dict[str, Any] = {}
 
 
 class _Scene(Struct):
@@ -114,32 +128,39 @@ class _Content(Struct, rename="camel"):
     extensions_used: list[str] = []
     meshes: list[_Mesh] = []
     nodes: Annotated[list[_Node], Meta(max_length=MOST_NODES)] = []
-    scene: Index = 0
+    scene: Index | None = None
     scenes: list[_Scene] = []
+
+
+ENTRIES = {*_Content.__struct_encode_fields__, *_About.__struct_encode_fields__}
 
 
 @np.errstate(all="ignore")  # whatever numbers a file holds: rows that come out unsound are not drawn
 def read_gltf_scene(path: Path | str) -> Scene:
     """Return all Gaussians of the default scene of a .glb or .gltf file.
 
-    Raises InputError when a file cannot be opened and FormatError when it breaks a rule of the format, needs
-    an extension that is not known here, or holds no Gaussians.
+    They are drawn antialiased where all come from .spz files that say so. Raises InputError when a file
+    cannot be opened and FormatError when it breaks a rule of the format, needs an extension that is not known
+    here, or holds no Gaussians.
     """
     path = Path(path)
     file = _File(path)
     try:
         # Positions about the first node's: in the world float32 may be too coarse.
-        middle = next((matrix[:3, 3] for matrix, _ in _placed(file)), np.zeros(3))
+        placed = (matrix for matrix, primitive in _placed(file) if EXTENSION in primitive.extensions)
+        middle = next(placed, np.eye(4))[:3, 3]
         parts = list(_parts(file, middle))
     except LookupError as error:
         raise malformed(path, f"names what it lacks ({str(error)[:80]})", "export it again") from None
     if not parts and EXTENSION not in file.content.extensions_used:
         raise malformed(path, f"holds no Gaussians ({EXTENSION}); meshes are not read")
+    report_losses(path, file.losses())
     gaussians = mirrored(join_gaussians(parts), SIGNS)
+    scene = Scene(gaussians, antialiased=file.antialiased == {True})
     if not middle.any():
-        return Scene(gaussians)
+        return scene
     means, origin = about_origin(gaussians.means + SIGNS * middle)
-    return Scene(replace(gaussians, means=means), origin=origin)
+    return replace(scene, gaussians=replace(gaussians, means=means), origin=origin)
 
 
 def _parts(file: "_File", middle: Array) -> Iterator[Gaussians]:
@@ -148,19 +169,27 @@ def _parts(file: "_File", middle: Array) -> Iterator[Gaussians]:
     middle: (3,), what they become relative to.
     """
     for matrix, primitive in _placed(file):
+        if EXTENSION not in primitive.extensions:
+            file.bare += 1
+            continue
         splatting = primitive.extensions[EXTENSION]
         if primitive.mode != POINTS:
             raise malformed(file.path, "Gaussians in a primitive that is not of points")
         if splatting.color_space != SRGB:
             raise malformed(file.path, f"colours are not {SRGB} but {quoted(splatting.color_space)}")
+        how = splatting.kernel, splatting.sorting_method, splatting.projection
+        file.others.update(quoted(name) for name in {*how} - {*HOW} | splatting.extensions.keys() - {*PACKED})
         packed = next(
             (found.buffer_view for name, found in splatting.extensions.items() if name in PACKED), None
         )
         if packed is not None:
             data = bytes(file.view(packed)[0])
             file.room.take(1 << 16)  # the time of small ones counts too
-            gaussians = mirrored(decode_spz(data, file.path, file.room).gaussians, SIGNS)
+            inside = decode_spz(data, file.path, file.room, file.told.append)
+            gaussians = mirrored(inside.gaussians, SIGNS)
+            file.antialiased.add(inside.antialiased)
         else:
+            file.antialiased.add(False)
             gaussians = _gaussians(file, primitive.attributes)
         try:
             place = similarity(matrix).then(moving(-middle))
@@ -170,9 +199,9 @@ def _parts(file: "_File", middle: Array) -> Iterator[Gaussians]:
 
 
 def _placed(file: "_File") -> Iterator[tuple[Array, _Primitive]]:
-    """Yield the primitives with Gaussians and the matrix of their place. A node has one parent at most."""
+    """Yield the primitives and the matrix of their place. A node has one parent at most."""
     content = file.content
-    roots = content.scenes[content.scene].nodes if content.scenes else range(len(content.nodes))
+    roots = content.scenes[content.scene or 0].nodes if content.scenes else range(len(content.nodes))
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:
@@ -182,8 +211,10 @@ def _placed(file: "_File") -> Iterator[tuple[Array, _Primitive]]:
         seen.add(number)
         node = content.nodes[number]
         matrix = above @ _matrix(node)
-        primitives = () if node.mesh is None else content.meshes[node.mesh].primitives
-        yield from ((matrix, primitive) for primitive in primitives if EXTENSION in primitive.extensions)
+        file.others.update(map(quoted, node.extensions))
+        if node.mesh is not None:
+            file.shown.add(node.mesh)
+            yield from ((matrix, primitive) for primitive in content.meshes[node.mesh].primitives)
         waiting += [(child, matrix) for child in reversed(node.children)]
 
 
@@ -208,10 +239,15 @@ def _gaussians(file: "_File", attributes: dict[str, int]) -> Gaussians:
     have = sum(name in attributes for name in COEFFICIENTS)
     if have not in SH_COUNTS.values() or COEFFICIENTS[have - 1] not in attributes:
         raise malformed(file.path, f"{have} of the coefficients of its colours; expected 1, 4, 9 or 16")
-    quats = column(f"{EXTENSION}:ROTATION", 4)
-    scales = column(f"{EXTENSION}:SCALE", 3)
-    log_scales = scales if (scales < 0).any() else np.log(scales)
-    logits = logit(column(f"{EXTENSION}:OPACITY", 1)[:, 0].astype(np.float64))
+    parts = rotation, scale, opacity = [f"{EXTENSION}:{part}" for part in ("ROTATION", "SCALE", "OPACITY")]
+    file.others.update(map(quoted, attributes.keys() - {"POSITION", "COLOR_0", *parts, *COEFFICIENTS}))
+    quats = column(rotation, 4)
+    log_scales = column(scale, 3)
+    if (log_scales < 0).any():
+        file.told.append("some scales are negative, and all are taken for logarithms, as of a draft")
+    else:
+        log_scales = np.log(log_scales)
+    logits = logit(column(opacity, 1)[:, 0].astype(np.float64))
     sh = np.empty((count, have, 3), np.float32)
     for number, name in enumerate(COEFFICIENTS[:have]):
         sh[:, number] = column(name, 3)
@@ -223,6 +259,11 @@ class _File:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.told: list[str] = []  # of what is passed over or guessed
+        self.others: set[str] = set()  # attributes, extensions and ways of drawing that are not known
+        self.bare = 0  # placed primitives without Gaussians
+        self.shown: set[int] = set()  # meshes that nodes place
+        self.antialiased: set[bool] = set()  # what primitives say
         text = memoryview(read_file(path, 2**32))
         self._binary = text[:0]
         # Numbers as they are stored, which an honest file shows once or a few times; Gaussians packed in it
@@ -234,7 +275,10 @@ class _File:
             if text[4:8] != b"\2\0\0\0" or text[16:20] != JSON_CHUNK or end - 20 > JSON_LIMIT:
                 raise malformed(path, f"does not begin with a chunk of JSON of at most {JSON_LIMIT} bytes")
             size = int.from_bytes(text[end : end + 4], "little")
-            self._binary = text[end + 8 :][: size if text[end + 4 : end + 8] == BINARY_CHUNK else 0]
+            size += 8 if text[end + 4 : end + 8] == BINARY_CHUNK else -size
+            self._binary = text[end + 8 : end + size]
+            if len(text) - end - size > 3:
+                self.told.append(f"{len(text) - end - size} bytes behind its buffer not read")
             text = text[20:end]
         about = decode_json(bytes(text), _About, path)  # first: other versions have other content
         version = about.asset.get("version")
@@ -244,6 +288,21 @@ class _File:
             if name not in KNOWN:
                 raise malformed(path, f"needs {quoted(name)}, which is not read", "export it without")
         self.content = decode_json(bytes(text), _Content, path)
+        self.told.append(other_entries(bytes(text), ENTRIES, path))
+
+    def losses(self) -> Iterator[str]:
+        """Yield what of the file was passed over or guessed, once its Gaussians are read."""
+        yield from dict.fromkeys(self.told)
+        yield unread("", self.others)
+        if self.bare:
+            yield f"{self.bare} primitives without Gaussians not read"
+        meshes = (mesh for number, mesh in enumerate(self.content.meshes) if number not in self.shown)
+        if hidden := sum(EXTENSION in one.extensions for mesh in meshes for one in mesh.primitives):
+            yield f"{hidden} primitives of Gaussians are not in its default scene"
+        if self.content.scene is None and len(self.content.scenes) > 1:
+            yield f"the first of its {len(self.content.scenes)} scenes is taken, as none is its default"
+        if len(self.antialiased) > 1:
+            yield "a part of its Gaussians is antialiased, and none is drawn so"
 
     def accessor(self, index: int, width: int, count: int, name: str) -> Array:
         """Return the (count, width) float32 values of an accessor."""

@@ -13,7 +13,7 @@ import stat
 import struct
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -32,6 +32,7 @@ from langsplat_core.errors import (
     quoted,
     remedy,
     report_loss,
+    unread,
 )
 from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS
@@ -238,6 +239,12 @@ def decode_json(text: bytes, kind: type[T], path: Path) -> T:
     with _as_json(path):
         _check_values(text, path)
         return msgspec.json.decode(text.decode(json.detect_encoding(text)), type=kind)
+
+
+def other_entries(text: bytes, known: Collection[str], path: Path) -> str:
+    """Return, for `report_losses`, which entries of a JSON object are none of `known`; FormatError."""
+    entries = decode_json(text, dict[str, msgspec.Raw], path)
+    return unread("entries", (quoted(name, 40) for name in entries if name not in known))
 
 
 def _check_values(text: bytes, path: Path) -> None:

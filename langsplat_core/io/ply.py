@@ -11,9 +11,9 @@ blue. Normals are zeros that nobody reads. Of a scene with an origin ``x y z`` a
 world.
 
 As read: the properties in any order and of any scalar type, any byte order, ascii, LF or CR LF in the
-header, without normals, with further elements (ignored) and properties (kept as `Scene.extras`). Rows are
-kept as they are, NaN included. Of comments in the header two kinds mean something; of several of a kind the
-last one counts:
+header, without normals, with further elements (not read, which is said) and properties (kept as
+`Scene.extras`). Rows are kept as they are, NaN included; doubles, but of positions, are rounded to float32.
+Of comments in the header two kinds mean something; of several of a kind the last one counts:
 
     metres_per_unit 0.25        length of the world's unit; no positive number: unknown
     SplatRenderMode: mip        trained with Mip-Splatting's compensation: Brush, splat-transform, gsplat
@@ -25,7 +25,7 @@ import math
 import re
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from langsplat_core.arrays import Array, logit
-from langsplat_core.errors import InputError, malformed, printable_line, quoted
+from langsplat_core.errors import InputError, Tell, malformed, printable_line, quoted, report_losses, unread
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
 from langsplat_core.io.quantised import smallest_three
@@ -86,7 +86,7 @@ class PlyFile:
         self.path = path
         self.comments: list[str] = []
         self.elements: dict[str, PlyElement] = {}
-        self._file, self._size = file, size
+        self._file, self._size, self._beyond = file, size, 0  # beyond: numbers that do not fit their types
         head = file.read(HEADER_LIMIT)
         if head[:4] not in (b"ply\n", b"ply\r"):
             raise malformed(path, "is not a PLY file (it does not begin with the line 'ply')")
@@ -188,8 +188,19 @@ class PlyFile:
             list(pool.map(work, range(2)))
         return tables
 
-    def _seek(self, wanted: PlyElement) -> None:
-        """Go to the first row of `wanted`, which the file has room for."""
+    def losses(self, read: Collection[str]) -> Iterator[str]:
+        """Yield what of the file is passed over; read: names of the elements that are not."""
+        others = (each for each in self.elements.values() if each.count and each.name not in read)
+        yield unread("elements", (f"{each.name} ({each.count} rows)" for each in others))
+        if self._beyond:
+            yield f"{self._beyond} numbers do not fit the types of their properties"
+        self._seek(None)
+        left = self._size - self._file.tell() if self._order else sum(map(bool, map(bytes.strip, self._file)))
+        if left:
+            yield f"{left} {'bytes' if self._order else 'lines'} behind the last row not read"
+
+    def _seek(self, wanted: PlyElement | None) -> None:
+        """Go to the first row of `wanted`, which the file has room for; None: behind the last row of all."""
         self._file.seek(self.header_size)
         for element in self.elements.values():
             left, least = self._size - self._file.tell(), element.row(self._order).itemsize
@@ -263,6 +274,10 @@ class PlyFile:
         if rows.shape != (count, len(element.numbers)):
             found = f"{len(rows)} rows of {rows.shape[1]} values from row {start} of {element.name} on"
             raise malformed(self.path, f"{found}; expected {count} of {len(element.numbers)}")
+        for column, code in zip(rows.T, element.numbers.values(), strict=True):
+            if code[0] != "f":
+                least, most = np.iinfo(code).min, np.iinfo(code).max
+                self._beyond += int((~((column >= least) & (column <= most) & (column % 1 == 0))).sum())
         # float64 holds every type of a PLY exactly
         return np.ascontiguousarray(rows).view([(name, "f8") for name in element.numbers])[:, 0]
 
@@ -321,24 +336,30 @@ def read_cloud(path: Path) -> tuple[Array, Array]:
     """Return (M, 3) float64 positions and (M, 3) uint8 colours of the element `vertex`.
 
     A position may be infinite or NaN. Colours are whole numbers from 0 to 255, or floats from 0 to 1; what
-    lies beyond is clipped. Raises InputError when the file cannot be opened and FormatError when it breaks a
-    rule of the format.
+    lies beyond is clipped, and for want of colours grey is taken; either is reported. Raises InputError when
+    the file cannot be opened and FormatError when it breaks a rule of the format.
     """
     with open_ply(path) as ply:
         vertex = ply.vertex
         coloured = all(channel in vertex.numbers for channel in CHANNELS)
         points, shades = ply.read(vertex, (POSITION, "f8"), (CHANNELS * coloured, "f8"))
+        told = list(ply.losses(ply.elements))  # of a mesh the faces play no part
     if not coloured:
         shades = np.full(points.shape, GREY)
+        told.append("its points have no colours, and grey is taken")
     scale = 255 if coloured and vertex.numbers["red"].startswith("f") else 1
     # clipped first, so that nothing overflows; NaN becomes black
-    return points, np.rint(np.clip(np.nan_to_num(shades), 0, 255 / scale) * scale).astype(np.uint8)
+    clipped = np.clip(np.nan_to_num(shades), 0, 255 / scale)
+    if cut := np.count_nonzero((clipped != shades).any(1)):
+        told.append(f"the colours of {cut} points are beyond 0 to {255 // scale} and were cut")
+    report_losses(path, told)
+    return points, np.rint(clipped * scale).astype(np.uint8)
 
 
 # ---- Gaussians, in INRIA's layout ----
 
 POSITION = ("x", "y", "z")
-NORMAL = ("nx", "ny", "nz")  # zeros that nobody reads
+NORMAL = ("nx", "ny", "nz")  # zeros
 BASE_COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -358,21 +379,24 @@ def read_ply_scene(path: Path | str) -> Scene:
     """Return the Gaussians of a 3DGS PLY file, plain or compressed, and what else the file tells of them.
 
     `extras` are the scalar properties of a plain file that are none of the layout, in its order, each of
-    its own type. Raises InputError when the file cannot be opened and FormatError when it breaks a rule of
-    the format or holds no Gaussians.
+    its own type. What is passed over is reported. Raises InputError when the file cannot be opened and
+    FormatError when it breaks a rule of the format or holds no Gaussians.
     """
+    extras, told = dict[str, Array](), list[str]()
     with open_ply(Path(path)) as ply:
-        extras: dict[str, Array] = {}
         if "chunk" in ply.elements and not ply.vertex.numbers.keys().isdisjoint(PACKED):
-            gaussians, origin = _read_compressed(ply, ply.vertex)
+            gaussians, origin = _read_compressed(ply, ply.vertex, told.append)
+            told += ply.losses(("chunk", "vertex", "sh"))
         else:
-            gaussians, origin, extras = _read_plain(ply, ply.vertex)
-    antialiased, metres = _said(ply.comments)
+            gaussians, origin, extras = _read_plain(ply, ply.vertex, told.append)
+            told += ply.losses(("vertex",))
+    antialiased, metres = _said(ply.comments, told.append)
+    report_losses(path, told)
     about = Scene(gaussians, antialiased=antialiased, extras=extras, metres_per_unit=metres)
     return replace(about, origin=origin)
 
 
-def _read_plain(ply: PlyFile, vertex: PlyElement) -> tuple[Gaussians, Array, dict[str, Array]]:
+def _read_plain(ply: PlyFile, vertex: PlyElement, tell: Tell) -> tuple[Gaussians, Array, dict[str, Array]]:
     needed = (*BASE_COLOUR, "opacity", *SCALE, *ROTATION)
     if vertex.numbers.keys().isdisjoint(needed):
         what = "a mesh or point cloud, not a 3D Gaussian scene: it has no f_dc, opacity, scale and rot"
@@ -384,14 +408,18 @@ def _read_plain(ply: PlyFile, vertex: PlyElement) -> tuple[Gaussians, Array, dic
     by_coefficient = [f"f_rest_{k + channel * higher}" for k in range(higher) for channel in range(3)]
     layout = (SCALE, ROTATION, ("opacity",), (*BASE_COLOUR, *by_coefficient))
     others = [name for name in vertex.numbers if name not in {*POSITION, *NORMAL}.union(*layout)]
+    normals = [name for name in NORMAL if name in vertex.numbers]
     single = ply.is_binary and all(vertex.numbers.get(axis) == "f4" for axis in POSITION)
     tables = ply.read(
         vertex,
         (POSITION, "f4" if single else "f8"),
+        (normals, "?"),
         *((names, "f4") for names in layout),
         *(((name,), vertex.numbers[name]) for name in others),
     )
-    means, log_scales, quats_wxyz, opacities, sh, *kept = tables
+    means, pointing, log_scales, quats_wxyz, opacities, sh, *kept = tables
+    if pointing.any():
+        tell(f"normals of {np.count_nonzero(pointing.any(1))} Gaussians not kept")
     means, origin = about_origin(means)
     sh = sh.reshape(vertex.count, 1 + higher, 3)
     extras = {name: table[:, 0] for name, table in zip(others, kept, strict=True)}
@@ -427,24 +455,32 @@ def write_ply(path: Path | str, content: Scene | Gaussians) -> None:
     write_table(path, columns, comments=comments)
 
 
-def _said(comments: Sequence[str]) -> tuple[bool, float | None]:
+def _said(comments: Sequence[str], tell: Tell) -> tuple[bool, float | None]:
     """Return whether to draw antialiased, and metres per unit where that is a positive number."""
-    antialiased, metres = False, None
+    marks, lengths = list[bool](), list[float]()
     for comment in comments:
         match comment.replace(":", " ").split():
-            case [key, text] if key == METRES:
+            case [key, *texts] if key == METRES:
                 try:
-                    metres = float(text) if 0 < float(text) < math.inf else None
+                    lengths.append(float(" ".join(texts)))
                 except ValueError:
-                    metres = None
+                    lengths.append(math.nan)
         match comment.lower().replace(":", " ").split():
-            case ["splatrendermode", mode, *_]:
-                antialiased = mode == "mip"
-            case ["antialiased", value]:
-                antialiased = value == "1"
+            case ["splatrendermode", ("mip" | "default") as mode, *_]:
+                marks.append(mode == "mip")
+            case ["antialiased", ("0" | "1") as value]:
+                marks.append(value == "1")
             case ["train_flags", *flags]:
-                antialiased = "antialiasing" in flags
-    return antialiased, metres
+                marks.append("antialiasing" in flags)
+            case ["splatrendermode", *_] | ["antialiased", _]:
+                tell(f"comment {quoted(comment)} not understood")
+    if any(len(set(said)) > 1 for said in (marks, lengths)):
+        tell("its comments differ, and the last of a kind counts")
+    metres = lengths[-1] if lengths else None
+    if metres is not None and not 0 < metres < math.inf:
+        tell(f"{METRES} is no positive number, and counts as unknown")
+        metres = None
+    return bool(marks and marks[-1]), metres
 
 
 def write_metres(path: Path | str, metres_per_unit: float) -> None:
@@ -497,13 +533,17 @@ _SH_VALUES = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
 _SH_VALUES[[0, 255]] = -4, 4
 
 
-def _read_compressed(ply: PlyFile, vertex: PlyElement) -> tuple[Gaussians, Array]:
+def _read_compressed(ply: PlyFile, vertex: PlyElement, tell: Tell) -> tuple[Gaussians, Array]:
     chunk = ply.elements["chunk"]
+    if chunk.count * CHUNK_SIZE >= vertex.count + CHUNK_SIZE:
+        tell(f"it has {chunk.count} chunks for {vertex.count} Gaussians, and the last ones are not used")
     if chunk.count * CHUNK_SIZE < vertex.count:
         what = f"{chunk.count} chunks for {vertex.count} Gaussians; expected one for every {CHUNK_SIZE}"
         raise malformed(ply.path, what)
     coloured = _BOUNDS[2][0] in chunk.numbers  # else of the range 0 to 1
     bounds = ply.read(chunk, *((names, "f8") for names in _BOUNDS[: 2 + coloured]))
+    others = chunk.numbers.keys() - set().union(*_BOUNDS[: 2 + coloured]) | vertex.numbers.keys() - {*PACKED}
+    tell(unread("properties", others))
     position, rotation, scale, colour = _codes(ply, vertex, PACKED, "u4").T
     rest = np.zeros((vertex.count, 3, 0))
     element = ply.elements.get("sh")
@@ -528,7 +568,7 @@ def _read_compressed(ply: PlyFile, vertex: PlyElement) -> tuple[Gaussians, Array
         gaussians = Gaussians(
             means=means,
             log_scales=between(bounds[1], _fractions(scale, 11, 10, 11)),
-            quats_wxyz=smallest_three((three - 0.5) * np.sqrt(2), rotation >> 30),
+            quats_wxyz=smallest_three((three - 0.5) * np.sqrt(2), rotation >> 30, tell),
             opacity_logits=logit(rgba[:, 3]),
             sh=np.concatenate([base, rest.transpose(0, 2, 1)], axis=1),
         )

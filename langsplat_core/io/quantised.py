@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, sigmoid, unit
-from langsplat_core.errors import InputError, malformed
+from langsplat_core.errors import InputError, Tell, malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
 from langsplat_core.scene import Gaussians
@@ -50,14 +50,18 @@ def check_steps(path: Path, gaussians: Gaussians, steps: Array) -> None:
         )
 
 
-def smallest_three(three: Array, largest: Array) -> Array:
+def smallest_three(three: Array, largest: Array, tell: Tell) -> Array:
     """Return (N, 4) unit quaternions from their (N, 3) components other than the largest.
 
-    largest: (N,) index of that one, which is positive.
+    largest: (N,) index of that one, which is positive; tell: is told of codes of longer quaternions, by more
+    than 8 bits a component round.
     """
     out = np.empty((len(three), 4))
+    left = 1 - (three**2).sum(1)
+    if longer := np.count_nonzero(left < -0.02):
+        tell(f"{longer} rotations are no unit quaternions")
     np.put_along_axis(out, _OTHERS[largest], three, 1)
-    np.put_along_axis(out, largest[:, None], np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))[:, None], 1)
+    np.put_along_axis(out, largest[:, None], np.sqrt(np.maximum(0, left))[:, None], 1)
     return out
 
 

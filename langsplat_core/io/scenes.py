@@ -194,6 +194,7 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
         try:
             named = decode_json(read_file(beside, 1 << 16), _Origin, beside).origin
         except InputError as error:
+            report_loss("opened without its origin: %s", error)
             return replace(scene, unread=(str(error),))
         return replace(scene, origin=np.array(named))
     if not scene.origin.any():

@@ -73,7 +73,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.errors import malformed, printable_line, quoted
+from langsplat_core.errors import malformed, printable_line, quoted, report_losses, unread
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import FromFile, decode_json, open_for_reading
 from langsplat_core.scene import (
@@ -154,7 +154,25 @@ def read_stored(path: Path) -> Stored:
         check_array("positions", positions, (len(field),))
         check_array("corners", corners, (2, 3))
         means, precision = unpack_positions(positions, corners)
+        report_losses(path, _passed_over(field, tensors, about))
         return Stored(field, means + about.get("origin", 0.0), precision, about["means_blake2b"])
+
+
+_ALWAYS = ("confidence", "positions", "corners", "means", "canonical", "everyday", "phrasebook", "things")
+_STATED = {*_PARSED, "format", "version", "encoder", "levels", "codec", "means_blake2b"}
+
+
+def _passed_over(field: LanguageField, tensors: dict[str, Array], about: dict[str, Any]) -> Iterator[str]:
+    """Yield, for `report_losses`, what of a field is passed over or guessed."""
+    read = {*_ALWAYS, "latents" if field.codec.blends else "codes"}
+    read.update(CODEC + name for name in field.codec.tensors())
+    read.update(name for name in _KINDS if name.startswith("tree.") and field.tree is not None)
+    read.update(name for name in ("taught", "taught.rivals") if field.taught)
+    yield unread("tensors", (quoted(name, 40) for name in tensors if name not in read))
+    yield unread("metadata", (quoted(name, 40) for name in about if name not in _STATED))
+    absent = [name for name in ("temperature", "found") if name not in about and about["version"] != "1"]
+    if absent:
+        yield f"{' and '.join(absent)} not given: taken as of the encoder CLIP"
 
 
 @contextmanager

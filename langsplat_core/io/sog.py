@@ -13,14 +13,15 @@ by row, belongs to Gaussian i:
                          row, one pixel per coefficient, rgb: indices into `codebook`
 
 Opacities of 0 and 1 become logits of -infinity and +infinity. `model: "antialiased"`, in older files
-`antialias: true`, says that the Gaussians were trained with Mip-Splatting's compensation. Source:
-PlayCanvas' public specification.
+`antialias: true`, says that the Gaussians were trained with Mip-Splatting's compensation. Pixels behind the
+last Gaussian are black; others, and what the file holds beside all this, are passed over, which is said.
+Source: PlayCanvas' public specification.
 """
 
 import io
 import json
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,7 +30,7 @@ from msgspec import Meta, Struct
 from PIL import Image
 
 from langsplat_core.arrays import Array, logit, sigmoid
-from langsplat_core.errors import malformed, quoted
+from langsplat_core.errors import malformed, quoted, report_losses, unread
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import (
     SMALL_RATIO,
@@ -38,6 +39,7 @@ from langsplat_core.io.hostile import (
     is_plain_name,
     opened,
     opened_archive,
+    other_entries,
     read_file,
 )
 from langsplat_core.io.quantised import check_steps, smallest_three, to_bytes, without_largest
@@ -97,6 +99,9 @@ class _Meta(Struct, rename={"higher": "shN"}):
     antialias: Any = None
 
 
+ENTRIES = {*_Meta.__struct_encode_fields__, "version", "asset"}
+
+
 def read_sog_scene(path: Path | str) -> Scene:
     """Return the Gaussians of a SOG folder, its `meta.json` or a `.sog` file.
 
@@ -108,17 +113,24 @@ def read_sog_scene(path: Path | str) -> Scene:
         path = path / META_NAME
     if path.suffix.lower() == ".json":
         size = sum(file.stat().st_size for file in path.parent.glob("*") if file.is_file())
-        return _decode(lambda name, limit: read_file(path.parent / name, limit), path, size)
+        images = [file.name for file in path.parent.glob("*.webp")]
+        return _decode(lambda name, limit: read_file(path.parent / name, limit), path, size, images)
     with opened_archive(path, "SOG archive") as archive:
         # The images are compressed already, so a member far larger than its archive is a trap.
         most = 16 * archive.size + META_LIMIT
         return _decode(
-            lambda name, limit: archive.read(name, min(limit, most)), path / META_NAME, archive.size
+            lambda name, limit: archive.read(name, min(limit, most)),
+            path / META_NAME,
+            archive.size,
+            archive.names,
         )
 
 
-def _decode(fetch: Fetch, meta_path: Path, size: int) -> Scene:
-    """Decode the scene, of `size` bytes, whose meta file `fetch` finds by the last part of `meta_path`."""
+def _decode(fetch: Fetch, meta_path: Path, size: int, files: Iterable[str]) -> Scene:
+    """Decode the scene, of `size` bytes, whose meta file `fetch` finds by the last part of `meta_path`.
+
+    files: names of those that it may have.
+    """
     text = fetch(meta_path.name, META_LIMIT)
     version = decode_json(text, _Versioned, meta_path).version
     if version != 2:
@@ -128,7 +140,16 @@ def _decode(fetch: Fetch, meta_path: Path, size: int) -> Scene:
     degree = meta.higher.bands if meta.higher is not None else 0
     Allowance(meta_path, size, SMALL_RATIO).take_gaussians(meta.count, degree)
     antialiased = meta.model == "antialiased" or meta.antialias is True
-    return Scene(_gaussians(_Planes(fetch, meta_path, meta.count), meta), antialiased=antialiased)
+    planes = _Planes(fetch, meta_path, meta.count)
+    scene = Scene(_gaussians(planes, meta), antialiased=antialiased)
+    told = [*planes.told, other_entries(text, ENTRIES, meta_path)]
+    if planes.beyond:
+        told.append(f"pixels of {planes.beyond} Gaussians behind its {meta.count} not read")
+    if meta.model not in (None, "antialiased") or meta.antialias not in (None, True, False):
+        told.append("what it says of antialiasing not understood")
+    told.append(unread("files", (name for name in files if name not in planes.read and name[-1] != "/")))
+    report_losses(meta_path, told)
+    return scene
 
 
 def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
@@ -156,7 +177,9 @@ def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
         log_scales=np.array(meta.scales.codebook, np.float32)[
             planes.of_gaussians(meta.scales.files[0])[:, :3]
         ],
-        quats_wxyz=smallest_three((quats[:, :3] / 255 - 0.5) * np.sqrt(2), quats[:, 3] - 252),
+        quats_wxyz=smallest_three(
+            (quats[:, :3] / 255 - 0.5) * np.sqrt(2), quats[:, 3] - 252, planes.told.append
+        ),
         opacity_logits=logit(sh0[:, 3] / 255),
         sh=np.concatenate([base[:, None], rest], axis=1),
     )
@@ -167,12 +190,18 @@ class _Planes:
 
     def __init__(self, fetch: Fetch, path: Path, count: int) -> None:
         self.path, self.count, self._fetch = path, count, fetch
+        self.read = {path.name}  # names of files
+        self.told: list[str] = []  # of what was guessed
+        self.beyond = 0  # pixels behind the last Gaussian that are not black
 
     def of_gaussians(self, name: str) -> Array:
         """Return the (N, 4) uint8 rgba of an image."""
         most = 2 * self.count + SLACK_PIXELS
         pixels = self._image(name, lambda w, h: self.count <= w * h <= most)
-        return pixels.reshape(-1, 4)[: self.count]
+        rgba = pixels.reshape(-1, 4)
+        more = rgba[self.count :]
+        self.beyond = max(self.beyond, int((more[:, :3].any(1) & (more[:, 3] > 0)).sum()))
+        return rgba[: self.count]
 
     def palette(self, name: str, coefficients: int, entries: int) -> Array:
         """Return the (entries, coefficients, 3) uint8 codes of an image."""
@@ -184,6 +213,7 @@ class _Planes:
         """(H, W, 4) uint8; `suits` judges (width, height) before anything is decoded."""
         if not is_plain_name(name):
             raise malformed(self.path, f"{quoted(name)} is no plain file name")
+        self.read.add(name)
         what = f"{self.path}: image {quoted(name)}"
         data = self._fetch(name, IMAGE_LIMIT)
         with opened(data, what, ("WEBP", "PNG")) as image:

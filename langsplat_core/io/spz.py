@@ -4,7 +4,7 @@ Versions 1 to 3 are one gzip stream (a few tools write it without gzip) of a 16-
 in the order of `_Header.widths`. Version 4 is a header of 32 bytes, extension records up to the byte that the
 header names, a table of (compressed, whole) sizes as uint64, and one Zstandard frame per block. In
 versions 2 and 3 extension records lie behind the last block. A record is a uint32 type, a uint32 length
-and so many bytes; the only one that changes how a file is to be read is the axes', an index into
+and so many bytes; the only one that is read is the axes', an index into
 LDB RDB LUB RUB LDF RDF LUF RUF (left or right, down or up, back or forward), from 1. Without it a file is
 RUB: x to the right, y up, z backwards.
 
@@ -13,7 +13,6 @@ Source of the layout: README, extensions and loader of nianticlabs/spz; the code
 
 import gzip
 import io
-import logging
 import struct
 import zlib
 from dataclasses import astuple, dataclass
@@ -23,7 +22,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, sigmoid
-from langsplat_core.errors import InputError, malformed
+from langsplat_core.errors import InputError, Tell, malformed, report_loss, report_losses, unread
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import SMALL_RATIO, Allowance, open_for_reading
 from langsplat_core.io.quantised import (
@@ -34,8 +33,6 @@ from langsplat_core.io.quantised import (
     without_largest,
 )
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
-
-log = logging.getLogger("langsplat")
 
 MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 ANTIALIASED, EXTENDED = 0x1, 0x2  # flags
@@ -79,7 +76,7 @@ class _Packed:
     blocks: dict[str, Array]  # attribute -> (N, bytes of one Gaussian) uint8
 
 
-def _read_packed(file: BinaryIO, size: int, path: Path, room: Allowance) -> _Packed:
+def _read_packed(file: BinaryIO, size: int, path: Path, room: Allowance, tell: Tell) -> _Packed:
     """Read a file of `size` bytes; what it can honestly hold is known before anything is unpacked."""
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
@@ -96,7 +93,7 @@ def _read_packed(file: BinaryIO, size: int, path: Path, room: Allowance) -> _Pac
         sizes = [header.count * width for width in header.widths.values()]
         room.take_gaussians(header.count, min(header.sh_degree, 3))
         if header.version == 4:
-            blocks, records = _read_streams(file, size, header, sizes, path)
+            blocks, records = _read_streams(file, size, header, sizes, path, tell)
         elif not zipped and sum(sizes) > size:
             raise malformed(path, f"truncated: {header.count} Gaussians need {sum(sizes)} bytes of {size}")
         else:
@@ -108,11 +105,15 @@ def _read_packed(file: BinaryIO, size: int, path: Path, room: Allowance) -> _Pac
         raise malformed(path, f"truncated, or too long for its {header.count} Gaussians")
     named = zip(header.widths.items(), blocks, strict=True)
     arrays = {name: np.frombuffer(b, np.uint8).reshape(header.count, width) for (name, width), b in named}
-    return _Packed(header, _axes(records if header.flags & EXTENDED else b"", path), arrays)
+    if unknown := header.flags & ~(ANTIALIASED | EXTENDED):
+        tell(f"flags {unknown:#x} not known")
+    if records and not header.flags & EXTENDED:
+        tell(f"{len(records)} bytes beside its Gaussians not read")
+    return _Packed(header, _axes(records if header.flags & EXTENDED else b"", path, tell), arrays)
 
 
 def _read_streams(
-    file: BinaryIO, size: int, header: _Header, wholes: list[int], path: Path
+    file: BinaryIO, size: int, header: _Header, wholes: list[int], path: Path, tell: Tell
 ) -> tuple[list[bytes], bytes]:
     """Read version 4 behind its first 16 bytes: blocks of `wholes` bytes, and records."""
     content = file.read(size)
@@ -128,6 +129,8 @@ def _read_streams(
     end = at + sum(zipped for zipped, _ in entries)
     if end > len(content):
         raise malformed(path, f"truncated: its streams do not fit into {size} bytes")
+    if end < len(content):
+        tell(f"{len(content) - end} bytes behind its last stream not read")
     streams = []
     for zipped, whole in entries:
         if whole:
@@ -147,21 +150,27 @@ def _unpacked(data: bytes, size: int, path: Path) -> bytes:
         raise malformed(path, f"a stream cannot be unpacked ({str(error)[:80]})") from None
 
 
-def _axes(records: bytes, path: Path) -> int:
-    """Return the axes that the extension records name, 1 to 8.
+def _axes(records: bytes, path: Path, tell: Tell) -> int:
+    """Return the axes that the extension records name, 1 to 8; of several that count the first.
 
     Records of other layouts, which older programs wrote, end the search.
     """
-    at = 0
+    at, axes, others = 0, 0, set[str]()
     while at + 8 <= len(records):
         kind, length = struct.unpack_from("<II", records, at)
-        if kind == AXES_RECORD and length == 4 and at + 12 <= len(records):
+        if at + 8 + length > len(records):
+            break
+        if kind == AXES_RECORD and length == 4 and not axes:
             axes = int(struct.unpack_from("<I", records, at + 8)[0]) or AXES_RUB
-            if axes > 8:
-                raise malformed(path, f"its axes are of kind {axes}", "export the scene with axes RUB")
-            return axes
+        else:
+            others.add(f"{kind:#010x}")
         at += 8 + length
-    return AXES_RUB
+    if axes > 8:
+        raise malformed(path, f"its axes are of kind {axes}", "export the scene with axes RUB")
+    tell(unread("extension records", others))
+    if at < len(records):
+        tell(f"{len(records) - at} bytes of extension records not understood")
+    return axes or AXES_RUB
 
 
 # ---- quantised Gaussians, about ten times smaller than the PLY ----
@@ -178,7 +187,7 @@ def _axes(records: bytes, path: Path) -> int:
 #
 # The axes are right, up, back (RUB), unless the file says otherwise: half a turn about x from the axes of
 # the PLY, which changes signs of positions, of quaternions and of coefficients. What is read are versions 1
-# to 4; degree 4, which nothing here can draw, is left out.
+# to 4; degree 4, which nothing here can draw, is left out, and that is said.
 #
 # Version 3 is written. Its rotations are exact to 0.1 degrees where those of version 2 err by up to a degree,
 # and every program that reads the newer version 4 reads it too, while many that read it do not know 4, which
@@ -197,26 +206,31 @@ def read_spz_scene(path: Path | str) -> Scene:
     path = Path(path)
     file, size = open_for_reading(path)
     with file:
-        return _scene(_read_packed(file, size, path, Allowance(path, size, SMALL_RATIO)))
+        told, room = list[str](), Allowance(path, size, SMALL_RATIO)
+        scene = _scene(_read_packed(file, size, path, room, told.append), told.append)
+    report_losses(path, told)
+    return scene
 
 
-def decode_spz(data: bytes, path: Path, room: Allowance) -> Scene:
+def decode_spz(data: bytes, path: Path, room: Allowance, tell: Tell) -> Scene:
     """Return the scene of an .spz file in memory, along the axes of the PLY.
 
-    path: for messages; room: of the file that it is a part of. Raises FormatError.
+    path: for messages; room: of the file that it is a part of; tell: is told of losses. Raises FormatError.
     """
-    return _scene(_read_packed(io.BytesIO(data), len(data), path, room))
+    return _scene(_read_packed(io.BytesIO(data), len(data), path, room, tell), tell)
 
 
-def _scene(packed: _Packed) -> Scene:
+def _scene(packed: _Packed, tell: Tell) -> Scene:
     blocks, degree = packed.blocks, min(packed.header.sh_degree, 3)
+    if degree < packed.header.sh_degree:
+        tell(f"its spherical harmonics of degree {packed.header.sh_degree} are cut to {degree}")
     count, width = blocks["sh"].shape
     rest = blocks["sh"].reshape(count, width // 3, 3)[:, : SH_COUNTS[degree] - 1]
     base = (blocks["colours"] / 255 - 0.5) / COLOUR_SCALE
     gaussians = Gaussians(
         means=_positions(packed),
         log_scales=blocks["scales"].astype(np.float32) / 16 - 10,
-        quats_wxyz=_rotations(packed),
+        quats_wxyz=_rotations(packed, tell),
         opacity_logits=logit(blocks["alphas"][:, 0] / 255),
         sh=np.concatenate([base[:, None], (rest.astype(np.float32) - 128) / 128], axis=1),
     )
@@ -242,7 +256,7 @@ def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
         what = f"sizes around {np.exp(np.median(sizes)):.2g} are beyond .spz, 4.5e-5 to 380"
         raise InputError(f"{path}: {what} world units; write .ply or .sog")
     if cut.any():
-        log.warning(".spz: the sizes of %d Gaussians of %d are beyond it and were cut", cut.sum(), len(sizes))
+        report_loss(".spz: the sizes of %d of %d Gaussians are beyond it and are cut", cut.sum(), len(sizes))
     codes = np.rint(drawn.means.astype(np.float64) * 2.0**bits).astype("<i4")
     rest = drawn.sh[:, 1:]
     coded = {
@@ -291,17 +305,15 @@ def _positions(packed: _Packed) -> Array:
     return codes / 2.0**packed.header.fractional_bits
 
 
-def _rotations(packed: _Packed) -> Array:
+def _rotations(packed: _Packed, tell: Tell) -> Array:
     """(N, 4) unit quaternions w x y z."""
     data = packed.blocks["rotations"]
     if packed.header.version < 3:
-        xyz = data / 127.5 - 1
-        w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(axis=1, keepdims=True)))
-        return np.concatenate([w, xyz], axis=1)
+        return smallest_three(data / 127.5 - 1, np.zeros(len(data), np.intp), tell)  # all but w
     words = np.ascontiguousarray(data).view("<u4")[:, 0]
     three = np.stack([words >> shift & 1023 for shift in (20, 10, 0)], axis=1)
     magnitudes = (three & 511) / 511 * np.sqrt(0.5)
-    xyzw = smallest_three(np.where(three & 512, -magnitudes, magnitudes), words >> 30)
+    xyzw = smallest_three(np.where(three & 512, -magnitudes, magnitudes), words >> 30, tell)
     return xyzw[:, [3, 0, 1, 2]]
 
 
