@@ -28,14 +28,21 @@ from langsplat_core.io.sidecar import read_words
 from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
+from langsplat_core.query.compose import (
+    Number,
+    check_phrase,
+    count_things,
+    encode_phrases,
+    joined,
+    run_phrase,
+)
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.selection import of_rows
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.protocol import View
+from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.language import split_phrases
@@ -200,27 +207,31 @@ class QueryScene:
         camera = camera_of(scene, self.camera) if scene.cameras else None
         engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
         unit = unit_of(self.scale or scene.metres_per_unit, scene.origin)
-        # one after the other: an answer has a number for every Gaussian and level
-        found = (self._ask(engine, text, camera) for text in self._askable(engine, camera))
-        view = None if camera is None else view_of(scene, camera)
-        answers, tables = [], []
-        for result, tree, of in found:
-            understood = None if tree is None else unparse(tree)
-            answer = _answer(result, engine, camera, view, self.mode) | {"reading": understood}
+        texts = self._askable(engine, camera)
+        pixels = None if camera is None else _Pixels(engine, view_of(scene, camera), self.mode)
+        asked: dict[str, tuple[dict[str, Any], list[str]]] = {}  # phrase -> answer, lines of its things
+        # One after the other: an answer has a number for every Gaussian and level.
+        for text in dict.fromkeys(texts):
+            result, tree, of = self._ask(engine, text, camera)
+            answer = _answer(result, camera) | {"reading": None if tree is None else unparse(tree)}
+            if pixels is not None:
+                pixels.add(result, answer)
             things = engine.instances(result, self.instances) if result.found else ()
             counts = result.found or (isinstance(tree, Counted) and result.verdict == "weak match")
             number = count_things(engine, result) if counts else Number(0, 0, 0)
             answer |= {"count": {"best": number.best, "least": number.least, "most": number.most}}
             because = {} if explain is None else {"evidence": explain(engine, result, of)}
             answer |= basis_fields(engine) | {"metres_per_unit": unit.metres, **listed(things)}
-            answers.append(answer | because)
-            tables.append(instance_lines(things, unit) + _reasons(**because))
+            answer |= because
+            asked[text] = answer, instance_lines(things, unit) + _reasons(**because)
+        if pixels is not None:
+            pixels.fill()
         if explain is not None:
             explain.write()
         if self.json:
-            print_json(in_world(answers, scene.origin))
+            print_json(in_world([asked[text][0] for text in texts], scene.origin))
             return
-        for answer, table in zip(answers, tables, strict=True):
+        for answer, table in map(asked.__getitem__, texts):
             print(*_lines(answer, unit), *table, sep="\n")
         print(f"answers: {engine.basis.long}")
 
@@ -232,6 +243,8 @@ class QueryScene:
         """
         phrases = [phrase for text in self.texts for phrase in split_phrases(text) or [text]]
         reasons: dict[str, list[str]] = {}  # why not -> these phrases
+        if len(phrases) > 1:
+            encode_phrases(engine, phrases)
         for phrase in dict.fromkeys(phrases):
             try:
                 if self.mode == "paper":
@@ -343,11 +356,9 @@ def _engine(scene: Scene, load: LoadEncoder, encoder: str, taught: Path | None) 
         raise EncoderError(f"{taught}: {error}") from None
 
 
-def _answer(
-    result: QueryResult, engine: QueryEngine, camera: Camera | None, view: View | None, mode: str
-) -> dict[str, Any]:
-    """One phrase's answer, ready for JSON. Pixel fields are None without cameras."""
-    answer: dict[str, Any] = {
+def _answer(result: QueryResult, camera: Camera | None) -> dict[str, Any]:
+    """One phrase's answer, ready for JSON; where there are cameras `_Pixels` fills its pixel fields."""
+    return {
         "phrase": result.phrase,
         "found": result.found,
         "verdict": result.verdict,
@@ -361,16 +372,40 @@ def _answer(
         "pixel_score": None,
         "view": None if camera is None else camera.name,
     }
-    if view is not None:
+
+
+class _Pixels:
+    """Pixels of answers in one view; relevancies of several phrases are blended together."""
+
+    def __init__(self, engine: QueryEngine, view: View, mode: str) -> None:
+        self._engine, self._view, self._paper = engine, view, mode == "paper"
+        size = max(view.count, view.camera.height * view.camera.width)
+        self._most = max(min(CHANNELS_AT_ONCE, 2**25 // size), 1)  # 128 MB of numbers, twice
+        self._waiting: list[tuple[dict[str, Any], Array]] = []
+
+    def add(self, result: QueryResult, answer: dict[str, Any]) -> None:
+        """Take an answer, whose pixel fields are filled sooner or later."""
         gate = PictureConfig().alpha_gate
-        if mode == "paper":
-            phrase = engine.text_vectors([result.phrase])
-            relevancy = decoded_relevancy(view, engine.field, result.level, phrase, gate)
-        else:
-            relevancy = splatted_relevancy(view, result.even[:, None], gate)
-        column, row, score = peak_pixel(np.asarray(relevancy[..., 0]), PAPER_FILTER)
+        if self._paper:
+            phrase = self._engine.text_vectors([result.phrase])
+            image = decoded_relevancy(self._view, self._engine.field, result.level, phrase, gate)
+            self._take(answer, image[..., 0])
+            return
+        self._waiting.append((answer, result.even))
+        if len(self._waiting) == self._most:
+            self.fill()
+
+    def fill(self) -> None:
+        """Fill the pixel fields of all that was added."""
+        if self._waiting:
+            answers, columns = zip(*self._waiting, strict=True)
+            images = splatted_relevancy(self._view, np.stack(columns, 1), PictureConfig().alpha_gate)
+            list(map(self._take, answers, np.moveaxis(images, -1, 0)))
+            self._waiting.clear()
+
+    def _take(self, answer: dict[str, Any], relevancy: Array) -> None:
+        column, row, score = peak_pixel(relevancy, PAPER_FILTER)
         answer |= {"pixel": [column, row], "pixel_score": score}
-    return answer
 
 
 def _lines(answer: dict[str, Any], unit: Unit) -> list[str]:

@@ -216,8 +216,8 @@ _GLSL = {
 
 def gated_mean(total: Array, alpha: Array, gate: float) -> Array:
     """Weighted sums (H, W, Q) / alpha where alpha exceeds `gate`, else 0: nothing there means nothing."""
-    open_ = alpha > gate
-    return np.where(open_[..., None], total / np.where(open_, alpha, 1)[..., None], 0)
+    mean: Array = total / np.where(alpha > gate, alpha, np.float32(np.inf))[..., None]
+    return mean
 
 
 def full_ranges(ranges: Ranges) -> Array:

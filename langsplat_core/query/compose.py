@@ -106,6 +106,18 @@ def check_phrase(
             raise
 
 
+def encode_phrases(engine: QueryEngine, texts: Sequence[str]) -> None:
+    """Encode many phrases together, as far as they can be; `check_phrase` says of the others why not."""
+    wanted: list[str] = []
+    for text in texts:
+        with suppress(InputError):
+            wanted += [
+                atom.text for atom in atoms(parse(text, engine.taught)) if not engine.is_taught(atom.text)
+            ]
+    with suppress(EncoderError, InputError):
+        engine.known_vectors(wanted)
+
+
 def _check_viewpoint(tree: Phrase, viewpoint: Camera | None) -> None:
     """Raise InputError for the first word in the tree that only a viewer can say, if there is none."""
     if viewpoint is None and isinstance(tree, Relation | Superlative):

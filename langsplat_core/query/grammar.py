@@ -294,7 +294,7 @@ def parse(text: str, names: Collection[str] = ()) -> Phrase:
     """
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"a query of {len(text)} characters; use at most {MAX_CHARACTERS}")
-    tokens = _with_names(tokens_of(text), names)
+    tokens = _with_names(list(tokens_of(text)), names)
     words = [token for token in tokens if token != ","]
     if words and _exclusion_at(tokens, 0):
         raise InputError(

@@ -19,7 +19,7 @@ from langsplat_core.scene import Camera, Gaussians
 # Of the dilation, for images 16 times as large as the photographs: with more of it, wrong cameras beside a
 # scene would spread every Gaussian over the whole image.
 MOST_GROWTH = 256.0
-LABELS_AT_ONCE = 32  # that a plain gather lifts
+CHANNELS_AT_ONCE = 32  # of an image: a tile of them stays in the first level cache
 
 
 class View(ABC):
@@ -82,8 +82,8 @@ class LiftingView(View):
         """
         self.check_labels(maps, count)
         columns = [sparse.csr_matrix((self.count, 0), dtype=np.float32)]
-        for start in range(0, count, LABELS_AT_ONCE):
-            size = min(LABELS_AT_ONCE, count - start)
+        for start in range(0, count, CHANNELS_AT_ONCE):
+            size = min(CHANNELS_AT_ONCE, count - start)
             image = np.zeros((self.camera.height * self.camera.width, size), np.float32)
             for labels in maps.reshape(len(maps), -1):
                 inside = np.flatnonzero((labels >= start) & (labels < start + size))

@@ -8,6 +8,7 @@ import re
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -33,7 +34,8 @@ def phrase_key(text: str) -> str:
     return " ".join(token for token in tokens(text) if token != ",").lower()
 
 
-def tokens(text: str) -> list[str]:
+@lru_cache(1024)  # a phrase is looked up a dozen times while it is answered
+def tokens(text: str) -> tuple[str, ...]:
     """Words without quotes and punctuation around them, and commas, none at the end."""
     text = "".join(" " if unicodedata.category(mark) in ("Cc", "Cs") else mark for mark in _composed(text))
     text = re.sub(r"(?<=\w)\s+'s\b", "'s", text)
@@ -44,7 +46,7 @@ def tokens(text: str) -> list[str]:
             found.append(word)
     while found and found[-1] == ",":
         found.pop()
-    return found
+    return tuple(found)
 
 
 def _composed(text: str) -> str:

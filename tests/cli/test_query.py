@@ -1,5 +1,6 @@
 """`langsplat query`, `select`, `describe`, `teach` and `scale`."""
 
+import itertools
 import json
 import os
 import subprocess
@@ -17,6 +18,7 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.io.sidecar import read_words
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster.protocol import CHANNELS_AT_ONCE
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import OPEN_MODEL
 from tests.support.fakes import (
@@ -133,6 +135,21 @@ def test_commas_separate_phrases_and_exclusions_stay_one(folder, capsys):
     found = answers(capsys, "query", "a.ply", "mug, plant; mug or book, not book")
     assert [answer["phrase"] for answer in found] == ["mug", "plant", "mug or book, not book"]
     assert found[2]["reading"] == "(mug  or  book)  without  book"
+
+
+def test_phrases_asked_together_answer_as_alone(folder, capsys):
+    """More than are blended together, and one of them twice."""
+    names, joints = ("mug", "book", "plant", "pair", "void"), (" or ", " and ", ", not ")
+    pieces = itertools.product(names, joints, ("book", "mug", "plant"))
+    some = ["mug", *("".join(piece) for piece in pieces), "book", "plant left of book", "mug"]
+    together = answers(capsys, "query", "a.ply", *some)
+    alone = {phrase: answers(capsys, "query", "a.ply", phrase)[0] for phrase in some}
+    assert len(together) == len(some) > CHANNELS_AT_ONCE
+    scores = [[answer.pop("pixel_score") for answer in found] for found in (together, alone.values())]
+    np.testing.assert_allclose(
+        scores[0], [scores[1][list(alone).index(phrase)] for phrase in some], atol=1e-6
+    )
+    assert together == [alone[phrase] for phrase in some]
 
 
 def test_query_lists_the_instances(folder, capsys):

@@ -47,7 +47,7 @@ from langsplat_core.raster.cpu.tiles import (
     walk,
     write_tile,
 )
-from langsplat_core.raster.protocol import LiftingView, mean_depth
+from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, LiftingView, mean_depth
 from langsplat_core.scene import Camera, Gaussians
 
 
@@ -248,7 +248,6 @@ def label_weights(
 
 # Views.
 
-_CHANNELS_AT_ONCE = 32  # a tile's state stays in the first level cache
 _SPARE_BLOCKS = 16  # a view takes five, its gradients seven
 _IDLE = 60  # requests after which a block that nobody asked for is given back
 
@@ -335,8 +334,8 @@ class CpuView(LiftingView):
         check_array("values", values, (len(self.order), "C"))
         size = self.camera.height, self.camera.width
         alpha, parts = np.empty((*size, 1), np.float32), []
-        for start in range(0, max(values.shape[1], 1), _CHANNELS_AT_ONCE):
-            part = plain(values[:, start : start + _CHANNELS_AT_ONCE])
+        for start in range(0, max(values.shape[1], 1), CHANNELS_AT_ONCE):
+            part = plain(values[:, start : start + CHANNELS_AT_ONCE])
             parts.append(np.empty((*size, part.shape[1]), np.float32))
             self._over_tiles(splat_tiles, part, parts[-1], alpha)
         return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha[..., 0]
@@ -351,13 +350,13 @@ class CpuView(LiftingView):
         check_array("image", image, (self.camera.height, self.camera.width, "C"))
         channels = image.shape[2]
         values = np.zeros((self.count, channels), np.float32)
-        for start in range(0, channels, _CHANNELS_AT_ONCE):
-            part = plain(image[..., start : start + _CHANNELS_AT_ONCE])
+        for start in range(0, channels, CHANNELS_AT_ONCE):
+            part = plain(image[..., start : start + CHANNELS_AT_ONCE])
             partial = np.empty((len(self.tiles.ranks), padded(part.shape[2])), np.float32)
             out = np.zeros((self.count, part.shape[2]), np.float32)
             self._over_tiles(gather_tiles, part, partial)
             self.workers.run(sum_partials, len(self.order), self.tiles, self.order, partial, out)
-            values[:, start : start + _CHANNELS_AT_ONCE] = out
+            values[:, start : start + CHANNELS_AT_ONCE] = out
         return values
 
     def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> sparse.csr_matrix:
