@@ -48,6 +48,7 @@ from langsplat_core.scene.transform import C0
 # ---- tables ----
 
 HEADER_LIMIT = 64 * 1024  # bytes; a real header of 62 properties takes about 1.5 KiB
+LINE_LIMIT = 1 << 20  # bytes, of a row of an ascii file: as many numbers as a header declares take a fifth
 NAME_LIMIT = 64  # characters; the longest of known programs has 17
 CHUNK_ROWS = 2048  # about 0.5 MB of a degree-3 scene: the columns are then picked out of the cache
 CLOUDCOMPARE = "scalar_"  # before names of properties in files of CloudCompare's
@@ -212,7 +213,7 @@ class PlyFile:
             if element is wanted:
                 return
             if not self._order:
-                lines = (line for line in self._file if line.strip())
+                lines = (line for line in self._lines() if line.strip())
                 if sum(1 for _ in islice(lines, element.count)) < element.count:
                     raise malformed(self.path, f"truncated: it ends in element {element.name}")
             elif element.lists:
@@ -247,6 +248,13 @@ class PlyFile:
             left -= 1 + same
             self._file.seek(start + size * (1 + same))
 
+    def _lines(self) -> Iterator[bytes]:
+        """Yield the lines that follow, none of which is the rest of a file without ends of lines."""
+        while line := self._file.readline(LINE_LIMIT):
+            if len(line) == LINE_LIMIT:
+                raise malformed(self.path, f"has a line of {LINE_LIMIT} bytes or more")
+            yield line
+
     def _exactly(self, size: int) -> bytes:
         data = self._file.read(size)
         if len(data) < size:
@@ -267,7 +275,7 @@ class PlyFile:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # "input contained no data": reported below
-                rows = np.loadtxt(self._file, comments=None, max_rows=count, ndmin=2, encoding="latin-1")
+                rows = np.loadtxt(self._lines(), comments=None, max_rows=count, ndmin=2, encoding="latin-1")
         except ValueError as error:  # NumPy tells its own options too
             what = f"unreadable row near {start} of {element.name}: {printable_line(error, 80)}"
             raise malformed(self.path, what) from None
