@@ -7,11 +7,11 @@ sees: those come from the encoder.
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from PIL import Image
@@ -19,7 +19,15 @@ from scipy.ndimage import binary_fill_holes, find_objects
 from scipy.ndimage import label as connected
 
 from assets.making.render import Light, RenderedView, Renderer
-from assets.making.world import Tier, World, build_room, object_words
+from assets.making.world import (
+    CATEGORIES,
+    RegionLabel,
+    Tier,
+    World,
+    build_room,
+    object_words,
+    part_words,
+)
 from langsplat_core.arrays import Array
 from langsplat_core.config import (
     ClipConfig,
@@ -31,10 +39,13 @@ from langsplat_core.config import (
 )
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.ply import write_table
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import LEVELS, Camera, look_at
+from langsplat_core.query.grammar import is_part
+from langsplat_core.raster.render import view_of
+from langsplat_core.scene import LEVELS, Camera, Scene, look_at
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 
 LabelLayout = Literal["plain", "lerf-ovs", "3d-ovs"]  # how a rendered room's truth is written
@@ -469,8 +480,36 @@ CONFIG = TrainConfig(
 )
 
 
+NAMED = 0.6  # share of a node's blending weight that one region of the truth has, or the node has no name
+
+
+def write_names(scene: Scene, truth: Iterable[Array], labels: Sequence[RegionLabel], path: Path) -> None:
+    """Write what the wholes and parts of a scene's tree are called, and all words for anything there.
+
+    truth: (3, H, W) ids of every camera, as of `truth_ids`; labels: by id.
+    """
+    assert scene.language is not None
+    assert scene.language.tree is not None
+    tree, names = scene.language.tree, {}
+    votes: Any = 0  # (N, ids) sparse
+    for camera, ids in zip(scene.cameras, truth, strict=True):
+        votes = votes + view_of(scene, camera).gather_labels(ids.astype(np.int32), len(labels))
+    levels = np.array([label.level for label in labels])
+    for node in np.flatnonzero(tree.levels > 0).tolist():
+        weights = np.where(levels == tree.levels[node], votes[tree.members(node)].sum(0).A1, 0)
+        label = labels[int(weights.argmax())]
+        named = label.level == 2 or (is_part(label.word) and label.word not in (label.thing, "body"))
+        if label.word and named and weights.max() > NAMED * weights.sum():
+            names[node] = (object_words if label.level == 2 else part_words)(label.word)
+    words = (
+        {*object_words(label.thing), *CATEGORIES.get(label.thing, ()), *part_words(label.word)}
+        for label in labels
+    )
+    write_json(path, {"names": names, "called": sorted(set().union(*words) - {""})})
+
+
 def build_scene(out: Path, gaussians: Path | None = None, progress: Progress = silent) -> str:
-    """Render the room, train a scene, and drop what its photographs do not miss.
+    """Render the room, train a scene, drop what its photographs do not miss, and write what is in it.
 
     Given `gaussians`, a scene of that room, only its language field is made anew. Returns a line about what
     was made. Photographs and truth stay in `<out>.work/photographs`, the scene as trained in
@@ -492,8 +531,12 @@ def build_scene(out: Path, gaussians: Path | None = None, progress: Progress = s
         masks_of=lambda capture: TruthMasks(capture, read_truth(photographs)),
         gaussians_from=gaussians,
     )
+    if not gaussians:
+        report = compact_scene(trained, out, BudgetConfig(max_psnr_loss=MAX_LOSS), photographs, progress)
+    scene, truth = load_scene(out), read_truth(photographs)
+    labels = photographed_room(SEED).labels
+    write_names(scene, (truth.labels(one.name) for one in scene.cameras), labels, out.with_name("names.json"))
     if gaussians:
         return f"{made.gaussians} Gaussians of {gaussians}, {made.codec} of {made.codec_size}"
-    report = compact_scene(trained, out, BudgetConfig(max_psnr_loss=MAX_LOSS), photographs, progress)
     kept, before = report.after, report.before.gaussians
     return f"{kept.gaussians} Gaussians of {before} trained, held-out {kept.psnr:.2f} dB"

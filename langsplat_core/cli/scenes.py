@@ -2,11 +2,12 @@
 
 import ctypes.util
 import importlib.metadata
+import logging
 import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -14,12 +15,20 @@ from types import MappingProxyType
 from langsplat_core import __version__
 from langsplat_core.cli.arguments import AnyScene, OutFolder
 from langsplat_core.cli.run import print_json
-from langsplat_core.errors import EXTRAS, BackendError, LangSplatError, printable_line, remedy
+from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, printable_line, remedy
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.summary import SceneSummary, disk_bytes, summarise
+from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.semantics.encoders import OPEN_MODEL, load_text_encoder
+from langsplat_core.semantics.encoders import (
+    DEMO,
+    OPEN_MODEL,
+    keep_calibration,
+    load_encoder,
+    load_text_encoder,
+)
 
+log = logging.getLogger("langsplat")
 OPTIONAL = ("torch", "transformers", "pycolmap", "matplotlib", "gsplat")
 # Debian's packages
 LIBRARIES = {"EGL": "libegl1", "GL": "libgl1", "X11": "libx11-6", "usb-1.0": "libusb-1.0-0"}
@@ -44,8 +53,7 @@ class Inspect:
         lines = [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(summary)]
         if scene.language is not None:
             lines.append(("answers", QueryEngine(scene).basis.long))
-        for name, value in [*lines, *(("not read", reason) for reason in scene.unread)]:
-            print(f"{name:<16}  {printable_line(value)}")
+        _print_rows([*lines, *(("not read", reason) for reason in scene.unread)])
 
 
 def _lines(a: SceneSummary) -> list[tuple[str, str]]:
@@ -83,21 +91,65 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Print what this machine has, for a report of trouble."""
+    """Print what this machine has, for a report of trouble, or with --encoder what an encoder is worth.
+
+    The encoder is tried on the bundled room, in about a minute: its geometry beside real CLIP's, and how much
+    of what is there is found. With --json this is what to send back about weights of your own.
+    """
+
+    encoder: str = ""
+    """Try this encoder: demo, a hub id, a folder or a file of weights."""
+    calibrate: bool = False
+    """Keep the calibration that the room gives, for all scenes of this encoder that have none."""
+    json: bool = False
+    """Print JSON."""
 
     def run(self) -> None:
-        print(f"langsplat        {__version__}")
-        print(
-            f"python           {platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"
-        )
-        for package in ("numpy", "numba", "moderngl", "imgui-bundle", *OPTIONAL):
-            print(f"{package:<16} {_version(package)}")
-        for library, package in LIBRARIES.items():
-            found = ctypes.util.find_library(library)
-            print(f"lib{library:<13} {found or f'missing: apt install {package}'}")
-        print(f"DISPLAY          {os.environ.get('DISPLAY') or 'not set: use --headless'}")
-        print(f"OpenGL           {_opengl()}")
-        print(f"text encoder     {_encoder()}")
+        if not self.encoder:
+            if self.calibrate:
+                raise InputError("--calibrate: name the encoder, --encoder ID")
+            machine = _machine()
+            print_json(machine) if self.json else _print_rows(machine.items())
+            return
+        if self.calibrate and self.encoder == DEMO:
+            raise InputError("--calibrate: the demo encoder has its own, and holds in drawn rooms alone")
+        from langsplat_core.pipeline.encoder_check import check_encoder, report_lines
+
+        with TerminalProgress() as progress:
+            encoder = load_encoder(self.encoder, option="--encoder")
+            report = check_encoder(encoder, progress)
+        if self.json:
+            print_json({"machine": _machine(), **asdict(report)})
+        else:
+            print(report_lines(report), end="")
+        if self.calibrate:
+            if report.calibration is None:
+                raise InputError(f"--calibrate: nothing to keep; {report.reason}")
+            kept = keep_calibration(encoder, report.calibration)
+            log.info("kept in %s; without that file verdicts are by chance again", kept)
+
+
+def _print_rows(rows: Iterable[tuple[str, str]]) -> None:
+    for name, value in rows:
+        print(f"{name:<16}  {printable_line(value)}")
+
+
+def _machine() -> dict[str, str]:
+    """Return what this machine has."""
+    cores = f"{os.cpu_count()} cores"
+    machine = {
+        "langsplat": __version__,
+        "python": f"{platform.python_version()} on {platform.platform()}, {cores}",
+    }
+    machine |= {name: _version(name) for name in ("numpy", "numba", "moderngl", "imgui-bundle", *OPTIONAL)}
+    for library, package in LIBRARIES.items():
+        found = ctypes.util.find_library(library)
+        machine[f"lib{library}"] = found or f"missing: apt install {package}"
+    return machine | {
+        "DISPLAY": os.environ.get("DISPLAY") or "not set: use --headless",
+        "OpenGL": _opengl(),
+        "text encoder": _encoder(),
+    }
 
 
 def _opengl() -> str:

@@ -43,11 +43,10 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
 from langsplat_core.scene.surface import Surface, build_surface, build_tree, surface_weights
-from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
+from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, kept_calibration, same_vectors
 from langsplat_core.semantics.relevancy import FEWEST, Scale, TextEncoder, everyday_vectors, relevancy_of
 
 BATCH = 256  # phrases that are encoded at a time
-SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
 NO_FIELD = "this scene has no language field: it can be looked at, not searched; `langsplat train` makes one"
 
 LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
@@ -182,8 +181,13 @@ class QueryEngine:
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration of probabilities, by regions alone."""
-        return self.field.calibration if self.rule == "regions" else None
+        """The calibration of probabilities, by regions alone: the scene's own, else the user's."""
+        return self.field.calibration or self._kept if self.rule == "regions" else None
+
+    @cached_property
+    def _kept(self) -> Calibration | None:
+        """The user's own calibration for the scene's encoder; the demo encoder elsewhere stays a guess."""
+        return None if self.field.encoder_id == DEMO else kept_calibration(self.field.canonical)
 
     @cached_property
     def compared(self) -> LanguageField:
@@ -246,12 +250,15 @@ class QueryEngine:
         elif everyday is None:
             short = f"{name}, as published: no everyday phrases to compare with"
             long = f"{short}. Found is a relevancy of {field.found:g} or more, without percentages"
-        elif field.calibration is None:
+        elif field.calibration is None and self._kept is None:
             short = f"{name}, no calibration here: found is more than by chance"
             long = (
                 f"{short}. Of phrases that name nothing in the scene, 19 in 20 are not found. Percentages "
                 "need a calibration in such scenes"
             )
+        elif field.calibration is None:
+            short, calibration = f"{name}, calibrated by `langsplat doctor`", "the bundled room"
+            long = f"{short}, from drawn rooms: percentages hold there, and may be off in this scene"
         else:
             short, calibration = f"{name}, calibrated in drawn rooms", "drawn rooms"
             long = f"{short}. Percentages hold in such rooms, and this scene is one"
@@ -426,13 +433,6 @@ def check_words(field: LanguageField, words: Words) -> None:
             f"these words were taught with {words.encoder_id}, the scene was made with {field.encoder_id}; "
             "teach them in a scene of that encoder"
         )
-
-
-def same_vectors(canonical: Array, own: Array) -> bool:
-    """Return whether two sets of canonical vectors are of the same encoder."""
-    if canonical.shape != own.shape:
-        return False
-    return bool(((canonical.astype(np.float64) * own).sum(1) >= SAME_ENCODER).all())
 
 
 def _enough(everyday: Array | None) -> Array | None:

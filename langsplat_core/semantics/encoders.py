@@ -4,12 +4,14 @@ CLIP is that of Radford et al. 2021, with OpenCLIP and the bundled demo encoder.
 each a few lines; checks of phrases and images, batches and unit vectors are the same for all.
 """
 
+import hashlib
 import html
 import json
+import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
@@ -17,12 +19,14 @@ from types import MappingProxyType
 from typing import Annotated, Any, Protocol
 
 import numpy as np
+import platformdirs
 from msgspec import Meta, Struct
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, FormatError, InputError, UnknownWordError, optional_imports
+from langsplat_core.io.files import write_json
 from langsplat_core.io.hostile import decode_json
-from langsplat_core.scene import Calibration, LanguageField
+from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField
 from langsplat_core.semantics.clip_plain import TEMPERATURE, TOKENIZER, check_whole, plain_text_tower
 from langsplat_core.semantics.weights import (
     OPEN_CLIP_CONFIG,
@@ -38,6 +42,8 @@ from langsplat_core.semantics.weights import (
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 WORD = re.compile(r"[^\W_]+(?:'[^\W_]+)?")
 TEXT_BATCH = 64  # phrases per forward pass
+
+log = logging.getLogger("langsplat")
 
 
 class TextTower(Protocol):
@@ -76,6 +82,52 @@ class _Beside(Struct, forbid_unknown_fields=True):
 
     found: Annotated[float, Meta(ge=0, le=1)] = LanguageField.found
     calibration: Calibration | None = None
+
+
+# Calibrations that a user made for an encoder (`langsplat doctor --encoder ID --calibrate`).
+
+SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
+
+
+class _Kept(Struct):
+    """A file of the user's configuration: a calibration from the bundled room, and whose it is."""
+
+    encoder: str
+    canonical: list[list[float]]  # which tell an encoder, whatever its folder is called
+    calibration: Calibration
+
+
+def _kept_folder() -> Path:
+    return Path(platformdirs.user_config_path("langsplat-viewer", appauthor=False)) / "calibrations"
+
+
+def keep_calibration(encoder: "PhraseEncoder", calibration: Calibration) -> Path:
+    """Keep a calibration for scenes of this encoder that have none, and return its file."""
+    canonical = encoder.encode_texts(list(CANONICAL_PHRASES))
+    digest = hashlib.sha256(canonical.round(3).tobytes()).hexdigest()[:12]
+    path = _kept_folder() / f"{digest}.json"
+    content = {"encoder": encoder.id, "canonical": canonical.astype(float).round(6).tolist()}
+    write_json(path, content | {"calibration": asdict(calibration)})
+    return path
+
+
+def kept_calibration(canonical: Array) -> Calibration | None:
+    """Return what was kept for the encoder of (C, D) canonical vectors; a damaged file is warned of."""
+    for path in sorted(_kept_folder().glob("*.json")):
+        try:
+            kept = decode_json(path.read_bytes(), _Kept, path)
+            if same_vectors(np.array(kept.canonical), canonical):
+                return kept.calibration
+        except (FormatError, OSError, ValueError) as error:
+            log.warning("%s; not used: delete it, or run `langsplat doctor` with --calibrate", error)
+    return None
+
+
+def same_vectors(canonical: Array, own: Array) -> bool:
+    """Return whether two sets of canonical vectors are of the same encoder."""
+    if canonical.shape != own.shape:
+        return False
+    return bool(((canonical.astype(np.float64) * own).sum(1) >= SAME_ENCODER).all())
 
 
 class PhraseEncoder:
@@ -372,9 +424,9 @@ def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
 
 
 @optional_imports(EncoderError)
-def load_encoder(model: str, device: str = "auto", batch: int = 32) -> Encoder:
+def load_encoder(model: str, device: str = "auto", batch: int = 32, option: str = "--clip.model") -> Encoder:
     """Load both halves of `model`, as `load_text_encoder` does; batch: images per forward pass."""
-    weights = open_weights(model, model_path(model, "--clip.model"), device)
+    weights = open_weights(model, model_path(model, option), device)
     family = family_of(weights, FAMILIES, "encoders")
     return Encoder(weights, family.text(weights), family.images(weights), batch)
 

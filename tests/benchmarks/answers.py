@@ -17,7 +17,6 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
 from assets.making.dataset import PHRASE_KINDS, Region
 from assets.making.objects import EVERYTHING
@@ -35,13 +34,13 @@ from langsplat_core.config import (
 )
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.report import markdown
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import write_json
+from langsplat_core.pipeline.encoder_check import fit_scaling
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import PARTS, forms, is_part
-from langsplat_core.query.rule import RULE
-from langsplat_core.scene import Calibration, Fits, PlattScaling
+from langsplat_core.scene import Calibration, Fits
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from tests.benchmarks.room import HOLD_OUT, InRooms, MaskOrigin, Room, Seeds, Variant, publish
 from tests.benchmarks.scoring import (
@@ -318,7 +317,6 @@ def _cell(shares: Array) -> str:
 # the fits of each (Platt 1999, with Platt's smoothed targets); it is fair only to rooms that it was not
 # fitted to.
 
-REJECTED = 0.95  # of what is absent, in the rooms that a calibration is fitted to
 BINS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # of probability
 SHARES = (0.9, 0.95, 0.98)  # of absent things rejected, at which acceptance is reported
 PAIRS = {  # what is looked for -> the kinds of phrases that are there and that are not
@@ -420,47 +418,20 @@ def _uncalled(words: Iterable[str], called: AbstractSet[str]) -> list[str]:
 
 
 def fit_calibration(rows: Sequence[Verdict]) -> Calibration:
-    """Platt scaling of all kinds of phrases. Raises as `fit_odds` does."""
+    """Platt scaling of all kinds of phrases. Raises as `fit_scaling` does."""
     return Calibration(
-        **{name: fit_odds(fits_of(rows, there), fits_of(rows, not_)) for name, (there, not_) in PAIRS.items()}
+        **{
+            name: fit_scaling(fits_of(rows, there), fits_of(rows, not_))
+            for name, (there, not_) in PAIRS.items()
+        }
     )
-
-
-def fit_odds(present: Array, absent: Array) -> PlattScaling:
-    """Fit to (P, 3) fits of things that are there and (A, 3) of things that are not, which weigh the same.
-
-    Raises InputError where there are fewer than ten of either, or the fits do not tell them apart.
-    """
-    if min(len(present), len(absent)) < 10:
-        raise InputError(
-            "a calibration needs ten things that are there and ten that are not; take more rooms"
-        )
-    fits = np.concatenate([present, absent])
-    features = np.stack([fits[:, 2], fits[:, :2].max(axis=1)], axis=1)
-    targets = np.repeat(
-        [(len(present) + 1) / (len(present) + 2), 1 / (len(absent) + 2)], [len(present), len(absent)]
-    )
-    weights = np.repeat([1 / len(present), 1 / len(absent)], [len(present), len(absent)])
-
-    def loss(parameters: Array) -> float:
-        logits = parameters[0] + features @ parameters[1:]
-        return float((weights * (np.logaddexp(0, logits) - targets * logits)).sum())
-
-    constant, whole, finer = minimize(loss, np.array([0.0, 10.0, 0.0]), method="BFGS").x.round(3)
-    if whole + finer <= 0:
-        raise InputError("what is there has no larger fits than what is not: nothing to calibrate")
-    plain = PlattScaling(float(constant), float(whole), float(finer))
-    said = [plain.probability((m[0], m[1], m[2])) for m in absent.tolist()]
-    highest = float(np.quantile(said, REJECTED, method="higher"))
-    return replace(plain, found=float(np.ceil(1000 * max(highest, RULE.weak_probability)) / 1000))
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
     """Write a calibration into a `reading.json`, whose other fields stay."""
     stated = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     stated["calibration"] = asdict(calibration)
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(stated, indent=1) + "\n", encoding="utf-8")
+    write_json(path, stated)
 
 
 def fits_of(rows: Sequence[Verdict], kind: str) -> Array:

@@ -18,6 +18,7 @@ from langsplat_core.config import DatasetConfig, numeric_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import save_scene
+from langsplat_core.pipeline.encoder_check import REJECTED, fit_scaling
 from langsplat_core.progress import silent
 from langsplat_core.query.inventory import InventoryEntry, Spot
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -28,13 +29,11 @@ from tests.benchmarks import answers, scoring
 from tests.benchmarks.__main__ import PROGRAM, parse
 from tests.benchmarks.answers import (
     PAIRS,
-    REJECTED,
     Lifting,
     Rooms,
     Verdict,
     curve,
     curve_table,
-    fit_odds,
     measure_methods,
     measure_verdicts,
     method_table,
@@ -180,9 +179,9 @@ def logistic(count: int, seed: int = 0) -> tuple[Array, Array]:
     return margins[there], margins[~there]
 
 
-def test_fit_recovers_the_odds_that_made_the_data():
+def test_fit_recovers_the_scaling_that_made_the_data():
     present, absent = logistic(20_000)
-    fitted = fit_odds(present, absent)
+    fitted = fit_scaling(present, absent)
     assert fitted.whole == pytest.approx(TRUE.whole, rel=0.06)
     assert fitted.finer == pytest.approx(TRUE.finer, rel=0.12)
     # Both weigh the same in the fit: the constant moves by the logarithm of how many there are of each.
@@ -192,13 +191,13 @@ def test_fit_recovers_the_odds_that_made_the_data():
 
 def test_fitted_threshold_rejects_the_required_share():
     present, absent = logistic(3_000)
-    fitted = fit_odds(present, absent)
+    fitted = fit_scaling(present, absent)
     said = np.array([fitted.probability(tuple(row)) for row in absent.tolist()])
     assert REJECTED <= (said < fitted.found).mean() < REJECTED + 0.01
-    often = fit_odds(present, np.tile(absent, (9, 1)))  # how many there are of each changes nothing
+    often = fit_scaling(present, np.tile(absent, (9, 1)))  # how many there are of each changes nothing
     for name in ("constant", "whole", "finer", "found"):
         assert getattr(often, name) == pytest.approx(getattr(fitted, name), rel=0.02, abs=0.02)
-    apart = fit_odds(np.full((20, 3), 0.5), np.full((20, 3), -0.5))
+    apart = fit_scaling(np.full((20, 3), 0.5), np.full((20, 3), -0.5))
     assert apart.found == 0.5  # never less than even
     assert np.isfinite([apart.constant, apart.whole, apart.finer]).all()  # Platt's targets keep it so
 
@@ -207,7 +206,7 @@ def test_fit_refuses_too_little_and_reversed_evidence():
     present, absent = logistic(500)
     for there, lacking in ((present[:9], absent), (present, absent[:9]), (absent, present)):
         with pytest.raises(InputError):
-            fit_odds(there, lacking)
+            fit_scaling(there, lacking)
 
 
 def row(kind: str, probability: float | None, *, found: bool | None = None, seed: int = 1, tier="clutter"):

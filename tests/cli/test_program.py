@@ -2,6 +2,7 @@
 whatever happens to a command, it ends with one line."""
 
 import dataclasses
+import json
 import logging
 import os
 import signal
@@ -19,10 +20,12 @@ from langsplat_core.cli import scenes
 from langsplat_core.cli.app import command_names, entry, load_command, parse
 from langsplat_core.cli.scenes import Doctor
 from langsplat_core.errors import InputError
+from langsplat_core.pipeline import encoder_check
 from langsplat_viewer.program import ViewerCommand
 from langsplat_viewer.program import entry as viewer_entry
 from langsplat_viewer.program import parse as viewer_parse
 from tests.support.processes import refusal, run
+from tests.support.tiny_models import tiny_clip
 
 EVERY = {
     "viewer": ViewerCommand,
@@ -105,6 +108,30 @@ def test_doctor_names_opengl_and_encoder(capsys):
     assert said["langsplat"] == __version__
     assert said["OpenGL"]
     assert "demo: works" in said["text"]
+
+
+@pytest.mark.long
+def test_doctor_tries_an_encoder_on_the_bundled_room(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(encoder_check, "VIEWS", 3)
+    monkeypatch.setattr(encoder_check, "MOST", 20)
+    assert run("doctor", "--encoder", "demo", "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["machine"]["langsplat"] == __version__
+    geometry = said["geometry"]
+    assert set(geometry) == set(encoder_check.GEOMETRY)
+    assert geometry["own"][0] > geometry["other"][0] + 0.1
+    things = said["rates"][0]
+    assert things["found"] + things["rejected"] > 1.3
+    assert said["calibration"]["thing"]["whole"] > 0
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    tiny_clip(tmp_path / "tiny")  # of random weights, which tell nothing apart
+    monkeypatch.setattr(encoder_check, "MOST", 9)
+    assert run("doctor", "--encoder", tmp_path / "tiny", "--calibrate") == 2
+    printed = capsys.readouterr()
+    assert encoder_check.GEOMETRY["alike"][0] in printed.out
+    assert "ten phrases" in printed.err
+    assert "demo" in refusal(capsys, "doctor", "--encoder", "demo", "--calibrate")
+    assert not (tmp_path / "config").exists()
 
 
 @pytest.mark.long

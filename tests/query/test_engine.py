@@ -38,7 +38,7 @@ from langsplat_core.scene import (
     Scene,
 )
 from langsplat_core.semantics import relevancy as relevancies
-from langsplat_core.semantics.encoders import DEMO, OPEN_MODEL
+from langsplat_core.semantics.encoders import DEMO, OPEN_MODEL, keep_calibration
 from langsplat_core.semantics.relevancy import FEWEST, Scale, latent_relevancy, relevancy, relevancy_of
 from tests.support.fakes import DIM, PER_BLOB, WORDS, FakeEncoder, axis, blob_scene, named_scene
 from tests.support.file_samples import random_field
@@ -263,6 +263,26 @@ def test_basis_names_a_calibration_where_there_is_one(encoder, calibration, ever
     assert before.encoder == encoder
     assert before.guesses == (encoder == DEMO and calibration is None)
     assert (OPEN_MODEL in before.long) == before.guesses
+
+
+def test_own_calibration_is_used_and_named_as_from_drawn_rooms(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    by_chance = QueryEngine(scene_of("lab/clip")).run("mug")
+    encoder = Speaker()
+    encoder.id = "lab/clip"
+    path = keep_calibration(encoder, CALIBRATED)
+    assert path.is_relative_to(tmp_path)
+    for encoder, calibrated in (("elsewhere/clip", True), (DEMO, False)):  # by its vectors, not by its name
+        engine = QueryEngine(scene_of(encoder))
+        assert (engine.run("mug").probability is not None) == calibrated
+        assert ("drawn rooms" in engine.basis.long and engine.basis.calibration is not None) == calibrated
+    assert QueryEngine(scene_of("lab/clip", everyday=False)).run("mug").probability is None
+    field = scene_of("lab/clip").language
+    other = replace(field, canonical=axis(2)[None])  # another encoder
+    assert QueryEngine(replace(scene_of("lab/clip"), language=other)).calibration is None
+    path.write_text("{}", encoding="utf-8")
+    assert QueryEngine(scene_of("lab/clip")).run("mug").judgement == by_chance.judgement
+    assert str(path) in caplog.text
 
 
 class Speaker(FakeEncoder):

@@ -19,7 +19,7 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.describe import Describer, likely_name
-from langsplat_core.query.engine import QueryEngine, same_vectors
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.inventory import NAMES
 from langsplat_core.raster.protocol import LiftingRasterizer
@@ -27,6 +27,7 @@ from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.surface import surface_areas
 from langsplat_core.scene.transform import moving, similarity
+from langsplat_core.semantics.encoders import same_vectors
 
 Kind = Literal["gone", "appeared", "moved", "recoloured"]
 KINDS: tuple[Kind, ...] = ("gone", "appeared", "moved", "recoloured")

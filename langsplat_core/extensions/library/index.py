@@ -41,7 +41,7 @@ from langsplat_core.io.sidecar import SUFFIX, read_stored
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
-from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors
+from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.query.grammar import heads, named, parse
 from langsplat_core.query.rule import (
     Bars,
@@ -60,6 +60,7 @@ from langsplat_core.scene import LEVELS, NO_ORIGIN, Calibration, Camera, Languag
 from langsplat_core.scene.codec import LinearCodec
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.language import phrase_key
+from langsplat_core.semantics.encoders import same_vectors
 from langsplat_core.semantics.relevancy import fit_of
 
 log = logging.getLogger("langsplat")
@@ -234,7 +235,7 @@ def digest(path: Path, name: str, load_encoder: LoadEncoder | None) -> Digest:
         mixtures=len(columns.shares),
         regions=(subparts, parts, wholes),
         bars=bars,
-        calibration=engine.calibration,
+        calibration=engine.field.calibration,
     )
     return replace(made, listed=listed, columns=columns)
 
