@@ -101,7 +101,7 @@ class _Names(Struct):
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class NamedRoom:
     """The bundled room, and what is known of it."""
 
     scene: Scene
@@ -119,7 +119,7 @@ class Room:
         return {node: names for node, names in self.names.items() if self.tree.levels[node] == level}
 
 
-def bundled_room() -> Room:
+def bundled_room() -> NamedRoom:
     """Read the bundled room."""
     folder = Path(str(files("langsplat_assets") / "demo"))
     stated = decode_json((folder / "names.json").read_bytes(), _Names, folder / "names.json")
@@ -131,7 +131,7 @@ def bundled_room() -> Room:
     owners = np.arange(tree.count)
     while (rising := tree.parents[owners] >= 0).any():
         owners[rising] = tree.parents[owners[rising]]
-    return Room(scene, tree, owners, stated.names, frozenset(words))
+    return NamedRoom(scene, tree, owners, stated.names, frozenset(words))
 
 
 def check_encoder(encoder: Encoder, progress: Progress = silent) -> EncoderReport:
@@ -178,7 +178,7 @@ def check_encoder(encoder: Encoder, progress: Progress = silent) -> EncoderRepor
     )
 
 
-def room_images(room: Room, side: int, progress: Progress = silent) -> tuple[Array, Array]:
+def room_images(room: NamedRoom, side: int, progress: Progress = silent) -> tuple[Array, Array]:
     """Return (M,) nodes, and (M, side, side, 3) uint8 images of them as they are cut out of renderings."""
     scene, tree = room.scene, room.tree
     at = [tree.at(level) for level in range(3)]
@@ -205,7 +205,7 @@ def room_images(room: Room, side: int, progress: Progress = silent) -> tuple[Arr
     return np.array(nodes), np.stack(images)
 
 
-def _engine(room: Room, encoder: Encoder, nodes: Array, images: Array) -> QueryEngine:
+def _engine(room: NamedRoom, encoder: Encoder, nodes: Array, images: Array) -> QueryEngine:
     """Return the room with the mean vector of each region's images; a subpart has that of its part."""
     kinds, row = np.unique(nodes, return_inverse=True)
     vectors = unit(np.stack([np.bincount(row, column) for column in images.T], 1)).astype(np.float32)
@@ -221,7 +221,12 @@ def _engine(room: Room, encoder: Encoder, nodes: Array, images: Array) -> QueryE
 
 
 def _geometry(
-    room: Room, engine: QueryEngine, nodes: Array, images: Array, there: Sequence[str], absent: Sequence[str]
+    room: NamedRoom,
+    engine: QueryEngine,
+    nodes: Array,
+    images: Array,
+    there: Sequence[str],
+    absent: Sequence[str],
 ) -> dict[str, tuple[float, ...]]:
     """Return the figures of `GEOMETRY`."""
     words = engine.text_vectors([*there, *absent])
@@ -256,7 +261,7 @@ def _geometry(
 
 
 def _phrases(
-    room: Room, engine: QueryEngine, there: Sequence[str], absent: Sequence[str]
+    room: NamedRoom, engine: QueryEngine, there: Sequence[str], absent: Sequence[str]
 ) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
     """Return phrases for what is there and for what is not, by the keys of `ASKED`."""
 
