@@ -60,12 +60,11 @@ from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.training.language.codec_fit import CodecReport
 from langsplat_core.training.radiance.trainer import budgets_for
+from tests.benchmarks.clip_spaces import TruthEncoder, read_truth_encoder
 from tests.benchmarks.oracles import (
-    ClipGeometry,
     moved_to_images,
     oracle_vectors,
     phrase_vectors,
-    read_geometry,
     true_labels,
     with_wrong_vectors,
 )
@@ -98,8 +97,10 @@ class RoomSettings:
     steps: Count = 1_500  # of radiance training
     max_gaussians: Count = 50_000  # of a room
     encoder: str = "demo"
-    """"demo" for the bundled one, a folder, a hub id, or clip-geometry:OWN[,ALIKE]: vectors made from truth
-    with the geometry of CLIP, OWN being the cosine of an image with its words (0.22 to 0.32)."""
+    """"demo" for the bundled one, a folder, a hub id; clip-geometry:OWN[,ALIKE], vectors made from truth with
+    the geometry of CLIP, OWN being the cosine of an image with its words (0.25, 0.27, 0.29); or
+    real:PATH[,RULE], real text vectors, and image vectors from what LangSplat's decoder PATH (.pth, or a
+    folder of some) makes of its sphere, by one rule or several (`tests/benchmarks/clip_spaces.py`)."""
     text_vectors: Path | None = None  # .npy of real text vectors for clip-geometry, names in a .txt beside it
 
 
@@ -147,9 +148,9 @@ class InRooms:
                 f"--seeds {SEED} is the bundled scene's room, on which things were tuned; take another seed"
             )
         model = self.settings.encoder
-        geometry = read_geometry(model, self.settings.text_vectors)
-        encoder: tuple[Encoder | ClipGeometry, str] = (
-            (load_encoder(model), weights_digest(model)) if geometry is None else (geometry, geometry.digest)
+        told = read_truth_encoder(model, self.settings.text_vectors)
+        encoder: tuple[Encoder | TruthEncoder, str] = (
+            (load_encoder(model), weights_digest(model)) if told is None else (told, told.digest)
         )
         for tier, seed in product(self.tiers, self.seeds):
             own = labelled(progress, f"{tier} {seed}, ")
@@ -170,12 +171,12 @@ class Room:
         tier: Tier,
         seed: int,
         work: Path,
-        encoder: tuple[Encoder | ClipGeometry, str],
+        encoder: tuple[Encoder | TruthEncoder, str],
         progress: Progress,
     ) -> None:
         width, height = config.size
         self.config, self.tier, self.seed, self.progress = config, tier, seed, progress
-        self.encoder, self.weights = encoder
+        self._encoder, self.weights = encoder
         self.folder = work / f"{tier}-{seed}-{config.views}x{width}x{height}"
         self.settings = TrainConfig(
             dataset=DatasetConfig(max_side=max(config.size), test_every=HOLD_OUT, hold_out="every"),
@@ -206,6 +207,12 @@ class Room:
         return read_truth(self.photographs)
 
     @cached_property
+    def encoder(self) -> Encoder | TruthEncoder:
+        """The encoder; one that looks at the truth as it is in this room."""
+        known = self._encoder
+        return known.in_room(self.truth, self.seed) if isinstance(known, TruthEncoder) else known
+
+    @cached_property
     def gaussians(self) -> Gaussians:
         """Gaussians that were trained without the held-out views."""
         train, _ = self.capture.split(HOLD_OUT)
@@ -232,7 +239,7 @@ class Room:
         with self._timed(f"masks ({variant.masks}) and vectors"):
             features = self._features("truth" if variant.masks == "wrong" else variant.masks, train, cameras)
         ids = [self.truth.labels(camera.name) for camera in cameras]
-        if isinstance(self.encoder, ClipGeometry):
+        if isinstance(self.encoder, TruthEncoder):
             seen = enumerate(zip(features, ids, strict=True))
             features = [self.encoder.describe(item, true, self.truth, row) for row, (item, true) in seen]
         if variant.masks == "wrong":
