@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import socket
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass
@@ -71,30 +72,31 @@ def kept(path: Path, make: Callable[[], Arrays]) -> Arrays:
 
 def open_array(path: Path) -> Array:
     """Map the array in `path` (*.npy) into memory; FormatError for a damaged file."""
-    try:
+    with _damage_as_error(path):
         try:
             return np.load(path, mmap_mode="r", allow_pickle=False)
         except ValueError:  # an array without elements cannot be mapped
             return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise _damaged(path, error) from None
 
 
 def read_arrays(path: Path) -> Arrays:
     """Return the arrays of an .npz file; FormatError for a damaged one."""
+    # Not by `read_npz`, which takes no array of more than 2 GB, and thrice its memory.
+    with _damage_as_error(path), np.load(path, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+        if not arrays or not all(isinstance(array, np.ndarray) for array in arrays.values()):
+            raise ValueError("it holds none, or more than arrays")
+        return arrays
+
+
+@contextmanager
+def _damage_as_error(path: Path) -> Iterator[None]:
     try:
-        # Not by `read_npz`, which takes no array of more than 2 GB, and thrice its memory.
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-            if not arrays or not all(isinstance(array, np.ndarray) for array in arrays.values()):
-                raise ValueError("it holds none, or more than arrays")
-            return arrays
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # a header of Python 2, which NumPy mends with a warning
+            yield
     except Exception as error:  # noqa: BLE001  zipfile and NumPy may raise any
-        raise _damaged(path, error) from None
-
-
-def _damaged(path: Path, error: Exception) -> FormatError:
-    return FormatError(f"{path}: damaged ({printable_line(error, 80)}); delete it and run again")
+        raise FormatError(f"{path}: damaged ({printable_line(error, 80)}); delete it and run again") from None
 
 
 def digest_of(data: Gaussians | ImageFeatures) -> str:

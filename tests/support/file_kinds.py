@@ -46,7 +46,7 @@ from langsplat_core.io.gltf import write_gltf
 from langsplat_core.io.hostile import picture_size
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.sidecar import Words, read_language, read_words, write_language, write_words
-from langsplat_core.pipeline.stages import kept
+from langsplat_core.pipeline.stages import kept, open_array
 from langsplat_core.progress import silent
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
@@ -631,6 +631,16 @@ def kept_stage(path: Path) -> float:
     return 1.0
 
 
+def mapped_arrays(folder: Path) -> list[bytes]:
+    for name, array in (("plain", np.ones((50, 3), np.float32)), ("none", np.zeros(0, np.int32))):
+        np.save(folder / name, array)
+    return [(folder / f"{name}.npy").read_bytes() for name in ("plain", "none")]
+
+
+def mapped(path: Path) -> float:
+    return float(np.asarray(open_array(path)).size >= 0)
+
+
 def feature_files(folder: Path) -> list[bytes]:
     rng = np.random.default_rng(0)
     store = FeatureStore(folder)
@@ -855,6 +865,7 @@ KINDS = {
     },
     ".features.npz": FileKind("a.features.npz", feature_files, stored_features, in_zip),
     "stage of training": FileKind("a.npz", stages, kept_stage, in_zip),
+    "array of training": FileKind("a.npy", mapped_arrays, mapped),
     "video": FileKind("a.mp4", video_files, filmed, or_text),
     "PNG": _photographs("PNG", in_png),
     **{kind: _photographs(kind) for kind in ("JPEG", "WEBP", "TIFF", "BMP", "AVIF")},
