@@ -1,25 +1,34 @@
 """The command line as a whole: its commands, their options, what it says of those that do not exist; and
 whatever happens to a command, it ends with one line."""
 
+import contextlib
 import dataclasses
+import io
 import json
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tyro.extras import get_parser
 
 from langsplat_core import __version__
 from langsplat_core.cli import scenes
 from langsplat_core.cli.app import command_names, entry, load_command, parse
+from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Doctor
 from langsplat_core.errors import InputError
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline import encoder_check
 from langsplat_viewer.program import ViewerCommand
 from langsplat_viewer.program import entry as viewer_entry
@@ -27,6 +36,7 @@ from langsplat_viewer.program import parse as viewer_parse
 from tests.support.processes import refusal, run
 from tests.support.tiny_models import tiny_clip
 
+DEMO = str(files("langsplat_assets") / "demo" / "scene.ply")
 EVERY = {
     "viewer": ViewerCommand,
     **{name: load_command(name) for name in command_names()},
@@ -144,9 +154,105 @@ def test_demo_renders_the_bundled_scene(tmp_path, monkeypatch, capfd):
     assert run("demo", "--out", tmp_path) == 2
 
 
+# Odd values for every option and place of every command: refused in a line, or used.
+
+ODD = ("1e-320", "1e308", "nan", "inf", "-inf", "-1", "0", "1000000", "", "x" * 5000, "\udcff", "0,0", "٣")
+LINES = {  # words that work: positions, and options; what would take long ends where its files are looked for
+    "viewer": "s.ply -- --headless --out o.png --size 32x24 --backend cpu",
+    "train": "absent -- --out o.ply",
+    "query": "s.ply gift --",
+    "describe": "s.ply -- --vocabulary v.txt",
+    "select": "s.ply gift -- --out o.ply",
+    "teach": "s.ply -- --name mine --at 20,20 --into w.safetensors",
+    "scale": "s.ply --",
+    "transform": "s.ply o.ply --",
+    "crop": "s.ply o.ply -- --box -9 -9 -9 9 9 9",
+    "export": "s.ply o.html --",
+    "convert": "s.ply o.ply --",
+    "inspect": "s.ply --",
+    "doctor": "--",
+    "demo": "-- --out s.ply/demo",
+    "find": "gift . --",
+    "changes": "s.ply t.ply --",
+    "map": "s.ply m -- --metres-per-unit 1 --robot-height 2 --resolution 0.1",
+    "mesh": "s.ply m.ply -- --views 3",
+    "register": "s.ply t.ply --",
+    "merge": "s.ply t.ply -- --out o.ply --as-is",
+    "clean": "s.ply o.ply -- --views 2",
+    "compact": "s.ply -- --out o.ply --views 2",
+    "eval lerf-ovs": "s.ply . --",
+    "eval 3d-ovs": "s.ply . --",
+    "bench raster": "-- --scenes absent.ply --out b",
+    "bench query": "absent.ply -- --out b",
+    "serve": "s.ply --",
+}
+
+
+@pytest.fixture(scope="module")
+def corner(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with every sixtieth Gaussian of the bundled scene, larger, in two files, and a vocabulary."""
+    folder, scene = tmp_path_factory.mktemp("corner"), load_scene(DEMO)
+    few = scene.take(np.arange(0, len(scene.gaussians), 60))
+    larger = few.gaussians.log_scales + np.float32(np.log(60) / 2)
+    cameras = tuple(camera.resized(64, 48) for camera in few.cameras[:4])
+    for name in ("s.ply", "t.ply"):
+        made = replace(few, gaussians=replace(few.gaussians, log_scales=larger), cameras=cameras)
+        save_scene(folder / name, replace(made, path=None))
+    (folder / "v.txt").write_text("gift\nwood\n")
+    return folder
+
+
+def odd_places(name: str) -> Iterator[tuple[list[str], list[str], int]]:
+    """Yield the words before and behind each place of a command line, and how many stand there."""
+    first, _, last = LINES[name].partition("--")
+    words, more = first.split(), last.split()
+    for place in range(len(words)):
+        yield words[:place], [*words[place + 1 :], *more], 1
+    for action in get_parser(EVERY[name])._actions:  # noqa: SLF001
+        if action.option_strings and action.nargs != 0:
+            counts = {"between": 6, "matrix": 16, "start": 2, "heat-scale": 2}
+            count = int(action.nargs) if str(action.nargs).isdigit() else counts.get(action.dest, 1)
+            yield [*words, *more, action.option_strings[-1]], [], count
+
+
+def check_odd_values(name: str, values: Callable[[], Iterable[str]], corner: Path, here: Path) -> None:
+    begin, used = (viewer_parse, []) if name == "viewer" else (parse, name.split())
+    for number, (before, behind, count) in enumerate(odd_places(name)):
+        for odd in values():
+            folder = here / str(number)
+            shutil.copytree(corner, folder, dirs_exist_ok=True)
+            line = ["-q", *used, *before, *[odd] * count, *behind]
+            said = io.StringIO()
+            with warnings.catch_warnings(record=True) as warned, contextlib.chdir(folder):
+                warnings.simplefilter("always", RuntimeWarning)
+                with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(said):
+                    code = main(name, lambda line=line: begin(line))
+            errors = said.getvalue().splitlines()
+            assert (code, len(errors)) in ((0, 0), (0, 1), (2, 1)), (line, code, errors)
+            assert all(text.isprintable() and len(text) <= 1100 for text in errors), line
+            assert [str(one.message) for one in warned if one.category is RuntimeWarning] == [], line
+            shutil.rmtree(folder)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_an_odd_value_is_refused_in_a_line_or_used(name, corner, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    rng = np.random.default_rng(len(name))
+    check_odd_values(name, lambda: [str(rng.choice(ODD))], corner, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_odd_values_are_refused_in_a_line_or_used(name, corner, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    check_odd_values(name, lambda: ODD, corner, tmp_path)
+
+
 # Endings.
 
-DEMO = str(files("langsplat_assets") / "demo" / "scene.ply")
 RUN = [sys.executable, "-m", "langsplat_core"]
 WRITING = [
     "train d --out {}.ply",
@@ -169,13 +275,6 @@ def test_commands_try_the_place_to_write_first(
     message = refusal(capsys, *line.format(place.format(here=tmp_path)).split())
     assert any(word in message for word in ("system's own", "is a file", "choose another")), message
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "s.ply"]
-
-
-@pytest.mark.parametrize(
-    "words", [["query", DEMO, "caf\udce9"], ["query", DEMO, "cup", "--encoder", "\udcff"]]
-)
-def test_texts_that_are_not_utf_8_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert "is not UTF-8" in refusal(capsys, *words)
 
 
 def test_names_that_are_not_utf_8_are_printed_with_escapes(tmp_path: Path) -> None:

@@ -662,25 +662,11 @@ def stored_features(path: Path) -> float:
 
 def transforms(folder: Path) -> list[bytes]:
     coefficients = {"k1": 0.01, "k2": 0.001, "p1": 1e-4, "p2": 0.0}
-    lenses = [
-        {
-            "camera_model": "OPENCV",
-            "fl_x": 50.0,
-            "fl_y": 51.0,
-            "cx": 20,
-            "cy": 15,
-            "w": 40,
-            "h": 30,
-            **coefficients,
-        },
-        {
-            "camera_angle_x": 0.8,
-            "camera_model": "OPENCV_FISHEYE",
-            "k1": 0.02,
-            "k2": 0.0,
-            "k3": 0.0,
-            "k4": 0.0,
-        },
+    size = {"cx": 20, "cy": 15, "w": 40, "h": 30}
+    fisheye = dict.fromkeys(("k2", "k3", "k4"), 0.0) | {"k1": 0.02}
+    lenses: list[dict[str, Any]] = [
+        {"camera_model": "OPENCV", "fl_x": 50.0, "fl_y": 51.0, **size, **coefficients},
+        {"camera_angle_x": 0.8, "camera_model": "OPENCV_FISHEYE", **fisheye},
         {"fl_x": 50, "metres_per_unit": 0.5, "applied_transform": np.eye(4)[:3].tolist()},
     ]
     made = []

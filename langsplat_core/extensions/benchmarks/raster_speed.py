@@ -26,8 +26,9 @@ import scipy.sparse
 from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import OutFolder
 from langsplat_core.config import INRIA, Count, Positive, Range, RasterSettings
-from langsplat_core.errors import BackendError
+from langsplat_core.errors import BackendError, InputError
 from langsplat_core.extensions.benchmarks.report import markdown, write_report
+from langsplat_core.io.hostile import exists
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.raster import load_rasterizer
@@ -81,6 +82,9 @@ class BenchRaster:
 
     def run(self) -> None:
         plan = self
+        for path in self.scenes:  # before the minutes that the others take
+            if not exists(path):
+                raise InputError(f"{path}: no such file; check the spelling and the folder")
         if self.quick:
             counts, sizes = (3_000, 10_000, 31_000), ((160, 120), (320, 240), (640, 480))
             plan = replace(self, counts=counts, sizes=sizes, pivot=10_000, limit=min(self.limit, 3.0))

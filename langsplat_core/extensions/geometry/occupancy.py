@@ -120,12 +120,14 @@ def find_occupancy(scene: Scene, to_map: Array, resolution: float, progress: Pro
         raise InputError("the scene's cameras see nothing in it; a map needs surfaces")
     low, high = np.quantile(ends, [OUTSIDE, 1 - OUTSIDE], axis=0)
     low, high = low - MARGIN * resolution, high + MARGIN * resolution
-    shape = np.ceil((high - low) / resolution).astype(np.int64)
-    if float(np.prod(shape.astype(np.float64))) > MOST_CELLS:
+    with np.errstate(over="ignore"):
+        sides = np.ceil((high - low) / resolution)
+    if not np.prod(sides) <= MOST_CELLS:
         raise InputError(
-            f"{shape[0]} x {shape[1]} x {shape[2]} voxels of {resolution:g} m are too many; "
+            f"{sides[0]:g} x {sides[1]:g} x {sides[2]:g} voxels of {resolution:g} m are too many; "
             "take a coarser --resolution, or see that the scene's scale is right"
         )
+    shape = sides.astype(np.int64)
     hits, passes = (np.zeros(shape, np.uint16) for _ in range(2))
     for number, (eye, points) in enumerate(rays):
         progress(STAGE, 0.5 + number / (2 * len(rays)))

@@ -13,7 +13,7 @@ import torch
 
 from langsplat_core.extensions.checkpoints.importing import read_foreign
 from langsplat_core.io.ply import write_ply
-from tests.support.file_kinds import FileKind, drawable_share, few_and_many, in_zip, mutant
+from tests.support.file_kinds import FileKind, drawable_share, few_and_many, in_zip
 from tests.support.file_samples import autoencoder, geometry, save_model, tensor, training_state
 from tests.support.processes import Ended, convert_each
 from tests.support.scenes import random_gaussians
@@ -183,13 +183,6 @@ def hostile_files() -> dict[str, bytes]:
     }  # fmt: skip
 
 
-def mutants() -> dict[str, bytes]:
-    rng = np.random.default_rng(0)
-    good = saved(model(extent=np.float64(4.25)))
-    stream = pickle_of(good)
-    return {f"mutant {number}": with_pickle(good, mutant(stream, [stream], rng)) for number in range(20)}
-
-
 def harmless_files() -> dict[str, bytes]:
     return {
         "untouched": saved(model()),
@@ -202,13 +195,10 @@ def harmless_files() -> dict[str, bytes]:
 
 @pytest.mark.long
 def test_every_crafted_file_is_refused_in_a_line_and_nothing_else(tmp_path):
-    hostile, damaged, harmless = hostile_files(), mutants(), harmless_files()
-    ended = ends(hostile | damaged | harmless, tmp_path)
+    hostile, harmless = hostile_files(), harmless_files()
+    ended = ends(hostile | harmless, tmp_path)
     assert {name: ended[name] for name in harmless} == dict.fromkeys(harmless, Ended(0, "", True))
-    loaded = [name for name in damaged if ended[name].code == 0]
-    assert len(loaded) < len(damaged) / 2
-    others = {name: how for name, how in ended.items() if name not in harmless and name not in loaded}
-    assert {name: how for name, how in others.items() if not refused(how)} == {}
+    assert {name: ended[name] for name in hostile if not refused(ended[name])} == {}
 
 
 # Damaged checkpoints of other methods: read, or refused in one line.
@@ -247,8 +237,8 @@ def imported(path: Path) -> float:
 
 
 KINDS = {
-    "checkpoint": FileKind("a.pth", checkpoints, imported),
-    "autoencoder": FileKind("a.pth", autoencoders, imported),
+    "checkpoint": FileKind("a.pth", checkpoints, imported, in_zip),
+    "autoencoder": FileKind("a.pth", autoencoders, imported, in_zip),
     "clusters": FileKind("a.npz", clusters, imported, in_zip),
 }
 test_a_few_mutants_are_read_or_refused, test_many_mutants_are_read_or_refused = few_and_many(KINDS)
