@@ -3,6 +3,8 @@ and what was there stays."""
 
 import errno
 import os
+import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -23,14 +25,22 @@ from langsplat_core.io.hostile import write_npy
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import load_scene, save_scene, writable_suffixes
 from langsplat_core.io.shapes import write_points
-from langsplat_core.io.sidecar import write_language
+from langsplat_core.io.sidecar import SUFFIX, write_language
 from langsplat_core.pipeline.stages import kept
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
 from langsplat_viewer.output import Film, save_png, write_film
-from langsplat_viewer.projects import Bookmark, Shelf, load_preferences, save_preferences, write_flight
-from langsplat_viewer.session import Preferences
+from langsplat_viewer.projects import (
+    Bookmark,
+    Project,
+    Shelf,
+    load_preferences,
+    save_preferences,
+    write_flight,
+    write_project,
+)
+from langsplat_viewer.session import Preferences, Session
 from tests.support.file_samples import random_field
 from tests.support.processes import (
     Captured,
@@ -39,6 +49,7 @@ from tests.support.processes import (
     check_full_disk,
     contents,
     files_of_at_most,
+    stopped_everywhere,
 )
 from tests.support.scenes import random_camera, random_gaussians
 from tests.support.windowless import flight as some_flight
@@ -167,6 +178,12 @@ def bookmarks(folder: Path) -> None:
     Shelf(folder).write(Path("s.ply"), (Bookmark("door", pose, 1.0),))
 
 
+def project(folder: Path) -> None:
+    view = Bookmark("view", some_flight().keyframes[0].pose, 1.0)
+    content = Project(str(folder / "s.ply"), len(GAUSSIANS), view, Session())
+    write_project(folder / "p.langsplat", content, folder / "p-other.langsplat")
+
+
 def stage(folder: Path) -> None:
     noise = {"a": np.random.default_rng(0).normal(size=999)}
     kept(folder / "codec.npz", lambda: noise)
@@ -195,17 +212,55 @@ WRITERS: dict[str, Write] = {
     "pictures of a film": film("film"),
     "camera path": flight,
     "bookmarks": bookmarks,
+    "project": project,
     "preferences": lambda folder: save_preferences(folder, Preferences()),
 }
 
 
 # What is there counts as done, or must make sense.
-ONLY_NEW = {"stage", "stage's array", "bookmarks", "pictures of a film"}
+ONLY_NEW = {"stage", "stage's array", "bookmarks", "project", "pictures of a film"}
 
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_full_disk_is_one_line(name: str, tmp_path: Path, capsys: Captured) -> None:
     check_full_disk(WRITERS[name], tmp_path, capsys, EARLIER if name not in ONLY_NEW else None)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(os.name == "nt", reason="no signal 9")
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_writer_killed_at_any_step_leaves_whole_files(name: str, tmp_path: Path) -> None:
+    """Under their names is what was there or what was written, and nothing else that is not hidden."""
+    write, folder, companions = WRITERS[name], tmp_path / "out", (".json", SUFFIX)
+    write(tmp_path / "whole")
+    whole = contents(tmp_path / "whole")
+    before = {} if name in ONLY_NEW else dict.fromkeys(whole, EARLIER)
+
+    def begin() -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        for path, content in before.items():
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).write_bytes(content)
+
+    def work() -> int:
+        write(folder)
+        return 0
+
+    killed = 0
+    begin()
+    for code in stopped_everywhere(work, folder, signal.SIGKILL):
+        after = contents(folder)
+        seen = {path for path in after if not Path(path).name.startswith(".writing-")}
+        gone = {path for path in before if name.startswith("scene") and path.endswith(companions)}
+        assert before.keys() - gone <= seen <= whole.keys()
+        for path in seen:
+            assert after[path] == before.get(path) or len(after[path]) == len(whole[path]), path
+        killed += code == -signal.SIGKILL
+        if code < 0:
+            begin()
+    assert code == 0
+    assert seen == whole.keys()
+    assert killed > 2
 
 
 def test_a_full_disk_keeps_the_old_scene_whole(tmp_path: Path) -> None:

@@ -363,5 +363,35 @@ def check_full_disk(write: Write, tmp_path: Path, capsys: Captured, earlier: byt
             assert content == before.get(path) or len(content) == len(whole[path])
 
 
+STEPS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.chmod", "os.chown", "os.truncate"}
+
+
+def stopped_everywhere(work: Callable[[], int | None], folder: Path, number: int) -> Iterator[int]:
+    """Do `work` in forks of this process, each sent a signal at another of its steps in `folder`.
+
+    Steps are what opens, makes, renames or removes a file. Yields the exit codes, the last of which is of a
+    fork that ended otherwise.
+    """
+    for last in range(500):
+        if (child := os.fork()) == 0:
+            left = iter(range(last))
+
+            def watch(event: str, given: tuple[object, ...], left: Iterator[int] = left) -> None:
+                if event in STEPS and str(given[0]).startswith(str(folder)) and next(left, None) is None:
+                    os.kill(os.getpid(), number)
+
+            code = 1
+            try:
+                signal.alarm(60)  # of threads a fork has none, and may wait for one
+                sys.addaudithook(watch)
+                code = int(work() or 0)
+            finally:
+                os._exit(code)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        yield code
+        if code not in (-number, 128 + number):
+            return
+
+
 if __name__ == "__main__":
     _all(Path(sys.argv[1]))
