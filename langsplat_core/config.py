@@ -344,7 +344,9 @@ class LiftConfig:
     # median, mean: of the CLIP vectors of the masks a Gaussian belongs to, then encoded;
     # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
     mode: Literal["median", "mean", "one-pass", "gradient"] = "median"
-    backend: Literal["auto", "cpu", "cuda"] = "auto"  # what lifts
+    backend: Literal["auto", "cpu", "cuda"] = (
+        "auto"  # what lifts; auto: cpu, which is faster but for gradient
+    )
     steps: Count = 30_000  # of mode gradient, as are the following
     lr: Rate = 2.5e-3  # learning rate
     start: Literal["one-pass", "zeros-as-published"] = "one-pass"  # what mode gradient starts from

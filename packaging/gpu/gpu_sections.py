@@ -181,7 +181,8 @@ def measure_environment(plan: Plan) -> Iterator[str]:
     except BackendError as error:  # its one line leaves out what the compiler said
         raise RuntimeError(f"{str(error.__cause__)[-3_000:]}\n{error}") from None
     seconds = time.perf_counter() - start
-    yield f"- gsplat's first picture and its gradients, with compiling: {seconds:.0f} s\n"
+    kernels = "compiled before" if find_spec("gsplat.csrc") else "with compiling"
+    yield f"- gsplat's first picture and its gradients, {kernels}: {seconds:.0f} s\n"
 
 
 def machine() -> dict[str, object]:

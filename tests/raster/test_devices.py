@@ -217,11 +217,20 @@ def test_a_missing_driver_is_reported_in_one_line(monkeypatch):
         create_egl_context()
 
 
-# What CUDA draws, gathers, differentiates, lifts and trains is what the reference and the CPU kernels say.
+# What CUDA draws, gathers, differentiates, lifts and trains is what the reference and the CPU kernels say, by
+# gsplat's kernels where there is a device, and by their twin.
+
+
+@pytest.fixture(params=["twin", "device"])
+def kernels(request: pytest.FixtureRequest) -> None:
+    if request.param == "twin":
+        request.getfixturevalue("gsplat_twin")
+    elif not gsplat.has_device():
+        pytest.skip("torch finds no CUDA device")
 
 
 def on_cuda(test: Any) -> Any:
-    return pytest.mark.long(pytest.mark.usefixtures("gsplat_twin")(test))
+    return pytest.mark.long(pytest.mark.usefixtures("kernels")(test))
 
 
 SETTINGS = [INRIA, GSPLAT, replace(INRIA, antialiased=True), replace(INRIA, far=3.0)]
@@ -278,10 +287,10 @@ def gradients(
     """Of <picture, image_grad> + the sum of alpha, by every parameter and by the projected means."""
     state = start(random_gaussians(60, 5, degree), 0, renderer.device)
     drawn = renderer.render(state.values, camera, degree)
-    (drawn.image * torch.tensor(image_grad)).sum().add(drawn.alpha.sum()).backward()
+    (drawn.image * torch.tensor(image_grad, device=renderer.device)).sum().add(drawn.alpha.sum()).backward()
     found: dict[str, Any] = {name: state.values[name].grad for name in PARAMETERS}
     found |= {"image": drawn.image.detach(), "visible": drawn.visible, "means_px": drawn.means_px_grad()}
-    return {name: value.numpy() for name, value in found.items() if value is not None}
+    return {name: value.cpu().numpy() for name, value in found.items() if value is not None}
 
 
 @on_cuda
@@ -328,7 +337,8 @@ def test_training_on_cuda_ends_where_the_cpu_does() -> None:
     assert min(scores) > 10
 
 
-@on_cuda
+@pytest.mark.long
+@pytest.mark.usefixtures("gsplat_twin")
 def test_a_failing_kernel_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise RuntimeError("Error building extension 'gsplat_cuda'\nand a thousand lines")

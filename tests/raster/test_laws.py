@@ -252,7 +252,8 @@ def check_adjoint(seen: Seen) -> None:
     assert not gathered[~seen.drawing.gaussians.valid()].any()
     sums = seen.view.gather(np.ones((*seen.alpha.shape, 1), np.float32))[:, 0]
     np.testing.assert_allclose(seen.view.contributions(), sums, rtol=1e-5, atol=1e-5)
-    assert_adjoint(lambda x: seen.view.splat(x)[0], seen.view.gather, seen.drawing.features(), y)
+    rtol = seen.backend.adjoint_tolerance
+    assert_adjoint(lambda x: seen.view.splat(x)[0], seen.view.gather, seen.drawing.features(), y, rtol)
 
 
 @pytest.mark.parametrize("case", NAMED)
@@ -392,7 +393,7 @@ def score(
     image, alpha = view.splat(values)
     error = np.abs(np.dstack([image - truth.image, alpha - truth.alpha])).max(-1)
     seen = ~truth.band & (truth.alpha > 0.01)
-    check_gather(view, truth, values)
+    check_gather(view, truth, values, backend.adjoint_tolerance)
     return Scored(
         worst=float(error[~truth.band].max(initial=0)),
         mean=float(error.mean()),
@@ -402,15 +403,15 @@ def score(
     )
 
 
-def check_gather(view: object, truth: Truth, x: Array) -> None:
-    """<W x, y> = <x, W^T y> to 1e-5, and W^T y is the reference's to 1e-5 of its largest entry."""
+def check_gather(view: object, truth: Truth, x: Array, rtol: float) -> None:
+    """<W x, y> = <x, W^T y>, and W^T y is the reference's, both to `rtol` of the largest entry."""
     if not hasattr(view, "gather"):
         return
     y = np.random.default_rng(4).normal(size=truth.image.shape).astype(np.float32)
     y[truth.band] = 0  # flipped weights of the band would enter every sum
-    assert_adjoint(lambda v: view.splat(v)[0], view.gather, x, y, rtol=1e-5)
+    assert_adjoint(lambda v: view.splat(v)[0], view.gather, x, y, rtol)
     want = truth.view.gather(y)
-    assert np.abs(view.gather(y) - want).max(initial=0) <= 1e-5 * max(np.abs(want).max(initial=0), 1e-3)
+    assert np.abs(view.gather(y) - want).max(initial=0) <= rtol * max(np.abs(want).max(initial=0), 1e-3)
 
 
 LABELS = ("error away from cut-offs", "mean error", "relative error of depth", "pixels flipped", "pixels")
@@ -483,6 +484,8 @@ def check_random_scenes(seeds: range, backend: Backend, measured: Measure) -> No
     flips = pixels = 0
     for seed in seeds:
         gaussians, camera, settings = random_case(seed)
+        if backend.gsplat:  # whose antialiasing has no floor
+            settings = replace(settings, antialiased=False)
         truth = truth_of(gaussians, camera, backend.expected_settings(settings), backend.band)
         scored = score(backend, gaussians, camera, settings, truth)
         record(scored, backend, "random scenes", measured)
@@ -515,8 +518,8 @@ def corner_case(width: int, height: int) -> tuple[Gaussians, Camera, Camera]:
 @pytest.mark.long
 @pytest.mark.parametrize("size", [(1920, 1080), pytest.param((3840, 2160), marks=pytest.mark.slow)])
 def test_far_corner_of_a_large_image(fast_backend: Backend, measured: Measure, size: tuple[int, int]) -> None:
-    """Pixel positions are largest there, and a float32 has the fewest digits left for the fraction: on the
-    GPU an opaque Gaussian of sub-pixel size is off by 5e-8 per pixel of the image's width."""
+    """Pixel positions are largest there, and a float32 has the fewest digits left for the fraction:
+    with OpenGL and gsplat an opaque Gaussian of sub-pixel size is off by 5e-8 per pixel of the image's width."""
     gaussians, camera, corner = corner_case(*size)
     x = random_values(len(gaussians), 3)
     reference = REFERENCE.view(gaussians, corner, fast_backend.expected_settings(INRIA))
@@ -524,5 +527,5 @@ def test_far_corner_of_a_large_image(fast_backend: Backend, measured: Measure, s
     image = fast_backend.raster.view(gaussians, camera).splat(x)[0][-30:, -40:]
     error = np.abs(image - reference.splat(x)[0]).max(-1)
     measured(f"{fast_backend.name}, corner of {size[0]} px", "error away from cut-offs", error[~band].max())
-    positions = 5e-8 * size[0] if fast_backend.name == "opengl-single" else 0.0
+    positions = 5e-8 * size[0] if fast_backend.name != "cpu" else 0.0
     assert error[~band].max() <= max(fast_backend.tolerance, positions)

@@ -55,6 +55,12 @@ class Backend:
         """Whether gsplat's own Python code draws, over its kernels or over their twin."""
         return self.name.startswith("cuda")
 
+    @property
+    def adjoint_tolerance(self) -> float:
+        """Of `gather`, relative to the largest entry. gsplat's backward pass begins with a pixel's transmittance as
+        1 - alpha, of which 6e-8 / 1e-4 may be lost where the pixel is full; its twin in PyTorch keeps it."""
+        return 1e-3 if self.name == "cuda" else 1e-5
+
     def promises(self, gaussians: Gaussians, settings: RasterSettings) -> bool:
         """Whether `tolerance` holds. Not for gsplat's needles, whose covariances are formed in 3D in float32,
         nor for its antialiasing of whatever is far smaller than a pixel, which has no floor."""
