@@ -518,8 +518,8 @@ def corner_case(width: int, height: int) -> tuple[Gaussians, Camera, Camera]:
 @pytest.mark.long
 @pytest.mark.parametrize("size", [(1920, 1080), pytest.param((3840, 2160), marks=pytest.mark.slow)])
 def test_far_corner_of_a_large_image(fast_backend: Backend, measured: Measure, size: tuple[int, int]) -> None:
-    """Pixel positions are largest there, and a float32 has the fewest digits left for the fraction:
-    with OpenGL and gsplat an opaque Gaussian of sub-pixel size is off by 5e-8 per pixel of the image's width."""
+    """Pixel positions are largest there, and a float32 has the fewest digits left for the fraction: with
+    OpenGL and gsplat an opaque Gaussian of sub-pixel size is off by 5e-8 per pixel of the image's width."""
     gaussians, camera, corner = corner_case(*size)
     x = random_values(len(gaussians), 3)
     reference = REFERENCE.view(gaussians, corner, fast_backend.expected_settings(INRIA))

@@ -57,8 +57,11 @@ class Backend:
 
     @property
     def adjoint_tolerance(self) -> float:
-        """Of `gather`, relative to the largest entry. gsplat's backward pass begins with a pixel's transmittance as
-        1 - alpha, of which 6e-8 / 1e-4 may be lost where the pixel is full; its twin in PyTorch keeps it."""
+        """Of `gather`, relative to the largest entry.
+
+        gsplat's backward pass begins with a pixel's transmittance as 1 - alpha, of which 6e-8 / 1e-4 may be
+        lost where the pixel is full; its twin in PyTorch keeps it.
+        """
         return 1e-3 if self.name == "cuda" else 1e-5
 
     def promises(self, gaussians: Gaussians, settings: RasterSettings) -> bool:
