@@ -8,7 +8,7 @@ from langsplat_core.cli.run import main, parsed
 from tests.benchmarks.answers import Lifting, Rooms, Verdicts
 from tests.benchmarks.extensions import Changed, Clean, Found, Maps, Meshes
 from tests.benchmarks.few import Few
-from tests.benchmarks.phrases import Phrases
+from tests.benchmarks.phrases import Counts, Phrases
 from tests.benchmarks.scale import Formats, Scale
 
 PROGRAM = "python -m tests.benchmarks"
@@ -18,7 +18,7 @@ def parse(args: list[str]) -> Runnable:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
     known = (
-        *(Rooms, Verdicts, Phrases, Clean, Maps, Meshes),
+        *(Rooms, Verdicts, Phrases, Counts, Clean, Maps, Meshes),
         *(Lifting, Scale, Found, Changed, Formats, Few),
     )
     reports = tuple(with_codec(report, args) for report in known)

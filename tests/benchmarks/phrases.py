@@ -1,6 +1,7 @@
-"""The report `phrases`: phrases with structure, asked whole and composed; names of regions, inventories.
+"""Reports on phrases that are true of a room, by its geometry and its names.
 
-Phrases that are true of a room come from its geometry and its names; the second table is of `words`.
+* phrases: phrases with structure, asked whole and composed; names of regions, inventories (`words`);
+* counts: phrases for none, one or several things, after GR-LERF.
 """
 
 import time
@@ -12,20 +13,22 @@ from typing import get_args
 import numpy as np
 
 from assets.making.dataset import MIN_PIXELS, Region, Truth, photographed_room
+from assets.making.objects import EVERYTHING
 from assets.making.world import CATEGORIES, World, object_words
 from langsplat_core.arrays import Array
 from langsplat_core.extensions.benchmarks.report import intersection_over_union, markdown
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import Describer
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Extreme, Side, atoms, parse
 from langsplat_core.query.inventory import InventoryEntry, scene_inventory
 from langsplat_core.query.relations import Body, body, most, stands, upright, viewpoint
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera
 from tests.benchmarks.oracles import surface_points
-from tests.benchmarks.room import InRooms, Room, Seeds, Variant, publish
-from tests.benchmarks.scoring import MIN_GAUSSIANS, masks_and_peaks
+from tests.benchmarks.room import InRooms, MaskOrigin, Room, Seeds, Variant, publish
+from tests.benchmarks.scoring import MIN_GAUSSIANS, masks_and_peaks, spread
 
 METHOD = Variant("the method", "truth")
 POINTS = 3000  # on the surface of every thing, by which it is measured
@@ -263,6 +266,98 @@ def phrase_table(rows: Sequence[PhraseScore]) -> str:
 def _pair(ways: Sequence[Sequence[float]]) -> str:
     """Percent; "-" for no figures."""
     return " / ".join(f"{100 * np.mean(way):.1f}" if len(way) else "-" for way in ways)
+
+
+# Phrases for none, one or several things, after GR-LERF (ZeroSplat, ECCV 2026), with the measures of
+# generalised referring segmentation (GRES, CVPR 2023).
+
+TARGETS = ("none", "one", "several", "all")
+
+
+@dataclass(frozen=True)
+class Counts(InRooms):
+    """Phrases for none, one or several things of a room: what they cover, and how many things they name.
+
+    Ours beside the published reading, a threshold on relevancy. Some minutes per room."""
+
+    masks: MaskOrigin = "truth"  # where outlines come from
+
+    def run(self) -> None:
+        rows = self.each(lambda room: measure_counts(room, replace(METHOD, masks=self.masks)))
+        publish(self, "counts", "None, one or several", count_table(rows), rows)
+
+
+@dataclass(frozen=True)
+class CountScore:
+    """One phrase, with the numbers of things that it names and that were answered."""
+
+    score: PhraseScore
+    true: int
+    said: int
+
+    @property
+    def overlaps(self) -> tuple[float, float]:
+        """Intersections over union, mean over the views and in 3-D: of nothing 1 where that is the answer."""
+        if not (self.true and self.score.found):
+            return (float(self.true == 0 and not self.score.found),) * 2
+        return float(np.mean(self.score.ious)) if self.score.ious else np.nan, self.score.direct
+
+
+def targets(truth: Truth, things: Things, seed: int) -> Iterator[Case]:
+    """Names, kinds and colours of things that are there and that are not, joined and left out."""
+    rng = np.random.default_rng((seed, 13))
+    words = sorted(set(things.words.values()) - set(SHELL))
+    for word in (*words, *_kinds(things), *truth.absent(EVERYTHING)):
+        yield Case("name", word, word, tuple(things.called(word)))
+    colours = sorted({truth.regions[number].colour for number in things.words} - {""})
+    for word, colour in product(words, colours):
+        ids = tuple(number for number in things.called(word) if truth.regions[number].colour == colour)
+        # Of the colours that it has not, one in as many as there are.
+        text = f"{colour} {word}"
+        if ids or (text not in truth.words and rng.random() < 1 / len(colours)):
+            yield Case("colour", text, text, ids)
+    yield from _sets(things, rng)
+
+
+def measure_counts(room: Room, variant: Variant) -> list[CountScore]:
+    """Every phrase of one room that the encoder knows the words of, by both readings."""
+    ours = room.engine(variant, room.capture.cameras)
+    published = QueryEngine(ours.scene, lambda _: room.encoder, rule="peak")
+    things = things_in(photographed_room(room.seed, room.tier), upright(ours.scene.up()), room.seed)
+    shown = set(_regions(room.labels[2]))
+    asked = [
+        case
+        for case in targets(room.truth, things, room.seed)
+        if shown.issuperset(case.ids) and not ours.unknown_words(case.whole)
+    ]
+    rows = []
+    for way, answers in (
+        ("published", (published.run(case.whole) for case in asked)),
+        ("ours", (run_phrase(ours, case.text).answer for case in asked)),
+    ):
+        answered = [(case, answer, 0.0) for case, answer in zip(asked, answers, strict=True)]
+        said = [len(ours.instances(answer)) if answer.found else 0 for _, answer, _ in answered]
+        scores = _scores(room, answered, room.held_out, way)
+        rows += [
+            CountScore(*row) for row in zip(scores, (len(case.ids) for case in asked), said, strict=True)
+        ]
+        room.progress(way, 1.0)
+    return rows
+
+
+def count_table(rows: Sequence[CountScore]) -> str:
+    """Markdown: per reading and number of things, means over rooms with their standard deviation."""
+    lines = []
+    for way, kind in product(("published", "ours"), TARGETS):
+        rooms: dict[int, list[tuple[float, ...]]] = {}
+        for row in rows:
+            if row.score.way == way and kind in ("all", TARGETS[min(row.true, 2)]):
+                right = row.score.found == row.score.present, row.said == row.true
+                rooms.setdefault(row.score.seed, []).append((*row.overlaps, *right))
+        columns = 100 * np.array([np.nanmean(each, axis=0) for each in rooms.values()]).reshape(-1, 4).T
+        lines.append((way, kind, sum(map(len, rooms.values())), *map(spread, columns)))
+    figures = ("gIoU %", "3-D gIoU %", "found, or rejected, rightly %", "right number %")
+    return markdown(("reading", "things named", "phrases", *figures), lines)
 
 
 # Names of regions and inventories against the truth of a room (the second table of the report `phrases`).

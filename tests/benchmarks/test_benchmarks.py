@@ -60,7 +60,15 @@ from tests.benchmarks.clip_spaces import (
 )
 from tests.benchmarks.extensions import FAR, alter, middle, with_floaters
 from tests.benchmarks.oracles import oracle_vectors, phrase_vectors, true_labels
-from tests.benchmarks.phrases import InventoryScore, Phrases, score_inventory
+from tests.benchmarks.phrases import (
+    CountScore,
+    InventoryScore,
+    Phrases,
+    PhraseScore,
+    count_table,
+    measure_counts,
+    score_inventory,
+)
 from tests.benchmarks.room import InRooms, RoomSettings, Variant
 from tests.benchmarks.scale import COARSE, errors
 from tests.benchmarks.scoring import Asked, evaluate_direct
@@ -564,7 +572,25 @@ def test_mistakes_end_with_one_line(words, capsys, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["rooms", "verdicts", "phrases", "lifting", "scale"])
+def test_counts_give_nothing_its_due():
+    def scored(true: int, said: int, seed: int = 1) -> CountScore:
+        score = PhraseScore(
+            "name", "x", "ours", seed, true > 0, said > 0, (0.4, 0.6) if true else (), (), 0.8, 0
+        )
+        return CountScore(score, true, said)
+
+    rows = [scored(0, 0), scored(0, 1), scored(1, 1), scored(1, 0), scored(3, 2), scored(2, 2)]
+    assert [row.overlaps for row in rows] == [(1, 1), (0, 0), (0.5, 0.8), (0, 0), (0.5, 0.8), (0.5, 0.8)]
+    table = count_table(rows)
+    assert cells(table, 6)[:3] == ["ours", "none", "2"]
+    assert [cells(table, line)[3:] for line in (6, 7, 8)] == [
+        [f"{share} +/- 0.0" for share in shares.split()]
+        for shares in ("50.0 50.0 50.0 50.0", "25.0 40.0 50.0 50.0", "50.0 80.0 100.0 50.0")
+    ]
+    assert cells(count_table(rows + [scored(0, 0, seed=2)]), 6)[3] == "75.0 +/- 35.4"
+
+
+@pytest.mark.parametrize("name", ["rooms", "verdicts", "phrases", "counts", "lifting", "scale"])
 def test_every_number_of_a_report_has_a_range(name):
     assert [setting.option for setting in numeric_settings(parse([name])) if setting.range is None] == []
 
@@ -573,6 +599,9 @@ def test_every_number_of_a_report_has_a_range(name):
 def test_verdicts_and_phrases_measure_the_same_room(run, tmp_path):
     rows = measure_verdicts(run.room, Variant("the method", "truth", codec=TINY.codec))
     assert {"object", "absent", "part", "absent part"} <= {row.kind for row in rows}
+    rows = measure_counts(run.room, Variant("the method", "truth", codec=TINY.codec))
+    assert {row.score.way for row in rows} == {"published", "ours"}
+    assert {min(row.true, 2) for row in rows} == {0, 1, 2}
     Phrases(("separate",), (101,), SETTINGS, run.work, tmp_path).run()
     figures = json.loads((tmp_path / "phrases.json").read_text())["rows"]
     assert {row["way"] for row in figures if "way" in row} == {"whole", "composed"}

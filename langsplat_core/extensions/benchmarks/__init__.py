@@ -10,6 +10,7 @@ EXTENSION = Extension(
     },
     commands={
         "eval lerf-ovs": f"{_HERE}.commands:EvalLerfOvs",
+        "eval gr-lerf": f"{_HERE}.commands:EvalGrLerf",
         "eval 3d-ovs": f"{_HERE}.commands:EvalOvs3d",
         "bench raster": f"{_HERE}.raster_speed:BenchRaster",
         "bench query": f"{_HERE}.query_speed:BenchQuery",

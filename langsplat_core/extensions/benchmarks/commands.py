@@ -10,6 +10,7 @@ import tyro
 from langsplat_core.cli.arguments import EncoderOption, OutFile
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.profiles import (
+    GR_PROFILES,
     LERF_PROFILES,
     OVS_PROFILES,
     LerfProtocol,
@@ -82,6 +83,22 @@ class EvalLerfOvs(_Eval):
         from langsplat_core.extensions.benchmarks.labels import read_lerf_ovs
 
         self.evaluate(read_lerf_ovs, LERF_PROFILES[self.protocol])
+
+
+@dataclass(frozen=True)
+class EvalGrLerf(_Eval):
+    """GR-LERF: phrases for none, one or several things; gIoU, and whether nothing is answered rightly.
+
+    DATA is a folder with SCENE/json/test_json/FRAME.json, or one SCENE; docs/evaluating.md has the layout.
+    """
+
+    protocol: LerfProtocol = "ours"
+    """Whose constants, as for lerf-ovs; langsplat's have no way to answer nothing."""
+
+    def run(self) -> None:
+        from langsplat_core.extensions.benchmarks.labels import read_gr_lerf
+
+        self.evaluate(read_gr_lerf, GR_PROFILES[self.protocol])
 
 
 @dataclass(frozen=True)

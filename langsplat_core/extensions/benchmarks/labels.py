@@ -49,7 +49,18 @@ class MaskFile:
         return resized(grey > (127 if grey.max(initial=0) > 1 else 0), size)
 
 
-Truth = Outlines | MaskFile  # true mask of a phrase in a frame
+@dataclass(frozen=True)
+class JoinedMasks:
+    """Masks of any number of things; of none the empty one."""
+
+    masks: tuple[Outlines | MaskFile, ...]
+
+    def draw(self, size: Size) -> Array:
+        """Return the mask on a grid of `size`, (H, W) bool."""
+        return np.any([mask.draw(size) for mask in self.masks] or [np.zeros(size[::-1], bool)], axis=0)
+
+
+Truth = Outlines | MaskFile | JoinedMasks  # true mask of a phrase in a frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +71,7 @@ class LabelledPhrase:
     truth: Truth
     # (B, 4) left, top, right, bottom on the label's grid, inclusive; None: no place is scored
     boxes: Array | None
+    targets: int | None = None  # things that it names in the frame; None: one at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,9 +213,7 @@ def _read_frame(path: Path) -> tuple[Frame, list[str]]:
     polygons: dict[str, list[Array]] = {}
     boxes: dict[str, list[Array]] = {}
     for number, item in enumerate(content.objects):
-        phrase, corners = item.category.strip(), np.array(item.segmentation, np.float64).reshape(-1, 2)
-        if not (np.abs(corners) <= 10 * max(size)).all():  # NaN fails too
-            raise FormatError(f"{path}: object {number} has corners far outside of the image")
+        phrase, corners = item.category.strip(), _corners(item.segmentation, size, f"{path}: object {number}")
         polygons.setdefault(phrase, [])
         if len(corners) >= 3:
             polygons[phrase].append(corners)
@@ -215,6 +225,13 @@ def _read_frame(path: Path) -> tuple[Frame, list[str]]:
     )
     without = [phrase for phrase, outlines in polygons.items() if not outlines]
     return Frame(path.stem, size, labels), without
+
+
+def _corners(stored: list[tuple[float, float]], size: Size, where: str) -> Array:
+    corners = np.array(stored, np.float64).reshape(-1, 2)
+    if not (np.abs(corners) <= 10 * max(size)).all():  # NaN fails too
+        raise FormatError(f"{where} has corners far outside of the image")
+    return corners
 
 
 def _box(stored: Any, polygon: Array) -> Array:
@@ -278,3 +295,83 @@ def _classes(path: Path) -> tuple[str, ...]:
     if not classes:
         raise FormatError(f"{path}: is empty; expected one class a line")
     return classes
+
+
+# GR-LERF (ZeroSplat, ECCV 2026): phrases for none, one or several things in LERF's scenes. No file of it was
+# at hand; what is read is the layout of Ref-LERF (ReferSplat, ICML 2025), with one thing for every phrase.
+#
+# <scene>/json/test_json/<frame>.json   object or objects [{category, sentence [...], segmentation}]; the last
+#                                       a file in <scene>/mask or gt_mask, or a polygon; none: no target
+# <scene>/                              photographs and cameras
+#
+# Things of a frame that share a sentence are its targets. A thing without sentences is asked by its category.
+
+
+class _Referred(msgspec.Struct):
+    category: str = ""
+    sentence: list[str] = []
+    segmentation: str | list[tuple[float, float]] | None = None
+
+
+class _ReferredFile(msgspec.Struct):
+    info: _Info | None = None
+    object: list[_Referred] = []
+    objects: list[_Referred] = []
+
+
+def read_gr_lerf(folder: Path) -> Benchmark:
+    """Return the labels in `folder`, which is the benchmark's or one scene's; errors as `read_lerf_ovs`."""
+    found = [
+        path.parents[1] for path in sorted({*folder.glob("json/test_json"), *folder.glob("*/json/test_json")})
+    ]
+    if not found:
+        raise InputError(
+            f"{folder}: not in the layout of GR-LERF; expected <scene>/json/test_json/<frame>.json in it"
+        )
+    scenes = {}
+    for scene in found:
+        paths = sorted((scene / "json" / "test_json").glob("*.json"))
+        frames = tuple(_referred_frame(path, scene) for path in paths)
+        if not any(frame.labels for frame in frames):
+            raise FormatError(f"{scene}: its files label nothing; expected objects with a sentence each")
+        scenes[scene.resolve().name] = LabelledScene(scene.resolve().name, frames, scene)
+    return Benchmark("gr-lerf", scenes)
+
+
+def _referred_frame(path: Path, scene: Path) -> Frame:
+    try:
+        content = msgspec.convert(read_json_file(path, LIMIT), _ReferredFile)
+    except msgspec.ValidationError as error:
+        raise FormatError(f"{path}: no label file of GR-LERF: {error}") from None
+    photograph = photograph_of(scene / "images", path.stem)
+    if content.info is not None:
+        size = content.info.width, content.info.height
+    elif photograph is not None:
+        size = picture_size(photograph)
+    else:
+        raise FormatError(f"{path}: has no info of width and height; add it, or images/{path.stem}.jpg")
+    masks: dict[str, list[Outlines | MaskFile]] = {}
+    for item in (*content.object, *content.objects):
+        for sentence in item.sentence or [item.category]:
+            own = masks.setdefault(" ".join(sentence.split()), [])
+            if isinstance(item.segmentation, str) and item.segmentation:
+                own.append(_mask_in(scene, item.segmentation, path))
+            elif item.segmentation:
+                corners = _corners(item.segmentation, size, f"{path}: {sentence!r}")
+                own.append(Outlines(size, (np.resize(corners, (max(len(corners), 3), 2)),)))
+    labels = (
+        LabelledPhrase(phrase, JoinedMasks(tuple(own)), None, len(own))
+        for phrase, own in masks.items()
+        if phrase
+    )
+    return Frame(path.stem, size, tuple(labels))
+
+
+def _mask_in(scene: Path, name: str, path: Path) -> MaskFile:
+    """Return the mask file of a scene that a label names; FormatError where it is not there."""
+    inside = not Path(name).is_absolute() and ".." not in Path(name).parts
+    candidates = [scene / folder / name for folder in ("mask", "gt_mask", ".")] if inside else []
+    found = next((one for one in candidates if one.is_file()), None)
+    if found is None:
+        raise FormatError(f"{path}: no mask file {name!r} in {scene / 'mask'}")
+    return MaskFile(found)

@@ -7,7 +7,7 @@ here depends on a label: a profile is chosen by name, and no threshold is search
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +20,7 @@ from langsplat_core.errors import FormatError
 from langsplat_core.extensions.benchmarks.labels import Size, check_same_image, read_grey
 from langsplat_core.io.hostile import opened, read_npy
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.raster.protocol import View
@@ -65,6 +66,7 @@ class OwnRule:
     share: float = 0.5  # of a pixel's light that comes from members, strictly above
     peak_window: int = 20  # px of an image of `rows` rows, as the paper's; in proportion for others
     rows: int = 731
+    composed: bool = False  # phrases are read by the grammar, else asked whole
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,7 @@ LERF_PROFILES: Mapping[str, Profile] = {
         _OURS,
     )
 }
+GR_PROFILES = {**LERF_PROFILES, "ours": replace(_OURS, rule=OwnRule(composed=True))}
 _OVS_PAPER = Profile(
     "langsplat-paper",
     "LangSplat's appendix: absolute 0.4, the level whose mask has the highest mean relevancy, no filter; its "
@@ -297,7 +300,10 @@ class SceneSource:
             vectors = engine.text_vectors(phrases)
             levels = [decoded_relevancy(view, engine.field, k, vectors, gate) for k in range(count)]
             return [read_maps(maps, rule) for maps in np.moveaxis(np.stack(levels), 3, 0)]
-        results = engine.run_many(phrases)
+        if isinstance(rule, OwnRule) and rule.composed:
+            results = [run_phrase(engine, phrase, viewpoint=camera).answer for phrase in phrases]
+        else:
+            results = engine.run_many(phrases)
         if isinstance(rule, OwnRule):
             return [own_prediction(view, result, rule) for result in results]
         if isinstance(rule, SilhouetteRule):

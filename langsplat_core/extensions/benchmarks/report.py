@@ -78,6 +78,8 @@ class QueryScore:
     unanswered: str = ""  # why there is no answer
     trained_on: bool | None = None  # whether the view is a training view; None: not known
     grid: Size = (0, 0)  # width and height that were scored
+    targets: int | None = None  # things that the phrase names in the frame, where that may be none
+    is_empty: bool = True  # whether nothing was answered
 
 
 def score_scene(
@@ -103,7 +105,7 @@ def score_scene(
                 size = answer.mask.shape[1], answer.mask.shape[0]
                 check_same_image(frame.name, size, frame.size)
             truth = label.truth.draw(size)
-            if not truth.any():
+            if label.targets != 0 and not truth.any():
                 left_out.append(f"{frame.name}: {label.phrase} (empty mask)")
                 continue
             placed = label.boxes is not None and not isinstance(profile.rule, SilhouetteRule)
@@ -111,6 +113,7 @@ def score_scene(
                 *(labelled.name, frame.name, label.phrase, 0.0, False if placed else None),
                 trained_on=source.trained_on(frame.name),
                 grid=size,
+                targets=label.targets,
             )
             if isinstance(answer, str):
                 score = replace(score, unanswered=answer)
@@ -120,6 +123,7 @@ def score_scene(
                     iou=intersection_over_union(answer.mask, truth),
                     hit=inside_any_box(answer.peaks, label.boxes, frame.size, size) if placed else None,
                     level="" if answer.level is None else LEVELS[answer.level],
+                    is_empty=not answer.mask.any(),
                 )
             scores.append(score)
         progress("asking phrases", (done + 1) / len(labelled.frames), labelled.name)
@@ -217,7 +221,24 @@ def table(report: BenchmarkReport) -> str:
         for name, row in summary(report).items()
     )
     head = ("", "queries", "mIoU %", "localisation %", "mAcc@0.25 %", "mAcc@0.5 %")
-    return "\n".join([markdown(head, rows), *notes(report)])
+    return "\n".join([markdown(head, rows), *target_table(report.queries), *notes(report)])
+
+
+def target_table(queries: Sequence[QueryScore]) -> list[str]:
+    """Return the scores by how many things a phrase names, as Markdown; nothing where that is not told.
+
+    Measures of GRES (CVPR 2023): gIoU is the mean of every query's IoU, of nothing 1 where nothing was
+    answered; no-target accuracy is the share of phrases for nothing that got that, target accuracy that of
+    the others that got something.
+    """
+    rows = []
+    for name, low, high in (("none", 0, 0), ("one", 1, 1), ("several", 2, np.inf), ("all", 0, np.inf)):
+        own = [one for one in queries if one.targets is not None and low <= one.targets <= high]
+        if own:
+            right = np.mean([one.is_empty == (one.targets == 0) and not one.unanswered for one in own])
+            rows.append((name, len(own), _percent(means(own).iou), _percent(float(right))))
+    head = ("things named", "queries", "gIoU %", "nothing or something, rightly %")
+    return [markdown(head, rows)] if rows else []
 
 
 def _percent(share: float | None) -> str:
@@ -291,8 +312,10 @@ N2F2          93.8  92.6   93.5  92.1  96.3
 def beside_published(report: BenchmarkReport) -> str:
     """Return a Markdown table of the report's scenes that others published too, and of their figures.
 
-    It is "" where there is no such scene.
+    It is "" where there is none.
     """
+    if report.benchmark not in _PUBLISHED:
+        return ""
     head, *lines = (line.split() for line in _PUBLISHED[report.benchmark].strip().splitlines())
     scenes, rows = [name for name in head if name in report.scenes], summary(report)
     if not scenes:

@@ -17,7 +17,13 @@ from assets.making.dataset import MIN_PIXELS, outlines, read_truth, write_labell
 from langsplat_core.cli.app import parse
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.extensions.benchmarks import profiles
-from langsplat_core.extensions.benchmarks.labels import Outlines, read_3d_ovs, read_lerf_ovs, without_suffix
+from langsplat_core.extensions.benchmarks.labels import (
+    Outlines,
+    read_3d_ovs,
+    read_gr_lerf,
+    read_lerf_ovs,
+    without_suffix,
+)
 from langsplat_core.extensions.benchmarks.profiles import (
     LERF_PROFILES,
     OVS_PROFILES,
@@ -35,6 +41,7 @@ from langsplat_core.extensions.benchmarks.report import (
     scored_size,
     summary,
     table,
+    target_table,
 )
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import silent
@@ -326,6 +333,42 @@ def test_macro_and_micro_means_and_all_figures_as_json(two_scenes, tmp_path):
     content = json.loads((tmp_path / "out.json").read_text())
     assert content["protocol"]["rule"] == {"alpha": 0.7, "grey": 10}
     assert [query["iou"] for query in content["queries"]] == pytest.approx([1, 0.5, 0.3, 0])
+
+
+def test_phrases_for_none_one_and_several_things_are_scored(tmp_path):
+    """GR-LERF: polygons and mask files; things that share a sentence are its targets."""
+    data, maps = tmp_path / "gr", tmp_path / "maps"
+    mask_file = data / "a" / "mask" / "one" / "cup.png"
+    silhouette(mask_file.parent, "cup", block(0, 0, 9, 9))
+    things = [
+        {"category": "cup", "sentence": ["the cup", "all of it"], "segmentation": "one/cup.png"},
+        {"category": "box", "sentence": ["all of it"], "segmentation": rectangle(20, 0, 29, 9)},
+        {"category": "dog", "sentence": ["a dog", "a cat"]},
+    ]
+    label = data / "a" / "json" / "test_json" / "one.json"
+    label.parent.mkdir(parents=True)
+    label.write_text(json.dumps({"info": {"width": 40, "height": 30}, "object": things}))
+    answers = {"the cup": (0, 0, 9, 9), "all of it": (0, 0, 9, 9), "a cat": (0, 0, 1, 1)}
+    for phrase, sides in answers.items():
+        silhouette(maps / "one", phrase, block(*sides))
+    silhouette(maps / "one", "a dog", np.zeros((30, 40), bool))
+    report = run_benchmark(read_gr_lerf(data), DIRECT, Evaluated(maps=maps), no_encoder)
+    scores = {one.phrase: (one.targets, one.iou, one.is_empty) for one in report.queries}
+    assert scores["the cup"] == (1, 1.0, False)
+    assert scores["all of it"] == (2, 0.5, False)
+    assert (scores["a dog"], scores["a cat"]) == ((0, 1.0, True), (0, 0.0, False))
+    (said,) = target_table(report.queries)
+    lines = [[cell.strip() for cell in line.strip("| ").split("|")] for line in said.splitlines()[2:]]
+    assert lines[0] == ["none", "2", "50.0", "50.0"]
+    assert lines[-1] == ["all", "4", "62.5", "75.0"]
+    assert said in table(report)
+    assert not target_table([replace(one, targets=None) for one in report.queries])
+    for wrong in ("../one/cup.png", "/etc/passwd", "absent.png"):
+        label.write_text(json.dumps({"object": [things[0] | {"segmentation": wrong}], "info": None}))
+        with pytest.raises(FormatError):
+            read_gr_lerf(data)
+    with pytest.raises(InputError, match="GR-LERF"):
+        read_gr_lerf(tmp_path / "nowhere")
 
 
 def test_a_missing_map_counts_as_wrong_and_is_named(two_scenes):
