@@ -27,7 +27,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import PARTS, forms
 from langsplat_core.query.rule import RULE
 from langsplat_core.raster.render import splat_colours, view_of
-from langsplat_core.scene import Calibration, CodebookCodec, Fits, PlattScaling, Scene, Tree
+from langsplat_core.scene import Calibration, CodebookCodec, PlattScaling, Scene, Tree
 from langsplat_core.semantics.encoders import Encoder
 from langsplat_core.semantics.features import masked_crop
 from langsplat_core.semantics.relevancy import bundled_vocabulary
@@ -107,16 +107,13 @@ class NamedRoom:
     scene: Scene
     tree: Tree
     owners: Array  # (K,) the root that each node of the tree is in
-    names: Mapping[int, Sequence[str]]  # of nodes
+    wholes: Mapping[int, Sequence[str]]  # node -> what it is called
+    parts: Mapping[int, Sequence[str]]  # the same of those with a word of their own
     called: frozenset[str]  # single words
 
     def has_not(self, phrase: str) -> bool:
         """Return whether no word of a phrase, in either number, is one for anything there."""
         return all(self.called.isdisjoint(forms(word)) for word in phrase.split())
-
-    def named(self, level: int) -> dict[int, Sequence[str]]:
-        """Return the nodes of a level that have a name."""
-        return {node: names for node, names in self.names.items() if self.tree.levels[node] == level}
 
 
 def bundled_room() -> NamedRoom:
@@ -131,7 +128,11 @@ def bundled_room() -> NamedRoom:
     owners = np.arange(tree.count)
     while (rising := tree.parents[owners] >= 0).any():
         owners[rising] = tree.parents[owners[rising]]
-    return NamedRoom(scene, tree, owners, stated.names, frozenset(words))
+    parts, wholes = (
+        {node: names for node, names in stated.names.items() if tree.levels[node] == level}
+        for level in (1, 2)
+    )
+    return NamedRoom(scene, tree, owners, wholes, parts, frozenset(words))
 
 
 def check_encoder(encoder: Encoder, progress: Progress = silent) -> EncoderReport:
@@ -144,27 +145,29 @@ def check_encoder(encoder: Encoder, progress: Progress = silent) -> EncoderRepor
         parts.append(encoder.encode_images(crops[first : first + BATCH]))
     images = np.concatenate(parts)
     progress("encoding names", 0.0)
-    names = dict.fromkeys(name for own in room.named(2).values() for name in own)
+    names = dict.fromkeys(name for own in room.wholes.values() for name in own)
     there = [name for name in names if not encoder.unknown_words(name)]
     plain = (name for name in bundled_vocabulary("things") if name.replace(" ", "").isalpha())
     absent = [name for name in filter(room.has_not, plain) if not encoder.unknown_words(name)]
+    if min(len(there), len(absent)) < FEWEST:
+        raise InputError(f"{encoder.id}: was taught too few words for things in the bundled room")
     engine = _engine(room, encoder, nodes, images)
     geometry = _geometry(room, engine, nodes, images, there, absent)
     rates, scalings, reason = [], {}, ""
     asked = _phrases(room, engine, there, absent)
     for done, (kind, texts) in enumerate(asked.items()):
         progress("asking", done / len(asked), ASKED[kind])
-        answers = [_answers(engine, some[:: -(-len(some) // MOST) or 1]) for some in texts]
-        fits = [np.array([own for own, _ in some]).reshape(-1, 3) for some in answers]
-        found, wrong = (sum(is_found for _, is_found in some) / max(len(some), 1) for some in answers)
+        fits, shares = zip(
+            *(_answers(engine, some[:: -(-len(some) // MOST) or 1]) for some in texts), strict=True
+        )
         calibrated = None
         try:
             scalings[kind] = fit_scaling(*fits)
             calibrated = _cross_validated(*fits)
         except InputError as error:
             reason = reason or f"{kind}: {error}"
-        present, missing = map(len, answers)
-        rates.append(Rates(kind, present, missing, found, 1 - wrong, calibrated))
+        found, wrong = shares
+        rates.append(Rates(kind, len(fits[0]), len(fits[1]), found, 1 - wrong, calibrated))
     return EncoderReport(
         encoder=encoder.id,
         dim=encoder.dim,
@@ -238,9 +241,9 @@ def _geometry(
     by_name, by_image = cosines.mean(0), cosines.mean(1)
     shares = np.cumsum(np.linalg.svd(images - images.mean(0), compute_uv=False) ** 2)
     margins = own - (images @ engine.field.canonical.T).max(1, keepdims=True)
-    rows = np.flatnonzero(np.isin(nodes, list(room.named(2))))
+    rows = np.flatnonzero(np.isin(nodes, list(room.wholes)))
     nearest = own[rows].argmax(1)
-    right = [there[name] in room.names[nodes[row]] for row, name in zip(rows, nearest, strict=True)]
+    right = [there[name] in room.wholes[nodes[row]] for row, name in zip(rows, nearest, strict=True)]
     figures = {
         "own": np.median(own.max(0)),
         "other": np.median(other.max(0)),
@@ -269,8 +272,8 @@ def _phrases(
         return sorted(word for word in words if not engine.unknown_words(word))
 
     on: dict[str, set[str]] = {}  # a thing -> words of its parts
-    for node, names in room.named(1).items():
-        for thing in room.names.get(int(room.owners[node]), ())[:1]:
+    for node, names in room.parts.items():
+        for thing in room.wholes.get(int(room.owners[node]), ())[:1]:
             on.setdefault(thing, set()).update(names)
     parts = known(set().union(*on.values()))
     inside: tuple[list[str], list[str]] = [], []
@@ -284,10 +287,11 @@ def _phrases(
     return {"thing": (there, absent), "part": (parts, lacking), "inside": inside}
 
 
-def _answers(engine: QueryEngine, texts: Sequence[str]) -> list[tuple[Fits, bool]]:
-    """Return the best fits of each phrase, and whether it was found."""
-    answers = (run_phrase(engine, text).answer for text in texts)
-    return [(one.fits, one.found) for one in answers]
+def _answers(engine: QueryEngine, texts: Sequence[str]) -> tuple[Array, float]:
+    """Return the (n, 3) best fits of phrases, and the share that was found."""
+    answers = (run_phrase(engine, text).answer for text in texts)  # a megabyte each
+    rows = np.array([(*one.fits, one.found) for one in answers]).reshape(-1, 4)
+    return rows[:, :3], float(rows[:, 3].mean()) if len(rows) else 0.0
 
 
 def report_lines(report: EncoderReport) -> str:
@@ -316,6 +320,7 @@ def report_lines(report: EncoderReport) -> str:
 
 # Platt scaling (Platt 1999) of fits, with Platt's smoothed targets.
 
+FEWEST = 10  # phrases of either kind that a calibration is fitted to
 REJECTED = 0.95  # of what is absent, among the phrases that a calibration is fitted to
 
 
@@ -324,7 +329,7 @@ def fit_scaling(present: Array, absent: Array) -> PlattScaling:
 
     Raises InputError where there are fewer than ten of either, or the fits do not tell them apart.
     """
-    if min(len(present), len(absent)) < 10:
+    if min(len(present), len(absent)) < FEWEST:
         raise InputError("a calibration needs ten phrases for what is there and ten for what is not")
     fits = np.concatenate([present, absent])
     features = np.stack([fits[:, 2], fits[:, :2].max(axis=1)], axis=1)
