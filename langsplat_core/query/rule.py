@@ -3,7 +3,8 @@
 A fit (`semantics.relevancy.Scale`) says by how many spreads a region is nearer to a phrase than everyday
 phrases are by chance, so that one rule serves all encoders. The exported page has the table as JSON and
 `decide` in JavaScript (`web/rule.js`); the index over scans calls these functions for many scenes at once.
-The numbers were chosen on rooms 201 to 203, with the bundled encoder and CLIP's geometry.
+The numbers were chosen on rooms 201 to 203, with the bundled encoder and CLIP's geometry; `common_share` on
+401 and 402, in four real spaces and with CLIP's geometry.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,6 +33,7 @@ class Rule:
     # and at the finer levels. One absent phrase in twenty exceeds them.
     found: Mapping[Sought, tuple[float, float]]
     part_share: float = 0.25  # weight of its best part in the fit of a region: of a thing, something is sure
+    common_share: float = 0.4  # of a phrase's mean fit, by how near it lies to everything here: no evidence
     reach: float = 0.45  # of the best fit: a region that fits less by this or less belongs to the answer,
     nearest: float = 0.15  # by this at least,
     farthest: float = 1.0  # and by this at most
@@ -104,6 +106,22 @@ def region_relevancies(fits: Array) -> Array:
     return np.where(fits > RULE.nothing, sigmoid(fits), 0)
 
 
+def common_fits(table: RegionTable, fits: Array) -> Array:
+    """Return the (S, ...) means of (R, ...) fits over the regions of each scene, without crumbs and nothing.
+
+    Some phrases lie near to all images and others far from all, "hand" and "pink ice cream" in CLIP by three
+    times what tells regions apart: the best fit of a phrase grows with its mean.
+    """
+    heard = ((fits > RULE.nothing).T & table.solid).T
+    counts = table.counts.sum(1)
+    filled, starts = counts > 0, np.cumsum(counts) - counts
+    totals = np.zeros((2, len(counts), *fits.shape[1:]))
+    if filled.any():
+        for total, values in zip(totals, (np.where(heard, fits, 0), heard), strict=True):
+            total[filled] = np.add.reduceat(values, starts[filled], axis=0, dtype=np.float64)
+    return np.asarray(totals[0] / np.maximum(totals[1], 1))
+
+
 def best_relevancies(table: RegionTable, relevancies: Array) -> Array:
     """Return the (S, 3) best of the (R,) `relevancies`; of crumbs only where a level has no more."""
     counts = table.counts.ravel()
@@ -138,14 +156,17 @@ Bars = tuple[Bar, Bar, Bar, Bar]  # of each level, and of the better one of the 
 
 
 def bars_of(table: RegionTable, chance: Array, chosen: Array | None = None) -> Bars:
-    """Return the bars of (R, V) fits of everyday phrases in a scene, or in its `chosen` (R,) regions."""
-    best = []
+    """Return the bars of (R, V) fits of everyday phrases in a scene, less their common fits.
+
+    In its `chosen` (R,) regions alone, those of one thing, what phrases have in common with all is kept.
+    """
+    best, common = [], RULE.common_share * common_fits(table, chance)[0] if chosen is None else 0
     for level in range(len(LEVELS)):
         solid = table.level(level, table.solid)
         counts = solid if solid.any() else np.ones_like(solid)
         if chosen is not None:
             counts = counts & table.level(level, chosen)
-        best.append(table.level(level, chance)[counts].max(0, initial=-np.inf))
+        best.append(table.level(level, chance)[counts].max(0, initial=-np.inf) - common)
     subpart, part, whole = best
     return _bar(subpart), _bar(part), _bar(whole), _bar(np.maximum(subpart, part))
 
@@ -236,12 +257,21 @@ def combined(verdicts: Sequence[Verdict], all_needed: bool) -> Verdict:
 
 
 def judge(
-    fits: Fits, sought: Sought, level: LevelChoice, bars: Bars | None, calibration: Calibration | None
+    fits: Fits,
+    sought: Sought,
+    level: LevelChoice,
+    bars: Bars | None,
+    calibration: Calibration | None,
+    common: float = 0.0,
 ) -> Verdict:
-    """Return the verdict that the best fits of a scene's levels stand for; `bars` without a calibration."""
+    """Return the verdict that the best fits of a scene's levels stand for; `bars` without a calibration.
+
+    common: the phrase's own of `common_fits`, if the bars are of a whole scene.
+    """
     if calibration is None:
         assert bars is not None
-        margin = excess(fits, bars, sought, level)
+        subpart, part, whole = (fit - RULE.common_share * common for fit in fits)
+        margin = excess((subpart, part, whole), bars, sought, level)
         return Verdict(margin >= 0, "chance", margin)
     ways = {"thing": calibration.thing, "inside": calibration.inside}
     scaling = ways.get(sought, calibration.part)
@@ -296,7 +326,7 @@ def decide(
         relevancies=shown,
         inside=table.level(chosen, fits) >= RULE.least_fit(float(best[chosen])),
         best=int(solid.argmax()) if solid.max(initial=0) > 0 else -1,
-        verdict=judge(triple(best), named, level, bars, calibration),
+        verdict=judge(triple(best), named, level, bars, calibration, float(common_fits(table, fits)[0])),
     )
 
 

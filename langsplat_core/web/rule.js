@@ -55,6 +55,12 @@ function bestRelevancy(rule, regions, relevancies, level) {
   return Math.max(solid > -Infinity ? solid : any, 0);
 }
 
+// The mean fit of regions, without crumbs and nothing.
+function commonFit(rule, regions, fits) {
+  const heard = fits.filter((fit, region) => fit > rule.nothing && regions.sizes[region] >= rule.smallest);
+  return heard.reduce((sum, fit) => sum + fit, 0) / Math.max(heard.length, 1);
+}
+
 // Spreads by which the best fits of the levels exceed those from which a phrase is found. level: number, or -1
 // where it is free. bars: of each level, and of the better one of the finer two.
 function excess(rule, fits, named, level, bars) {
@@ -73,10 +79,12 @@ function verdict(rule, found, reached, margin, probability = null) {
   return { outcome, found, reached, margin, probability };
 }
 
-// The verdict that the best fits of the levels stand for. level: number, or -1 where it is free.
-function judge(rule, fits, named, level, { bars, calibration }) {
+// The verdict that the best fits of the levels stand for. level: number, or -1 where it is free. common: the
+// phrase's mean fit.
+function judge(rule, fits, named, level, { bars, calibration }, common) {
   if (!calibration) {
-    const margin = excess(rule, fits, named, level, bars);
+    const evidence = fits.map((fit) => fit - rule.common_share * common);
+    const margin = excess(rule, evidence, named, level, bars);
     return verdict(rule, margin >= 0, "chance", margin);
   }
   const odds = named === "thing" ? calibration.thing : calibration.part;
@@ -117,7 +125,7 @@ function decide(rule, regions, own, named, level, evidence) {
     regionFits: every,
     inside,
     best,
-    verdict: judge(rule, fits, named, level, evidence),
+    verdict: judge(rule, fits, named, level, evidence, commonFit(rule, regions, every)),
   };
 }
 

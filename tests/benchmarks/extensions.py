@@ -335,9 +335,10 @@ def compare(room: Room, masks: MaskOrigin) -> Iterator[Compared]:
         write_library(Path(folder, "index"), [digest(path, path.name, lambda _: room.encoder)])
         group = read_library(Path(folder, "index"), Path(folder)).groups[0]
         for answer in engine.run_many([text for text in room.texts if not engine.unknown_words(text)]):
-            fits = fits_in(group, engine.text_vectors([answer.phrase])[0])[0]
+            (fits,), (common,) = fits_in(group, engine.text_vectors([answer.phrase])[0])
             scene, kind = group.scenes[0], named(answer.phrase)
-            verdict = judge(triple(fits), kind, "auto", scene.bars, scene.calibration).outcome
+            judged = scene.bars, scene.calibration, float(common)
+            verdict = judge(triple(fits), kind, "auto", *judged).outcome
             error = float(np.abs(fits - answer.fits).max())
             yield Compared(room.seed, masks, answer.phrase, verdict, answer.verdict, error)
 

@@ -13,7 +13,16 @@ from langsplat_core.query.answers import QueryResult, Regions, build_regions, by
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
-from langsplat_core.query.rule import RULE, Bar, RegionTable, bars_of, excess, region_fits
+from langsplat_core.query.rule import (
+    RULE,
+    Bar,
+    RegionTable,
+    bars_of,
+    common_fits,
+    excess,
+    judge,
+    region_fits,
+)
 from langsplat_core.scene import (
     LEVELS,
     NO_NODE,
@@ -189,14 +198,41 @@ def test_bars_are_quantiles_of_the_best_fits():
     fits[:, 4] += 9  # crumbs, which do not count
     table = RegionTable(np.full((1, 3), 9), np.full(27, -1), solid)
     bars = bars_of(table, fits.reshape(27, 101))
-    best = np.delete(fits, 4, axis=1).max(1)
+    heard = np.delete(fits, 4, axis=1)
+    best = heard.max(1) - RULE.common_share * heard.mean((0, 1))
     for bar, level in zip(bars, (*best, best[:2].max(0)), strict=True):
         low, median = np.quantile(level, [0.16, 0.5])
         assert (bar.median, bar.spread) == (pytest.approx(median), pytest.approx(median - low))
     some = bars_of(table, fits.reshape(27, 101), np.isin(np.arange(27), [2, 9, 10]))
-    assert some[0].median < bars[0].median
+    assert some[0].median == pytest.approx(np.median(fits[0, 2]))
     assert not np.isfinite(some[2].median)  # nothing is found where there is nothing
     assert np.isfinite(bars_of(replace(table, solid=~solid & False), fits.reshape(27, 101))[0].median)
+
+
+def test_common_fits_are_means_over_what_has_features():
+    rng = np.random.default_rng(2)
+    counts, fits = np.array([[3, 2, 1], [0, 0, 0], [4, 1, 2]]), rng.normal(size=(13, 5)).astype(np.float32)
+    fits[2], fits[9, 3] = RULE.nothing - 1, RULE.nothing - 1  # without a feature, and nothing of one phrase
+    table = RegionTable(counts, np.full(13, -1), np.arange(13) % 5 != 4)
+    want = np.zeros((3, 5))
+    for scene, rows in enumerate((range(6), (), range(6, 13))):
+        for phrase in range(5):
+            kept = [row for row in rows if table.solid[row] and fits[row, phrase] > RULE.nothing]
+            for row in kept:
+                want[scene, phrase] += np.float64(fits[row, phrase]) / len(kept)
+    np.testing.assert_allclose(common_fits(table, fits), want, atol=1e-12)
+    np.testing.assert_allclose(common_fits(table, fits[:, 1]), want[:, 1], atol=1e-12)
+
+
+def test_verdicts_by_chance_leave_out_what_lies_near_everything():
+    fits, plain = (1.0, 2.0, 3.0), judge((1.0, 2.0, 3.0), "thing", "auto", BARS, None)
+    near = judge(fits, "thing", "auto", BARS, None, common=1 / RULE.common_share)
+    by_hand = judge((0.0, 1.0, 2.0), "thing", "auto", BARS, None)
+    assert near.margin == pytest.approx(by_hand.margin)
+    assert near.margin < plain.margin
+    calibration = Calibration(*[PlattScaling(-2.0, 1.5, 0.5)] * 3)
+    told = [judge(fits, "thing", "auto", None, calibration, common) for common in (0.0, 2.0)]
+    assert told[0] == told[1]
 
 
 @pytest.mark.parametrize("named", RULE.found)

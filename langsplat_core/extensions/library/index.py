@@ -50,6 +50,7 @@ from langsplat_core.query.rule import (
     RegionTable,
     Verdict,
     best_relevancies,
+    common_fits,
     judge,
     region_fits,
     region_relevancies,
@@ -65,7 +66,7 @@ from langsplat_core.semantics.relevancy import fit_of
 
 log = logging.getLogger("langsplat")
 INDEX = ".langsplat-library"  # its name in the folder
-SCENES = "scenes"  # key of the metadata
+SCENES = "scenes 2"  # key of the metadata; "scenes" has bars of fits that common fits are in
 THUMBNAIL = (96, 72)  # width and height, pixels, of the picture that the index keeps of a scene
 REMADE = "remove it, and it is made again"
 PICTURE = (320, 240)  # and of the picture of an answer
@@ -414,11 +415,11 @@ def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> 
 # The first pass: fits of a phrase in all scenes of a group.
 
 
-def fits_in(group: EncoderGroup, vector: Array) -> Array:
-    """Return the (S, 3) float64 fits of a phrase's (D,) unit vector in every scene, see `QueryResult.fits`.
+def fits_in(group: EncoderGroup, vector: Array) -> tuple[Array, Array]:
+    """Return the (S, 3) float64 fits of a phrase's (D,) unit vector in every scene, and (S,) `common_fits`.
 
-    They are -inf in scenes that are not indexed. Raises FormatError for an index whose numbers do not fit
-    each other.
+    Fits are as in `QueryResult.fits`, -inf in scenes that are not indexed. Raises FormatError for an index
+    whose numbers do not fit each other.
     """
     arrays, phrase = group.columns, np.require(vector, np.float32, "C")
     means, sound = np.zeros(len(arrays.parents)), np.ones(len(group.scenes), bool)
@@ -433,7 +434,7 @@ def fits_in(group: EncoderGroup, vector: Array) -> Array:
     fits = region_fits(group.table, fit_of(means))
     best = fit_of(best_relevancies(group.table, region_relevancies(fits)))
     indexed = np.array([scene.is_indexed for scene in group.scenes], bool)
-    return np.where(indexed[:, None], best, -np.inf)
+    return np.where(indexed[:, None], best, -np.inf), common_fits(group.table, fits)
 
 
 @partial(helper, fastmath={"reassoc", "contract", "nsz"})
@@ -570,9 +571,10 @@ def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[Verdict]:
     """Return the verdict on every scene by the index alone: on the best of some phrases."""
     best = [Verdict(False, "chance", -math.inf)] * len(group.scenes)
     for text, vector in vectors.items():
-        for row, (scene, fits) in enumerate(zip(group.scenes, fits_in(group, vector), strict=True)):
+        for row, (scene, fits, common) in enumerate(zip(group.scenes, *fits_in(group, vector), strict=True)):
             if scene.is_indexed:
-                verdict = judge(triple(fits), named(text), "auto", scene.bars, scene.calibration)
+                judged = scene.bars, scene.calibration, float(common)
+                verdict = judge(triple(fits), named(text), "auto", *judged)
                 best[row] = max(best[row], verdict, key=lambda found: found.margin)
     return best
 

@@ -87,14 +87,14 @@ def test_scenes_with_a_field_are_found_in_all_folders(folder):
 def test_the_index_has_the_fits_of_the_engine(folder, phrase):
     group = update_library(folder, load_encoder=load).groups[0]
     vector = FakeEncoder().encode_texts([phrase])[0]
-    for scene, fits in zip(group.scenes, fits_in(group, vector), strict=True):
+    for scene, fits, common in zip(group.scenes, *fits_in(group, vector), strict=True):
         answer = QueryEngine(load_scene(folder / scene.path), load).run(phrase)
         if scene.path == "linear.spz":
             assert not scene.is_indexed
             assert np.isneginf(fits).all()
         else:
             np.testing.assert_allclose(fits, answer.fits, atol=0.05)  # spreads; 8 bits of a codeword
-            verdict = judge(triple(fits), "thing", "auto", scene.bars, scene.calibration)
+            verdict = judge(triple(fits), "thing", "auto", scene.bars, scene.calibration, float(common))
             assert (verdict.outcome, verdict.probability) == (answer.verdict, answer.probability)
             assert verdict.margin == pytest.approx(answer.judgement.margin, abs=0.2)
 
@@ -520,8 +520,9 @@ def index_verdicts(engine: QueryEngine, phrases: list[str], folder: Path) -> Ite
     group = read_library(folder / "index", folder).groups[0]
     (scene,) = group.scenes
     for phrase in phrases:
-        (fits,) = fits_in(group, engine.text_vectors([phrase])[0])
-        yield fits, judge(triple(fits), named(phrase), "auto", scene.bars, scene.calibration)
+        (fits,), (common,) = fits_in(group, engine.text_vectors([phrase])[0])
+        judged = scene.bars, scene.calibration, float(common)
+        yield fits, judge(triple(fits), named(phrase), "auto", *judged)
 
 
 @pytest.mark.long
