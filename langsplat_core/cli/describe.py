@@ -83,7 +83,7 @@ class Describe:
         if self.outline:
             print(*outline_lines(found, unit_of(scene.metres_per_unit, scene.origin)), sep="\n")
         else:
-            _print_inventory(found)
+            _print_inventory(found, scene.origin)
         print(f"answers: {engine.basis.long}")
         if left_out:
             names = ", ".join(left_out[:3]) + (" ..." if len(left_out) > 3 else "")
@@ -120,13 +120,13 @@ def _percent(described: dict[str, Any]) -> str:
     return "" if described["probability"] is None else f" {100 * described['probability']:.0f} %"
 
 
-def _print_inventory(entries: list[dict[str, Any]]) -> None:
+def _print_inventory(entries: list[dict[str, Any]], origin: Array) -> None:
     table = Table("what", "also", "level", "p %", "surface %", "centre", box=None)
     for entry in entries:
         sure = _percent(entry).strip(" %") or "-"
         names = (entry["phrase"], ", ".join(entry["also"]), entry["level"], sure)
         for number, spot in enumerate(entry["spots"]):
-            centre = length_text(spot["centre"], least=2)
+            centre = length_text(spot["centre"] - origin, least=2, origin=origin)
             start = names if number == 0 else ("", "", "", "")
             table.add_row(*start, f"{100 * spot['share']:.2f}", centre)
     console = OutputConsole()

@@ -166,7 +166,7 @@ class Convert:
             scene = replace(self._read(), path=self.source)
             if scene.origin.any():
                 where = " ".join(f"{value:.10g}" for value in scene.origin)
-                print(f"{self.out}: positions are relative to {where}, for which checkpoints have no room")
+                print(f"{self.out}: checkpoints have no room for an origin: *.origin.json keep {where}")
             return scene
 
         with TerminalProgress() as progress:

@@ -19,6 +19,7 @@ import numpy as np
 from msgspec import Struct
 
 from langsplat_core import registry
+from langsplat_core.arrays import Array
 from langsplat_core.config import CodecConfig
 from langsplat_core.errors import STRICTNESS, InputError, report_loss
 from langsplat_core.io import cameras as camera_files
@@ -189,14 +190,13 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
 
     Logs a warning where positions were rounded to float32 far from zero before they were written.
     """
-    beside = companion_path(path, ORIGIN_SUFFIX)
-    if exists(beside):
-        try:
-            named = decode_json(read_file(beside, 1 << 16), _Origin, beside).origin
-        except InputError as error:
-            report_loss("opened without its origin: %s", error)
-            return replace(scene, unread=(str(error),))
-        return replace(scene, origin=np.array(named))
+    try:
+        named = read_origin(path)
+    except InputError as error:
+        report_loss("opened without its origin: %s", error)
+        return replace(scene, unread=(str(error),))
+    if named is not None:
+        return replace(scene, origin=named)
     if not scene.origin.any():
         means, origin = about_origin(scene.gaussians.means)
         if not origin.any():
@@ -213,6 +213,19 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
             *(path, step),
         )
     return scene
+
+
+def read_origin(path: Path) -> Array | None:
+    """Return the origin (3,) that the companion of a file names; None without one. InputError if damaged."""
+    beside = companion_path(path, ORIGIN_SUFFIX)
+    if not exists(beside):
+        return None
+    return np.array(decode_json(read_file(beside, 1 << 16), _Origin, beside).origin)
+
+
+def write_origin(path: Path, origin: Array) -> None:
+    """Write an origin (3,) as the companion `path` of a file whose format has no room for it."""
+    write_json(path, {"origin": origin.tolist()})
 
 
 def warn_of_undrawable(path: Path, gaussians: Gaussians) -> None:
@@ -271,7 +284,7 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
             in_world = tuple(camera.moved(scene.origin) for camera in scene.cameras)
             camera_files.write_cameras(renames.enter_context(atomic_path(cameras)), in_world)
         if beside := "origin" in row.loses and bool(scene.origin.any()):
-            write_json(renames.enter_context(atomic_path(origin)), {"origin": scene.origin.tolist()})
+            write_origin(renames.enter_context(atomic_path(origin)), scene.origin)
         new_sidecar = None if scene.language is None else renames.enter_context(atomic_path(sidecar))
         new_file = renames.enter_context(atomic_path(path))
         row.write(new_file, scene)

@@ -155,7 +155,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
             scene = Scene(gaussians, language, views.cameras, metres_per_unit=metres, origin=capture.origin)
             save_scene(run.out, scene)
             small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
-            near = config.radiance.near
+            near = config.radiance.near or scene.near  # as whoever opens the scene has it
             scores = evaluate_views(gaussians, capture, held_out, small=small, near=near) if held_out else []
         report = TrainReport(
             views=len(views),
@@ -178,7 +178,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
             held_out_views=tuple(scores),
             rehearsed=rehearsed,
         )
-        write_reports(run.work, report, capture, gaussians, config.radiance.near)
+        write_reports(run.work, report, capture, gaussians, near)
     processes.barrier()
     return read_report(run.work)
 

@@ -80,7 +80,7 @@ def write_page(
     tensors = pack_gaussians(scene.gaussians.take(rows), centre)
     meta: dict[str, Any] = {
         "title": title,
-        "origin": centre.tolist(),
+        "origin": scene.in_world(centre).tolist(),
         "radius": radius,
         "up": scene.up().tolist(),
         "metres_per_unit": scene.metres_per_unit,
@@ -242,10 +242,10 @@ def _region_tables(engine: QueryEngine) -> dict[str, Array]:
     """Return tensors of all regions, those of subparts first.
 
     `share_of`, `share_code` and `share` are a sparse matrix that takes relevancies of codewords to means of
-    regions; beside it sizes, parents, places, boxes and corners.
+    regions; beside it sizes, parents, places and boxes in the world, corners relative to the page's origin.
     """
     field, regions = engine.field, engine.regions
-    means = engine.scene.gaussians.means
+    scene, means, (centre, _) = engine.scene, engine.scene.gaussians.means, engine.scene.bounds()
     firsts = np.cumsum([0, *map(len, regions.nodes)])
     shares, places, boxes, corners = [], [], [], []
     for level, (first, total) in enumerate(zip(firsts, regions.totals, strict=False)):
@@ -255,7 +255,8 @@ def _region_tables(engine: QueryEngine) -> dict[str, Array]:
         found = [place_of(means[own]) for own in each]
         places += [place for place, _ in found]
         boxes += [box.ravel() for _, box in found]
-        corners += [oriented_box(means[own[:: -(-len(own) // BOXED)]]).corners.ravel() for own in each]
+        around = [oriented_box(means[own[:: -(-len(own) // BOXED)]]).corners for own in each]
+        corners += [(eight - centre).ravel() for eight in around]
         own = counted[field.known[level, counted]]
         where = regions.everywhere[level, own], field.latents[level, own, 0]
         shape = len(total), field.codec.size
@@ -269,8 +270,8 @@ def _region_tables(engine: QueryEngine) -> dict[str, Array]:
         "share": share.astype(np.float32),
         "sizes": np.concatenate(regions.sizes).astype(np.uint32),
         "parents": regions.table.parents.astype(np.int32),
-        "places": np.array(places, np.float64).reshape(count, 3),
-        "boxes": np.array(boxes, np.float64).reshape(count, 6),
+        "places": scene.in_world(np.reshape(places, (count, 3))),
+        "boxes": scene.in_world(np.reshape(boxes, (count, 2, 3))).reshape(count, 6),
         "corners": np.array(corners, np.float32).reshape(count, 24),
     }
 

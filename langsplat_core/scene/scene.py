@@ -196,17 +196,36 @@ def near_plane(gaussians: Gaussians, cameras: Sequence[Camera], most: float | No
 
 
 def bounds_of(gaussians: Gaussians) -> tuple[Array, float]:
-    """Robust centre (3,) and radius in world units, > 0: medians, so that floaters do not count."""
+    """Robust centre (3,) and radius in world units, > 0: medians, so that floaters do not count.
+
+    Neither depends on how the world's axes lie.
+    """
     valid = gaussians.valid()
     means = gaussians.means[valid].astype(np.float64)
     if len(means) == 0:
         return np.zeros(3), 1.0
-    centre = np.median(means, axis=0)
+    centre = geometric_median(means[:: len(means) // SAMPLES + 1])
     radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.7))
     # One Gaussian alone has a radius too; and far from the origin float32 positions are coarse, and a camera
     # needs a distance that it can tell.
     size = float(np.exp(np.median(gaussians.log_scales[valid].astype(np.float64))))
     return centre, max(radius, size, 1e-6 * float(np.abs(centre).max()))
+
+
+def geometric_median(points: Array) -> Array:
+    """(N, 3) points, N >= 1 -> (3,) float64, from where the sum of distances to them is least (Weiszfeld)."""
+    centre = np.median(points, axis=0)
+    for _ in range(100):
+        offsets = points - centre
+        away = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
+        if not (mean := float(away.mean())):  # all in one place
+            break
+        pull = 1 / np.maximum(away, 1e-9 * mean)
+        step = pull / pull.sum() @ offsets
+        centre = centre + step
+        if np.linalg.norm(step) <= 1e-6 * mean:
+            break
+    return np.asarray(centre)
 
 
 # Far from zero float32 is coarse: at a northing of 5 400 000 m positions lie half a metre apart. So what is
@@ -301,6 +320,12 @@ class Scene:
             path=None,
         )
 
+    def recoloured(self, gaussians: Gaussians) -> "Scene":
+        """Return the scene with `gaussians` in the same places; what follows from these is handed on."""
+        made = replace(self, gaussians=gaussians)
+        vars(made)["near"] = self.near
+        return made
+
     def raster_settings(self, profile: RasterSettings | None = None) -> RasterSettings:
         """`profile` with the antialiasing and the focal length that this scene was trained with.
 
@@ -334,11 +359,16 @@ class Scene:
         """Robust centre (3,) and radius in world units, > 0: see `bounds_of`."""
         return bounds_of(self.gaussians)
 
+    def _level(self, up: Array) -> tuple[Array, Array]:
+        """Two (3,) unit directions across `up` and each other: the first camera's right, else of an axis."""
+        right = self.cameras[0].rotation[0] if self.cameras else across(up)
+        right = right - (right @ up) * up
+        side = unit(right if np.linalg.norm(right) > 0.1 else across(up))
+        return side, np.cross(up, side)
+
     def _across(self, centre: Array, radius: float, up: Array) -> Array:
         """(3,) the level direction along which the scene covers the most of an image."""
-        side = across(up)
-        side /= np.linalg.norm(side)
-        ahead = np.cross(up, side)
+        side, ahead = self._level(up)
         some = self.gaussians.take(np.arange(0, len(self.gaussians), len(self.gaussians) // SAMPLES + 1))
         offsets = (some.means[some.valid()] - centre) / radius
         heights, covered, directions = offsets @ up, [], []
@@ -363,8 +393,7 @@ class Scene:
         """
         centre, radius = self.bounds()
         up = self.up()
-        east = unit(across(up))
-        north = np.cross(up, east)
+        east, north = self._level(up)
         low, high = np.sin(np.radians(elevations))
         cameras = []
         for index in range(count):

@@ -335,8 +335,7 @@ class Page {
 
   // Eight corners of the box of a region, relative to the page's origin.
   corners(region) {
-    const corners = this.language.tensors.corners.subarray(24 * region, 24 * region + 24);
-    return corners.map((length, i) => length - this.meta.origin[i % 3]);
+    return this.language.tensors.corners.subarray(24 * region, 24 * region + 24);
   }
 
   // Corners of the boxes of an answer, the best first: one for each whole that answers or has parts that do.

@@ -185,7 +185,7 @@ class _Curve:
 
         self._times = np.array([key.seconds for key in keyframes], np.float64)
         positions = np.array([key.pose.position for key in keyframes], np.float64)
-        least = SAME * (1 + np.abs(positions).max())
+        least = SAME * np.abs(positions).max()
         slopes = tangents(self._times, np.diff(positions, axis=0), least)
         self._positions = CubicHermiteSpline(self._times, positions, slopes)
         # Camera to world: a product from the right is then a turn as the camera feels it.

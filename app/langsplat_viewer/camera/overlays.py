@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.scene import Camera
+from langsplat_core.scene import NO_ORIGIN, Camera
 from langsplat_viewer.camera.controls import Extent, frame_of, weighted_quantile
 
 
@@ -140,28 +140,30 @@ class Grid:
     marks: tuple[tuple[str, Array], ...]  # what a line is called, and where that is written (3,)
 
 
-def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None) -> Grid:
-    """Return a level grid below almost all of the scene.
+def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None, origin: Array = NO_ORIGIN) -> Grid:
+    """Return a level grid below almost all of a scene with an `origin` (3,).
 
-    Its lines are round lengths apart and at round distances from the scene's origin: in metres where the
-    scene has a scale, else in world units.
+    Its lines are round lengths apart and at round distances from the world's zero: in metres where the scene
+    has a scale, else in world units.
     """
     scale = metres_per_unit or 1.0
     frame = frame_of(up)
     spacing = round_length(2 * GRID_REACH * extent.radius / GRID_LINES * scale) / scale
+    shift = frame @ origin
     right, height, front = frame @ extent.centre
     height -= extent.radius
     if len(extent.sample.points):
         height = weighted_quantile(extent.sample.points @ up, extent.sample.weights, GROUND_SHARE)
     reach = GRID_REACH * extent.radius
-    ends = (((middle - reach) / spacing, (middle + reach) / spacing) for middle in (right, front))
+    middles = right + shift[0], front + shift[2]
+    ends = (((middle - reach) / spacing, (middle + reach) / spacing) for middle in middles)
     across, ahead = (spacing * np.arange(math.floor(low), math.ceil(high) + 1) for low, high in ends)
 
     def point(x: float, z: float) -> Array:
-        return np.array([x, height, z]) @ frame
+        return np.array([x - shift[0], height, z - shift[2]]) @ frame
 
     lines = [(point(x, ahead[0]), point(x, ahead[-1])) for x in across]
     lines += [(point(across[0], z), point(across[-1], z)) for z in ahead]
-    marks = [(f"{x * scale:.4g}", point(x, ahead[0])) for x in across[1:]]
-    marks += [(f"{z * scale:.4g}", point(across[0], z)) for z in ahead[1:]]
+    marks = [(f"{x * scale:.10g}", point(x, ahead[0])) for x in across[1:]]
+    marks += [(f"{z * scale:.10g}", point(across[0], z)) for z in ahead[1:]]
     return Grid(np.array(lines), spacing, tuple(marks))

@@ -192,7 +192,8 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
     if state.scene is None or state.view is None or state.extent is None:
         return
     paint, metres = imgui.get_background_draw_list(), state.scene.metres_per_unit
-    grid = overlays.ground_grid(state.extent, state.view.up, metres) if "grid" in shown else None
+    place = state.extent, state.view.up, metres, state.origin
+    grid = overlays.ground_grid(*place) if "grid" in shown else None
     for part in area.columns(state.session.split.columns):
         pen = Pen(part, state.view.camera(*part.size), overlays.LEAST_DEPTH * state.extent.radius)
         paint.push_clip_rect(*part.corners, True)
@@ -312,7 +313,7 @@ def _names(named: list[Named], area: ui.Area) -> None:
 
 
 def _grid(grid: overlays.Grid, pen: Pen) -> None:
-    """Draw the lines on the ground, each with its distance from the scene's origin."""
+    """Draw the lines on the ground, each with its distance from the world's zero."""
     _lines(pen.segments(grid.segments)[0], GRID, 1.0)
     paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32((*GRID[:3], 1.0))
     for text, point in grid.marks:

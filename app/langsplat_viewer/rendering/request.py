@@ -151,7 +151,7 @@ def edited_scene(source: Scene, marks: Marks | None = None, before: EditedScene 
     sh = untinted.gaussians.sh.copy()
     sh[selected] *= 1 - TINT_STRENGTH
     sh[selected, 0] += TINT_STRENGTH * (TINT - 0.5) / C0
-    tinted = replace(untinted, gaussians=replace(untinted.gaussians, sh=sh))
+    tinted = untinted.recoloured(replace(untinted.gaussians, sh=sh))
     return EditedScene(source, marks, tinted, rows, selected, untinted)
 
 
@@ -322,7 +322,7 @@ def with_splats(scene: Scene, splats: Splats) -> Scene:
         gaussians = replace(gaussians, log_scales=scales)
     if splats.sh_degree < gaussians.sh_degree:
         gaussians = replace(gaussians, sh=gaussians.sh[:, : SH_COUNTS[splats.sh_degree]])
-    return scene if gaussians is scene.gaussians else replace(scene, gaussians=gaussians)
+    return scene if gaussians is scene.gaussians else scene.recoloured(gaussians)
 
 
 def why_undrawable(gaussians: Gaussians) -> str:

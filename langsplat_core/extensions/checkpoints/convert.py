@@ -52,7 +52,7 @@ def export_langsplat(scene: Scene, folder: Path, name: str) -> list[Path]:
     latents = np.where(language.known[..., None], language.latents, np.float32(0))
     written = [folder / f"{name}_{level + 1}" / "chkpnt30000.pth" for level in range(len(LEVELS))]
     for level, path in enumerate(written):
-        write_checkpoint(path, scene.gaussians, latents[level])
+        write_checkpoint(path, scene.gaussians, latents[level], scene.origin)
     write_autoencoder(folder / "best_ckpt.pth", codec.encoder, codec.decoder)
     return [*written, folder / "best_ckpt.pth"]
 
@@ -72,7 +72,7 @@ def export_occam(scene: Scene, folder: Path, progress: Progress = silent) -> lis
         for start in range(0, len(known), BLOCK):
             rows = known[start : start + BLOCK]
             vectors[rows] = language.codec.decode(language.latents[level, rows])
-        write_checkpoint(path, scene.gaussians, vectors)
+        write_checkpoint(path, scene.gaussians, vectors, scene.origin)
         written.append(path)
     progress("decoding", 1.0)
     return written

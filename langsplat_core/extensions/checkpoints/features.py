@@ -6,7 +6,7 @@ is made here.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ from langsplat_core.extensions.checkpoints.langsplat_files import (
 from langsplat_core.extensions.checkpoints.unpickling import load_torch, plain_array, plain_mapping
 from langsplat_core.io.hostile import open_for_reading, opened_archive, read_npz
 from langsplat_core.io.ply import read_ply_scene
-from langsplat_core.scene import LEVELS, AutoencoderCodec, Gaussians
+from langsplat_core.io.scenes import read_origin
+from langsplat_core.scene import LEVELS, NO_ORIGIN, AutoencoderCodec, Gaussians
 from langsplat_core.scene.gaussians import join_gaussians
 
 TOPK = 4  # codewords of a Gaussian in LangSplatV2
@@ -108,6 +109,14 @@ class Carrier:
     features: Features | None = None
     extras: Mapping[str, Array] = field(default_factory=dict)  # of a PLY, as `Scene.extras`
     antialiased: bool = False
+    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) that positions are relative to
+
+    def about(self, origin: Array) -> "Carrier":
+        """Return the same Gaussians relative to another `origin` (3,)."""
+        if np.array_equal(self.origin, origin):
+            return self
+        means = self.gaussians.means + (self.origin - origin)
+        return replace(self, gaussians=replace(self.gaussians, means=means), origin=origin)
 
     @property
     def has_features(self) -> bool:
@@ -170,12 +179,13 @@ def _from_ply(path: Path) -> Carrier:
     names = [name for name in scene.extras if SEMANTIC.fullmatch(name)]
     rest = {name: values for name, values in scene.extras.items() if name not in names}
     if not names:
-        return Carrier(path, PLAIN, scene.gaussians, extras=rest, antialiased=scene.antialiased)
+        return Carrier(path, PLAIN, scene.gaussians, None, rest, scene.antialiased, scene.origin)
     ordered = [f"semantic_{index}" for index in range(len(names))]
     if set(ordered) != set(names):
         raise FormatError(f"{path}: {len(names)} properties semantic_*, not counted from 0 without gaps")
     vectors = np.stack([scene.extras[name].astype(np.float32) for name in ordered], axis=1)
-    return Carrier(path, FEATURE_3DGS, scene.gaussians, whole_vectors(vectors), rest, scene.antialiased)
+    known = whole_vectors(vectors)
+    return Carrier(path, FEATURE_3DGS, scene.gaussians, known, rest, scene.antialiased, scene.origin)
 
 
 def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
@@ -203,7 +213,8 @@ def _from_torch(content: Any, path: Path) -> Part:
     if elements is not None:
         gaussians = gaussians_of(elements, path)
         method, features = _language(elements, len(gaussians), path)
-        return Carrier(path, method, gaussians, features)
+        origin = read_origin(path)
+        return Carrier(path, method, gaussians, features, origin=NO_ORIGIN if origin is None else origin)
     mapping = plain_mapping(content)
     named = {"": content} if mapping is None else mapping
     if is_autoencoder(named):

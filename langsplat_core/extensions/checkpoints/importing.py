@@ -194,6 +194,7 @@ def _of_levels(
         numbers, how = [len(LEVELS) - 1], f"{method} knows none, whole is filled"
     else:
         numbers, how = levels_of(featured, asked)
+    featured = [carrier.about((plain or featured[0]).origin) for carrier in featured]
     carriers = [plain] if plain else featured  # the scene's Gaussians: those without features, or the first's
     base = carriers[0]
     if base.method == OCCAM:  # which removes what no view saw, so that levels keep different Gaussians
@@ -227,7 +228,9 @@ def _scene(carrier: Carrier) -> Scene:
     folder = carrier.path.resolve().parent
     model = folder.parent.parent if carrier.path.name == "point_cloud.ply" else folder
     cameras = [path for path in (carrier.path.with_suffix(CAMERAS), model / "cameras.json") if exists(path)]
-    means, origin = about_origin(carrier.gaussians.means)
+    means, origin = carrier.gaussians.means, carrier.origin
+    if not origin.any():
+        means, origin = about_origin(means)
     return Scene(
         replace(carrier.gaussians, means=means),
         cameras=tuple(camera.moved(-origin) for camera in (read_cameras(cameras[0]) if cameras else ())),

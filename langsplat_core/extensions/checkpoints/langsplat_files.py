@@ -12,7 +12,8 @@ from langsplat_core.errors import FormatError
 from langsplat_core.extensions.checkpoints.unpickling import plain_array
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.ply import REST_COUNTS
-from langsplat_core.scene import AutoencoderCodec, Gaussians
+from langsplat_core.io.scenes import ORIGIN_SUFFIX, companion_path, write_origin
+from langsplat_core.scene import NO_ORIGIN, AutoencoderCodec, Gaussians
 from langsplat_core.scene.codec import Layers
 
 # ---- LangSplat's autoencoder, `best_ckpt.pth`: weights by the number of a layer in its network ----
@@ -155,10 +156,10 @@ def gaussians_of(elements: tuple[Any, ...], path: Path) -> Gaussians:
 # would need is empty.
 
 
-def write_checkpoint(path: Path, gaussians: Gaussians, features: Array) -> None:
+def write_checkpoint(path: Path, gaussians: Gaussians, features: Array, origin: Array = NO_ORIGIN) -> None:
     """Write a level's checkpoint with (N, D) float32 `features`, zero where a Gaussian has no meaning.
 
-    It loads with and without `weights_only`.
+    It loads with and without `weights_only`. An `origin` (3,) that positions are relative to lies beside it.
     """
     import torch
 
@@ -181,6 +182,11 @@ def write_checkpoint(path: Path, gaussians: Gaussians, features: Array) -> None:
         1.0,  # the scene's extent, which scales a learning rate
     )
     _save((elements, 30_000), path)
+    beside = companion_path(path, ORIGIN_SUFFIX)
+    if origin.any():
+        write_origin(beside, origin)
+    else:
+        beside.unlink(missing_ok=True)
 
 
 def write_autoencoder(path: Path, encoder: Layers, decoder: Layers) -> None:

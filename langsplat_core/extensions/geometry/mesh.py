@@ -5,7 +5,7 @@ where this Gaussian is densest along the ray. The depth of its centre, which `Vi
 wherever a large Gaussian is seen aslant.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -114,7 +114,7 @@ def fuse(
             f"voxels of {resolution:g} units are finer than the images, whose pixels are {pixel:.2g} wide; "
             f"take {pixel / OVERSAMPLED:.2g} or more"
         )
-    return _cleaned(_fused(images, resolution, views, progress)), resolution
+    return _cleaned(_fused(images, scene.bounds()[0], resolution, views, progress)), resolution
 
 
 def _rendered(scene: Scene, camera: Camera) -> Depth:
@@ -126,7 +126,8 @@ def _rendered(scene: Scene, camera: Camera) -> Depth:
     return small, depth, np.rint(255 * colours).astype(np.uint8)
 
 
-def _fused(images: list[Depth], resolution: float, views: int, progress: Progress) -> Mesh:
+def _fused(images: list[Depth], centre: Array, resolution: float, views: int, progress: Progress) -> Mesh:
+    """Mesh on a grid of voxels that begins at `centre` (3,), so that it moves with the scene."""
     import open3d
 
     o3d, core = open3d, open3d.core
@@ -140,14 +141,15 @@ def _fused(images: list[Depth], resolution: float, views: int, progress: Progres
         if farthest == 0:
             continue
         inner = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
-        pose = core.Tensor(inner), core.Tensor(camera.world_to_camera)
+        pose = core.Tensor(inner), core.Tensor(camera.moved(-centre).world_to_camera)
         limits = 1.0, farthest * 1.001, float(TRUNCATION)
         image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(depth[..., None])))
         blocks = grid.compute_unique_block_coordinates(image, *pose, *limits)
         light = o3d.t.geometry.Image(core.Tensor((colours / 255).astype(np.float32)))  # Open3D takes no bytes
         grid.integrate(blocks, image, light, *pose, *limits)
     progress(STAGE, 1.0)
-    return _taken(grid.extract_triangle_mesh(views - 0.5).to_legacy())
+    mesh = _taken(grid.extract_triangle_mesh(views - 0.5).to_legacy())
+    return replace(mesh, vertices=mesh.vertices + centre)
 
 
 def _taken(mesh: "object") -> Mesh:
