@@ -265,7 +265,7 @@ def test_gather_is_the_adjoint_and_contributions_its_sums() -> None:
     forth, back = np.sum(view.splat(x)[0].astype(float) * y), np.sum(view.gather(y).astype(float) * x)
     assert forth == pytest.approx(back, rel=1e-5)
     sums = view.gather(np.ones((30, 41, 1), np.float32))[:, 0]
-    np.testing.assert_array_equal(view.contributions(), sums)
+    np.testing.assert_allclose(view.contributions(), sums, rtol=1e-6)  # sums by atomics differ between runs
     assert sums.max() > 1
 
 

@@ -159,12 +159,13 @@ def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | Non
 
 def clean_gradients(state: TrainingState) -> None:
     """Zero and count gradient entries that are NaN or infinite: one bad pixel must not end a training."""
-    for value in state.values.values():
-        if value.grad is None or bool(torch.isfinite(value.grad.sum())):
-            continue  # a finite sum has finite terms; an overflowing sum is looked at entry by entry
-        bad = ~torch.isfinite(value.grad)
+    gradients = [value.grad for value in state.values.values() if value.grad is not None]
+    if not gradients or bool(torch.isfinite(torch.stack([gradient.sum() for gradient in gradients]).sum())):
+        return  # a finite sum has finite terms; an overflowing sum is looked at entry by entry
+    for gradient in gradients:
+        bad = ~torch.isfinite(gradient)
         state.non_finite += int(bad.sum())
-        value.grad[bad] = 0
+        gradient[bad] = 0
 
 
 def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
@@ -175,7 +176,7 @@ def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
     for name, value in state.values.items():
         if value.grad is None or value.numel() == 0:
             continue
-        updates = torch.tensor(float(state.updates[name]), device=state.device)
+        updates = torch.full((), float(state.updates[name]), device=state.device)  # not copied to a GPU
         with torch.no_grad():
             adam(
                 *([value], [value.grad], [state.first[name]], [state.second[name]], [], [updates]),
