@@ -122,6 +122,17 @@ def mask_beside(photo: Path) -> Path | None:
     return next((path for path in candidates if path != photo and os.path.isfile(path)), None)
 
 
+def _stray_masks(photos: Sequence[Photo]) -> list[str]:
+    """Return the names of images in folders "masks" that are of no photograph."""
+    folders = {photo.path.parent for photo in photos}
+    beside = {folder / "masks" for folder in folders}
+    beside |= {folder.parent / "masks" for folder in folders if folder.name in ("images", "photos")}
+    known = {name for folder in folders for photo in find_photos(folder) for name in (photo.name, photo.stem)}
+    listed = [mask for folder in beside for mask in find_photos(folder)]
+    used = {photo.mask for photo in photos} | {photo.path for photo in photos}
+    return [m.name for m in listed if m not in used and (m.suffix != ".png" or m.stem not in known)]
+
+
 def unique_names(labels: Sequence[str]) -> list[str]:
     """Return file stems where those differ, else paths with "_" for "/" and for the suffix's dot."""
     stems = [PurePosixPath(label).stem for label in labels]
@@ -418,6 +429,9 @@ def develop(photos: Sequence[Photo], config: DatasetConfig, progress: Progress) 
         report_loss("%d photographs cannot be used and are left out: %s", len(broken), shortened(broken))
     cameras, images, files, masks, alphas = zip(*done, strict=True)
     _report(told, masks)
+    if stray := _stray_masks(photos):
+        remedy = "a mask is called masks/NAME.jpg.png or masks/NAME.png after its photograph"
+        report_loss("%d masks are of no photograph: %s; %s", len(stray), shortened(stray), remedy)
     cut_out = _cut_out(masks, alphas, config)
     masks = tuple(_counted(mask, alpha, cut_out) for mask, alpha in zip(masks, alphas, strict=True))
     masks = masks if any(mask is not None for mask in masks) else ()

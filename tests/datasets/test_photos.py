@@ -353,6 +353,20 @@ def test_a_mask_has_the_shape_of_the_photograph_as_it_is_shown(tmp_path: Path) -
         develop([photo], DatasetConfig(max_side=120), silent)
 
 
+def test_masks_that_are_missing_or_stray_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    names = write_photos(tmp_path / "images", LENS, poses(3))
+    white = np.ones((90, 120), bool)
+    for name in ("view_0.png", "view_2.png.png", "view_9.png", "0001.png", "view_1.jpg"):
+        mask_file(tmp_path / "masks" / name, white)
+    paths = [tmp_path / "images" / name for name in names]
+    photos = [Photo(path, path.name, LENS, np.eye(4), mask=mask_beside(path)) for path in paths]
+    masks = develop(photos[:2], DatasetConfig(max_side=120), silent).masks  # of the third none is stray
+    assert [mask is None for mask in masks] == [False, True]
+    missing, stray = caplog.messages
+    assert missing.startswith("1 of 2 photographs have a mask")
+    assert stray.startswith("3 masks are of no photograph: 0001.png, view_1.jpg, view_9.png; ")
+
+
 def test_a_photograph_of_which_nothing_counts_is_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
