@@ -279,6 +279,7 @@ class Archive:
     def __init__(self, archive: zipfile.ZipFile, path: Path, size: int, free: int) -> None:
         self._archive, self.path, self.size = archive, path, size  # size of the file, bytes
         self.names = archive.namelist()
+        self.deflated = any(info.compress_type for info in archive.infolist())  # some, or packed otherwise
         self._room = Allowance(path, size, free=free)
 
     def read(self, name: str, limit: int) -> bytes:

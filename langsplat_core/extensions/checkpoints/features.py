@@ -13,15 +13,21 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import FormatError, InputError, Tell, quoted, report_loss, report_losses, unread
 from langsplat_core.extensions.checkpoints.langsplat_files import (
     GEOMETRY,
     autoencoder_from,
     gaussians_of,
     is_autoencoder,
+    is_layer,
     model_tuple,
 )
-from langsplat_core.extensions.checkpoints.unpickling import load_torch, plain_array, plain_mapping
+from langsplat_core.extensions.checkpoints.unpickling import (
+    IgnoredArray,
+    load_torch,
+    plain_array,
+    plain_mapping,
+)
 from langsplat_core.io.hostile import open_for_reading, opened_archive, read_npz
 from langsplat_core.io.ply import read_ply_scene
 from langsplat_core.io.scenes import read_origin
@@ -110,6 +116,7 @@ class Carrier:
     extras: Mapping[str, Array] = field(default_factory=dict)  # of a PLY, as `Scene.extras`
     antialiased: bool = False
     origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) that positions are relative to
+    metres_per_unit: float | None = None
 
     def about(self, origin: Array) -> "Carrier":
         """Return the same Gaussians relative to another `origin` (3,)."""
@@ -178,14 +185,14 @@ def _from_ply(path: Path) -> Carrier:
     scene = read_ply_scene(path)
     names = [name for name in scene.extras if SEMANTIC.fullmatch(name)]
     rest = {name: values for name, values in scene.extras.items() if name not in names}
+    about = rest, scene.antialiased, scene.origin, scene.metres_per_unit
     if not names:
-        return Carrier(path, PLAIN, scene.gaussians, None, rest, scene.antialiased, scene.origin)
+        return Carrier(path, PLAIN, scene.gaussians, None, *about)
     ordered = [f"semantic_{index}" for index in range(len(names))]
     if set(ordered) != set(names):
         raise FormatError(f"{path}: {len(names)} properties semantic_*, not counted from 0 without gaps")
     vectors = np.stack([scene.extras[name].astype(np.float32) for name in ordered], axis=1)
-    known = whole_vectors(vectors)
-    return Carrier(path, FEATURE_3DGS, scene.gaussians, known, rest, scene.antialiased, scene.origin)
+    return Carrier(path, FEATURE_3DGS, scene.gaussians, whole_vectors(vectors), *about)
 
 
 def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
@@ -205,19 +212,29 @@ def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
         raise FormatError(f"{path}: occu_count has the shape {counts.shape}, leaf_feat {vectors.shape}")
     known = np.where(counts[:, None] > 0, vectors, 0).astype(np.float32)
     index = index.astype(np.int64)
+    told = [unread("arrays", arrays.keys() - {"leaf_feat", "leaf_ind", "leaf_score", "occu_count"})]
+    if beyond := np.count_nonzero((index > len(vectors)) | (index < -1)):  # -1, and one too many, mean none
+        told.append(f"{beyond} Gaussians are of clusters that are not there, and get none")
+    report_losses(path, told)
     return Clusters(path, np.where((index >= 0) & (index < len(vectors)), index, -1), known)
 
 
 def _from_torch(content: Any, path: Path) -> Part:
     elements = model_tuple(content)
     if elements is not None:
-        gaussians = gaussians_of(elements, path)
-        method, features = _language(elements, len(gaussians), path)
+        gaussians, told = gaussians_of(elements, path), list[str]()
+        method, features = _language(elements, len(gaussians), path, told.append)
+        if elements[0] < gaussians.sh_degree and gaussians.sh[:, (elements[0] + 1) ** 2 :].any():
+            told.append(f"its active degree is {elements[0]}, and all {gaussians.sh_degree} are taken")
+        ignored = [index for index, element in enumerate(elements) if isinstance(element, IgnoredArray)]
+        told.append(unread("arrays of NumPy, elements", ignored))
+        report_losses(path, told)
         origin = read_origin(path)
         return Carrier(path, method, gaussians, features, origin=NO_ORIGIN if origin is None else origin)
     mapping = plain_mapping(content)
     named = {"": content} if mapping is None else mapping
     if is_autoencoder(named):
+        report_losses(path, [unread("entries", (quoted(name, 40) for name in named if not is_layer(name)))])
         return Autoencoder(path, autoencoder_from(named, path))
     arrays = {str(name): plain_array(value, path) for name, value in named.items()}
     found = {name: array for name, array in arrays.items() if array is not None}
@@ -229,13 +246,15 @@ def _from_torch(content: Any, path: Path) -> Part:
     raise FormatError(f"{path}: a torch file, but not a checkpoint or autoencoder of a known method")
 
 
-def _language(elements: tuple[Any, ...], count: int, path: Path) -> tuple[str, Features | None]:
-    """Return the method and the features of what follows the geometry."""
+def _language(elements: tuple[Any, ...], count: int, path: Path, tell: Tell) -> tuple[str, Features | None]:
+    """Return the method and the features of what follows the geometry; training's state plays no part."""
     first = plain_array(elements[GEOMETRY], path)
     second = plain_array(elements[GEOMETRY + 1], path) if len(elements) > GEOMETRY + 1 else None
     if first is None or first.ndim != 2:  # (N,) radii of plain 3D Gaussian Splatting
         late = [plain_array(element, path) for element in elements[GEOMETRY + 1 :]]
         wide = [flat for array in late if (flat := _wide(array, count)) is not None]
+        if len(wide) > 1:
+            tell(f"it has vectors {len(wide)} times, and the first are taken")
         return (FEATURE_3DGS, whole_vectors(wide[0])) if wide else (PLAIN, None)
     if len(first) != count:
         raise FormatError(f"{path}: features {first.shape} for {count} Gaussians")
@@ -286,14 +305,18 @@ def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[i
         )
     if asked:
         return [LEVELS.index(name) for name in asked], "as asked"
+    guess = ""
     numbers = [_numbered(carrier.path) for carrier in carriers]
     chosen = [number - 1 for number in numbers if number is not None]
     if len(set(chosen)) == len(carriers):
         return chosen, "by the names of files and folders"
     if len(carriers) == len(LEVELS) and len(set(numbers)) == 1:
-        return list(range(len(LEVELS))), "by their order"
+        chosen, guess = list(range(len(LEVELS))), "by their order"
     if numbers == [None]:
-        return [len(LEVELS) - 1], "one alone is taken for the whole"
+        chosen, guess = [len(LEVELS) - 1], "one alone is taken for the whole"
+    if guess:
+        report_loss("%s: its level is a guess, %s; --levels says which it is", carriers[0].path, guess)
+        return chosen, guess
     paths = ", ".join(str(carrier.path) for carrier in carriers)
     raise InputError(
         f"{paths}: of which levels? Say, for example, --levels {' '.join(LEVELS[: len(carriers)])}"

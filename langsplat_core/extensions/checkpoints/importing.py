@@ -236,6 +236,7 @@ def _scene(carrier: Carrier) -> Scene:
         cameras=tuple(camera.moved(-origin) for camera in (read_cameras(cameras[0]) if cameras else ())),
         origin=origin,
         antialiased=carrier.antialiased,
+        metres_per_unit=carrier.metres_per_unit,
         extras=carrier.extras,
     )
 

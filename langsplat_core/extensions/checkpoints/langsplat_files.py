@@ -38,6 +38,11 @@ def is_autoencoder(content: Mapping[Any, Any]) -> bool:
     return parts == {"encoder", "decoder"}
 
 
+def is_layer(name: Any) -> bool:
+    """Return whether an entry's name is that of a layer's weights."""
+    return isinstance(name, str) and _NAME.fullmatch(name) is not None
+
+
 def autoencoder_from(content: Mapping[str, Any], path: Path) -> AutoencoderCodec:
     """Return the codec of these weights, batch normalisation folded into the linear layers.
 

@@ -2,18 +2,23 @@
 
 A pickle is looked through before torch runs it: it may name little more than what dense tensors are made of,
 since torch believes what a file says of sparse, quantised and nested ones, and reads beyond its memory. What
-training code leaves of NumPy among them plays no part here: it is passed over by a stand-in.
+training code leaves of NumPy among them plays no part here: it is passed over by a stand-in. Archives are
+mapped into memory and not read, as torch then sees where they end.
 """
 
 import io
 import pickletools
+import tempfile
 import warnings
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, optional_imports, quoted
-from langsplat_core.io.hostile import open_for_reading
+from langsplat_core.io.hostile import open_for_reading, opened_archive
 
 DEEPEST = 100  # tuples in tuples; Python's hash goes down them on the machine's stack, which ends at 100 000
 _ARCHIVE = b"PK\x03\x04"  # how torch tells an archive
@@ -32,9 +37,14 @@ class _Ignored:
         pass
 
 
+class IgnoredArray(_Ignored):
+    """Stand-in for an array of NumPy's, which a reader tells of."""
+
+
 # NumPy's names before and since its version 2.
-_OF_NUMPY = {f"numpy.{core}.multiarray.{name}" for core in ("core", "_core")
-             for name in ("scalar", "_reconstruct")} | {"numpy.dtype", "numpy.ndarray"}  # fmt: skip
+_CORES = ("numpy.core.multiarray", "numpy._core.multiarray")
+_ARRAYS = {f"{core}._reconstruct" for core in _CORES}
+_OF_NUMPY = {*_ARRAYS, *(f"{core}.scalar" for core in _CORES), "numpy.dtype", "numpy.ndarray"}
 _NAMED = {
     *_OF_NUMPY,
     *(f"torch.{kind}Storage" for kind in _STORAGES),
@@ -55,16 +65,38 @@ def load_torch(path: Path) -> Any:
     import torch  # a second to import, and only a checkpoint needs it
 
     open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
-    with warnings.catch_warnings(), torch.serialization.safe_globals([(_Ignored, n) for n in _OF_NUMPY]):
+    stand_ins: Any = [(IgnoredArray if name in _ARRAYS else _Ignored, name) for name in _OF_NUMPY]
+    with warnings.catch_warnings(), torch.serialization.safe_globals(stand_ins):
         warnings.simplefilter("ignore")
         try:
-            archived = _look_through(path)
-            return torch.load(path, map_location="cpu", weights_only=True, mmap=archived)
+            with _mappable(path) as file:
+                archived = _look_through(file)
+                return torch.load(file, map_location="cpu", weights_only=True, mmap=archived)
         except FormatError as error:
             raise FormatError(f"{path}: {error}") from None
         except Exception:  # noqa: BLE001  a damaged file raises whatever it hits first
             reason = "not a whole file of torch.save; was the download complete?"
             raise FormatError(f"{path}: {reason}") from None
+
+
+@contextmanager
+def _mappable(path: Path) -> Iterator[Path]:
+    """Yield the file, or a copy that lasts as long where members of its archive are deflated."""
+    try:
+        with opened_archive(path, "archive") as archive:
+            deflated = archive.deflated
+    except FormatError:  # torch finds more in a damaged archive than zipfile does
+        deflated = False
+    if not deflated:
+        yield path
+        return
+    # A mapped file outlives its name, where the system lets it be removed.
+    with tempfile.TemporaryDirectory(prefix="langsplat-", ignore_cleanup_errors=True) as folder:
+        copy = Path(folder) / "stored.pth"
+        with opened_archive(path, "archive") as archive, zipfile.ZipFile(copy, "w") as stored:
+            for name in archive.names:
+                stored.writestr(name, archive.read(name, 2**32))
+        yield copy
 
 
 def _look_through(path: Path) -> bool:
@@ -111,13 +143,13 @@ def _check_pickle(stream: IO[bytes]) -> None:
 def plain_array(value: Any, path: Path) -> Array | None:
     """Return a tensor as a NumPy array, not copied where it need not be; None for anything else.
 
-    Raises FormatError for a tensor that no array can be, or that claims more numbers than the file holds.
+    Raises FormatError for a tensor that no array can be, or that claims more numbers than it was stored with.
     """
     import torch
 
     if not isinstance(value, torch.Tensor):
         return None
-    if value.numel() * value.element_size() > path.stat().st_size:
+    if value.numel() * value.element_size() > value.untyped_storage().nbytes():
         raise FormatError(f"{path}: holds a tensor {tuple(value.shape)}, more numbers than the file has")
     value = value.detach()
     try:

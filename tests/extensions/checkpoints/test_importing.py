@@ -5,8 +5,11 @@ import json
 import logging
 import os
 import pickle
+import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +17,7 @@ import torch
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodebookConfig, LinearConfig
-from langsplat_core.errors import EncoderError, FormatError, InputError
+from langsplat_core.errors import STRICTNESS, EncoderError, FormatError, InputError
 from langsplat_core.extensions.checkpoints.convert import export_langsplat, export_occam
 from langsplat_core.extensions.checkpoints.importing import ForeignScene, import_scene, read_foreign
 from langsplat_core.extensions.checkpoints.langsplat_files import write_checkpoint
@@ -232,6 +235,60 @@ def test_feature_3dgs(tmp_path):
     refused([path, tmp_path / "dec.pth"], "decodes pictures, not Gaussians")
     write_ply(ply, Scene(G, extras={"semantic_0": VECTORS[0][:, 0], "semantic_2": VECTORS[0][:, 0]}))
     refused([ply], "without gaps")
+
+
+def test_archives_with_deflated_members_are_read(tmp_path):
+    path, packed = save_model(tmp_path / "a.pth", G), tmp_path / "b.pth"
+    with zipfile.ZipFile(path) as whole, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in whole.namelist():
+            archive.writestr(name, whole.read(name))
+    assert_same(read_foreign([packed]).scene.gaussians, G)
+
+
+FAR = replace(G, means=G.means + np.float32(2**20))
+PASSED_OVER: dict[str, Callable[[Path], list[Path]]] = {
+    "an array of NumPy": lambda path: [save_model(path / "a.pth", G, VECTORS[0])],
+    "a lower active degree": lambda path: [saved(path / "a.pth", (1, *geometry(G)[1:], *training_state(G)))],
+    "vectors twice": lambda path: [save_model(path / "a.pth", G, behind=(tensor(VECTORS[0]),) * 2)],
+    "other entries": lambda path: [
+        saved(path / "best_ckpt.pth", autoencoder(D).state_dict() | {"epoch": 3}),
+        *langsplat(path),
+    ],
+    "other arrays": lambda path: [
+        save_model(path / "a.pth", G),
+        saved(path / "c.npz", {"leaf_feat": VECTORS[0], "leaf_ind": ALL, "more": ALL}),
+    ],
+    "other clusters": lambda path: [
+        save_model(path / "a.pth", G),
+        saved(path / "c.npz", {"leaf_feat": VECTORS[0][:9], "leaf_ind": ALL}),
+    ],
+    "a level that is a guess": lambda path: [best_ckpt(path), save_model(path / "a", G, tensor(LATENTS[0]))],
+}
+
+
+def saved(path: Path, content: Any) -> Path:
+    if path.suffix == ".npz":
+        np.savez(path, **content)
+    else:
+        torch.save(content, path)
+    return path
+
+
+@pytest.mark.parametrize("case", PASSED_OVER)
+def test_what_is_passed_over_is_said(tmp_path, case, caplog, monkeypatch):
+    paths = PASSED_OVER[case](tmp_path)
+    read_foreign(paths)
+    assert len(caplog.messages) == 1
+    monkeypatch.setattr(STRICTNESS, "on", True)
+    refused(paths, "--strict")
+
+
+def test_a_ply_far_from_zero_keeps_its_origin(tmp_path):
+    write_ply(tmp_path / "a.ply", Scene(FAR, metres_per_unit=2.0))
+    scene = read_foreign([tmp_path / "a.ply"]).scene
+    assert scene.origin.any()
+    assert scene.metres_per_unit == 2
+    assert_same(scene.world_gaussians(), FAR)
 
 
 def test_half_precision_and_older_files(tmp_path):
