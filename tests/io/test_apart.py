@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import STRICTNESS, FormatError, InputError, report_loss
 from langsplat_core.io import apart
 from langsplat_core.io.hostile import PictureError
 from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
@@ -23,6 +23,10 @@ def halve(number: float, progress: Progress) -> tuple[float, int]:
     log.warning("%g is halved", number)
     print("what a library prints is no message")
     return number / 2, os.getpid()
+
+
+def lose(_: Progress) -> None:
+    report_loss("%s is left out", "a.jpg")
 
 
 def fail(error: Exception, _: Progress) -> None:
@@ -55,6 +59,16 @@ def test_results_progress_and_messages_come_back(caplog: pytest.LogCaptureFixtur
     assert pid != os.getpid()
     assert reports == [Report("halving", 0.5, "a number", {"loss": 0.25})]
     assert caplog.messages == ["3 is halved"]
+
+
+def test_a_loss_in_the_process_is_said_or_with_strict_an_error(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    apart.run(lose, progress=silent)
+    assert caplog.messages == [STRICTNESS.last] == ["a.jpg is left out"]
+    monkeypatch.setattr(STRICTNESS, "on", True)
+    with pytest.raises(InputError, match="--strict"):
+        apart.run(lose, progress=silent)
 
 
 @pytest.mark.parametrize(

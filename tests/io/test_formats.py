@@ -5,39 +5,48 @@ import gzip
 import json
 import struct
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from plyfile import PlyData
+from safetensors.numpy import load, save
 
 from langsplat_core.arrays import rotation_matrices, sigmoid, unit
-from langsplat_core.errors import InputError
+from langsplat_core.errors import STRICTNESS, InputError
+from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
 from langsplat_core.io.quantised import read_splat, write_splat
 from langsplat_core.io.scenes import load_gaussians, load_scene, save_scene, writable_suffixes
 from langsplat_core.io.shapes import write_mesh, write_points
+from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.sog import write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.raster.reference import colours
-from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.transform import moving, rotating, scaling, transform_gaussians
 from tests.support.file_samples import (
     C0,
     assert_refused,
     assert_same,
+    assert_same_field,
+    compressed_ply,
     glb,
+    plain_ply,
+    random_field,
     sog_files,
     splat_bytes,
     spz_bytes,
     write_folder,
     zipped,
 )
-from tests.support.scenes import covariances, random_gaussians
+from tests.support.scenes import covariances, random_camera, random_gaussians
 
 # ---- .splat ----
 
@@ -530,6 +539,190 @@ def test_written_files_keep_the_rules(tmp_path):
     assert set(attributes) == {"POSITION", "COLOR_0", *(f"{EXTENSION}:{name}" for name in names)}
     positions = content["accessors"][attributes["POSITION"]]
     assert np.less(positions["min"], positions["max"]).all()
+
+
+# ---- changes that leave a file well-formed: the same comes out, or a line, or an error ----
+
+
+def changed_ply(data: bytes, rng: np.random.Generator) -> bytes:
+    """A table with columns in another order, or of another number; with more around it, or less."""
+    header, body = data.split(b"end_header\n", 1)
+    lines = header.decode().splitlines()
+    at = rng.choice([row for row, line in enumerate(lines) if line.startswith("property")])
+    match rng.integers(8):
+        case 0:
+            lines[at : at + 1] = [lines[at]] * int(2 * rng.integers(2))
+        case 1:
+            rows = [row for row, line in enumerate(lines) if line.startswith("element")]
+            name, count = lines[rng.choice(rows)].rsplit(" ", 1)
+            less = str(int(count) + int(rng.choice([-1, 1, 300])))
+            lines = [f"{name} {less}" if line.startswith(name) else line for line in lines]
+        case 2:
+            body += bytes(rng.integers(256, size=rng.integers(1, 400), dtype=np.uint8))
+        case 3:
+            lines, body = [*lines, "element intrinsic 2", "property float fx"], body + bytes(8)
+        case 4:
+            said = ["antialiased 0", "antialiased yes", "SplatRenderMode: 3d", "metres_per_unit none"]
+            lines[2:2] = [f"comment {text}" for text in rng.choice(said, 2)]
+        case _ if b"nx" in header:
+            names = [line.split()[-1] for line in lines if line.startswith("property")]
+            table = np.frombuffer(body, [(name, "<f4") for name in names])
+            names = [name for name in rng.permutation(names) if name[0] != "n" or rng.integers(2)]
+            columns = [table[name] + np.float32(name == "nz" and rng.integers(2)) for name in names]
+            lines = [line for line in lines if not line.startswith("property")]
+            lines += [f"property float {name}" for name in names]
+            body = np.column_stack(columns).astype("<f4").tobytes()
+    return "\n".join([*lines, "end_header\n"]).encode() + body
+
+
+def changed_spz(data: bytes, rng: np.random.Generator) -> bytes:
+    """With records, flags, bytes and a number of Gaussians that are not those of its maker."""
+    zipped = data[:2] == b"\x1f\x8b"
+    data = gzip.decompress(data) if zipped else data
+    other = struct.pack("<II", int(rng.integers(1, 9)), 4) + bytes(int(rng.integers(7)))
+    match rng.integers(4):
+        case 0:
+            data = patched(data, 14, "B", int(rng.choice([0, 4, 128])))
+        case 1:
+            data += other
+        case 2 if zipped:
+            data = patched(data, 14, "B", 2) + other
+        case _:
+            data = patched(data, 8, "<I", int(rng.integers(28, 33)))
+    return gzip.compress(data) if zipped else data
+
+
+def without(content: dict, rng: np.random.Generator) -> None:
+    """Drop an entry of an object or of one within it."""
+    parts = [content, *(part for part in content.values() if isinstance(part, dict))]
+    part = parts[rng.integers(len(parts))]
+    del part[str(rng.choice(sorted(part)))]
+
+
+def changed_sog(files: dict[str, bytes], rng: np.random.Generator) -> bytes:
+    meta, files = json.loads(files["meta.json"]), dict(files)
+    match rng.integers(5):
+        case 0:
+            without(meta, rng)
+        case 1:
+            meta["count"] += int(rng.integers(-30, 3))
+        case 2:
+            meta |= {str(rng.choice(["model", "antialias", "lod"])): str(rng.choice(["2dgs", "no"]))}
+        case 3:
+            del files[str(rng.choice(sorted(files)))]
+        case _:
+            files["more.webp"] = files["sh0.webp"]
+    return zipped(files | ({"meta.json": json.dumps(meta).encode()} if "meta.json" in files else {}))
+
+
+def changed_glb(data: bytes, rng: np.random.Generator) -> bytes:
+    content, binary = parts(data)
+    says, attributes = splats(content)["extensions"][EXTENSION], splats(content)["attributes"]
+    match rng.integers(8):
+        case 0:
+            del attributes[str(rng.choice(sorted(attributes)))]
+        case 1:
+            attributes["_MORE"] = 0
+        case 2:
+            content["meshes"].append({"primitives": [splats(content)]})
+            content["nodes"] += [{"mesh": 1}] * int(rng.integers(2))
+        case 3:
+            content["meshes"][0]["primitives"].append({"attributes": {}})
+        case 4:
+            content["scenes"].append({"nodes": [0]})
+            del content["scene"]
+        case 5:
+            says |= {str(rng.choice(["kernel", "projection", "sortingMethod"])): "another"}
+        case 6:
+            content["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {}}
+        case _:
+            content[str(rng.choice(["cameras", "animations", "extras"]))] = [{}]
+    return glb(content, binary) + bytes(4 * int(rng.integers(2)))
+
+
+def changed_sidecar(data: bytes, rng: np.random.Generator) -> bytes:
+    size = struct.unpack_from("<Q", data)[0]
+    about = json.loads(data[8 : 8 + size])["__metadata__"]
+    tensors = load(data)
+    match rng.integers(4):
+        case 0:
+            del tensors[str(rng.choice(sorted(tensors.keys() - {"everyday"})))]  # which may be absent
+        case 1:
+            del about[str(rng.choice(sorted(about.keys() - {"odds"})))]  # likewise
+        case 2:
+            tensors[str(rng.choice(["codec.more", "taught", "more"]))] = np.zeros(3, np.float32)
+        case _:
+            about["more"] = "1"
+    return save(tensors, about)
+
+
+def changed_cameras(data: bytes, rng: np.random.Generator) -> bytes:
+    cameras = json.loads(data)
+    at = int(rng.integers(len(cameras)))
+    match rng.integers(4):
+        case 0:
+            del cameras[at][str(rng.choice(sorted(cameras[at].keys() - {"img_name"})))]
+        case 1:
+            cameras[at]["k1"] = 0.1
+        case 2:
+            cameras.append(cameras[at] | {"position": [1, 2, 3]})
+        case _:
+            cameras = [dict(sorted(camera.items())) for camera in cameras]
+    return json.dumps(cameras).encode()
+
+
+def assert_same_scene(got: Scene, want: Scene) -> None:
+    assert (got.antialiased, got.metres_per_unit) == (want.antialiased, want.metres_per_unit)
+    assert_same(got.gaussians, want.gaussians)
+
+
+def assert_same_cameras(got: Sequence[Camera], want: Sequence[Camera]) -> None:
+    views = [[(c.name, c.intrinsics, c.world_to_camera.tolist()) for c in cameras] for cameras in (got, want)]
+    assert views[0] == views[1]
+
+
+def of_writer(write: Callable[..., object], *content: object) -> bytes:
+    with TemporaryDirectory() as folder:
+        write(Path(folder) / "a", *content)
+        return (Path(folder) / "a").read_bytes()
+
+
+NAMED = tuple(replace(random_camera(seed), name=f"view {seed}") for seed in range(2))
+CHANGED: dict[str, tuple[str, Any, Callable[..., bytes]]] = {  # the name of a file, a good one, its changes
+    "PLY": ("a.ply", plain_ply(WANT), changed_ply),
+    "compressed PLY": ("a.ply", compressed_ply(random_gaussians(300, sh_degree=1)), changed_ply),
+    **{f"SPZ {v}": ("a.spz", spz_bytes(WANT, v), changed_spz) for v in (2, 3, 4)},
+    "SOG": ("a.sog", sog_files(random_gaussians(40, sh_degree=1), 40), changed_sog),
+    "glTF": ("a.glb", of_writer(write_gltf, WANT), changed_glb),
+    "sidecar": ("a.safetensors", of_writer(write_language, random_field(30), WANT.means), changed_sidecar),
+    "cameras": ("a.json", of_writer(write_cameras, NAMED), changed_cameras),
+}
+
+
+@pytest.mark.parametrize("kind", CHANGED)
+def test_a_changed_file_gives_the_same_or_a_line(put, kind, caplog):
+    name, good, change = CHANGED[kind]
+    readers: dict[str, tuple[Any, Any]] = {
+        ".json": (read_cameras, assert_same_cameras),
+        ".safetensors": (lambda path: read_language(path, WANT.means), assert_same_field),
+    }
+    read, check = readers.get(Path(name).suffix, (load_scene, assert_same_scene))
+    want = read(put(zipped(good) if isinstance(good, dict) else good, name))
+    assert not caplog.messages
+    said = 0
+    for seed in range(120):
+        caplog.clear()
+        path = put(change(good, np.random.default_rng(seed)), name)
+        with suppress(InputError):
+            got = read(path)
+            if not caplog.messages:
+                check(got, want)
+            said += len(caplog.messages)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(STRICTNESS, "on", True)
+                with pytest.raises(InputError, match="--strict") if caplog.messages else nullcontext():
+                    read(path)
+    assert said > 5
 
 
 # Point clouds and meshes, read back by other programs.
