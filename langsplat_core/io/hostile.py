@@ -71,8 +71,8 @@ class Allowance:
 # ---- .npy and .npz: plain numbers or texts, read without pickles and without belief in their headers ----
 
 
-def write_npy(path: Path, array: Array) -> None:
-    """Write an array of numbers, whole or not at all.
+def write_npy(path: Path, array: Array, behind: bytes = b"") -> None:
+    """Write an array of numbers, and what NumPy passes over `behind` it, whole or not at all.
 
     `np.save` hands the numbers to C's library, and where the disk takes all but the end nobody is told.
     """
@@ -81,6 +81,7 @@ def write_npy(path: Path, array: Array) -> None:
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, header)
         file.write(whole.reshape(-1).view(np.uint8).data)
+        file.write(behind)
 
 
 def read_npy(path: Path) -> Array:

@@ -17,7 +17,6 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import LiftConfig, RadianceConfig, RasterSettings, TrainConfig
 from langsplat_core.errors import InputError
-from langsplat_core.io.hostile import write_npy
 from langsplat_core.pipeline.stages import (
     Arrays,
     ProcessGroup,
@@ -26,6 +25,7 @@ from langsplat_core.pipeline.stages import (
     open_array,
     read_arrays,
     stage_key,
+    write_array,
 )
 from langsplat_core.progress import Progress
 from langsplat_core.raster import LiftingRasterizer, load_lifting_rasterizer
@@ -349,7 +349,7 @@ def kept_mask_weights(
     files = [folder / f"{index:05d}.npy" for index in range(len(views))]
     for index in processes.share(range(len(views))):
         if not files[index].exists():
-            write_npy(files[index], view_pairs(rasterizer, gaussians, *views[index], settings))
+            write_array(files[index], view_pairs(rasterizer, gaussians, *views[index], settings))
         progress("lifting masks onto the Gaussians", (index + 1) / len(views))
     processes.barrier()
     return MaskWeights([open_array(path) for path in files], len(gaussians))

@@ -20,6 +20,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import write_npy
 from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.features import ImageFeatures
 
@@ -60,7 +61,7 @@ def kept(path: Path, make: Callable[[], Arrays]) -> Arrays:
         found = dict(read_arrays(path))
         stated = str(found.pop(DIGEST, ""))  # none in work folders of earlier versions
         if stated and stated != _digest(found.items()):
-            raise FormatError(f"{path}: changed since it was written; delete it and run again")
+            raise _changed(path)
         return found
     made = make()
     # The digest first, so that it is not lost together with an array at the end.
@@ -70,13 +71,24 @@ def kept(path: Path, make: Callable[[], Arrays]) -> Arrays:
     return made
 
 
+def write_array(path: Path, array: Array) -> None:
+    """Write an array of numbers that `open_array` maps, with its digest behind it, whole or not at all."""
+    write_npy(path, array, bytes.fromhex(_digest([("", array)])))
+
+
 def open_array(path: Path) -> Array:
-    """Map the array in `path` (*.npy) into memory; FormatError for a damaged file."""
+    """Map the array of `write_array` in `path` (*.npy) into memory; FormatError for a damaged file."""
     with _damage_as_error(path):
         try:
-            return np.load(path, mmap_mode="r", allow_pickle=False)
+            array: Any = np.load(path, mmap_mode="r", allow_pickle=False)
         except ValueError:  # an array without elements cannot be mapped
             return np.load(path, allow_pickle=False)
+        with path.open("rb") as file:
+            file.seek(array.offset + array.nbytes)
+            stated = file.read().hex()  # nothing in work folders of earlier versions
+    if stated and stated != _digest([("", array)]):
+        raise _changed(path)
+    return np.asanyarray(array)
 
 
 def read_arrays(path: Path) -> Arrays:
@@ -97,6 +109,10 @@ def _damage_as_error(path: Path) -> Iterator[None]:
             yield
     except Exception as error:  # noqa: BLE001  zipfile and NumPy may raise any
         raise FormatError(f"{path}: damaged ({printable_line(error, 80)}); delete it and run again") from None
+
+
+def _changed(path: Path) -> FormatError:
+    return FormatError(f"{path}: changed since it was written; delete it and run again")
 
 
 def digest_of(data: Gaussians | ImageFeatures) -> str:

@@ -155,12 +155,24 @@ def test_a_setting_repeats_only_what_depends_on_it(room, trained):
     assert (len(list(work.glob("codec-*.npz"))), len(list(work.glob("latents-*.npz")))) == (3, 4)
 
 
-@pytest.mark.parametrize("name", ["member*/*.npy", "member*/*.npz", "codec-*", "latents-*", "nodes-*"])
-def test_a_damaged_stage_ends_in_one_line(room, trained, name):
+def cut(data: bytes) -> bytes:
+    return data[:100]
+
+
+def with_another_bit(data: bytes) -> bytes:
+    return data[:-40] + bytes([data[-40] ^ 1]) + data[-39:]
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [(name, cut) for name in ("member*/*.npy", "member*/*.npz", "codec-*", "latents-*", "nodes-*")]
+    + [("member*/*.npy", with_another_bit)],
+)
+def test_a_damaged_stage_ends_in_one_line(room, trained, name, damage):
     work = trained.with_name("scene.work")
     damaged = sorted(work.glob(name))
     for path in damaged:
-        path.write_bytes(path.read_bytes()[:100])
+        path.write_bytes(damage(path.read_bytes()))
     for path in {*work.glob("*.np[yz]"), *work.glob("member*/*")} - set(damaged):
         path.unlink()
     with pytest.raises(FormatError, match="delete it and run again"):

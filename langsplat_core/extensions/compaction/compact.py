@@ -44,6 +44,7 @@ from langsplat_core.arrays import Array, mean_squared_error, psnr
 from langsplat_core.config import DatasetConfig, Decibels, Range, SeveralCount, Side, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
+from langsplat_core.io.files import shown
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.io.summary import disk_bytes, memory_bytes
 from langsplat_core.progress import Progress, silent
@@ -258,7 +259,7 @@ def compact_scene(
     views = choose_views(scene, photos, config, progress)
     measured = views.measured(scene)
     before, before_bytes = _stored(scene, out)
-    keep, sh_degree = find_reduction(before, views, measured, config, progress)
+    keep, sh_degree = find_reduction(replace(before, path=source), views, measured, config, progress)
     candidate = _reduced(before, keep, sh_degree)
     after, after_bytes = _stored(candidate, out)
     losses = psnr_losses(after, measured, config.assumed_psnr)
@@ -310,9 +311,10 @@ def find_reduction(
     `measured` are those of ``views.measuring``. Raises InputError where nothing is visible, nothing fits the
     budget or nothing can be dropped.
     """
+    name = "the scene" if scene.path is None else shown(scene.path)
     score = contributions(scene, views.ranking, progress)
     if not score.any():
-        raise InputError(f"no Gaussian of the scene is visible from {views.origin}")
+        raise InputError(f"{name}: no Gaussian is visible from {views.origin}; name photographs that show it")
     order = np.argsort(-score, kind="stable")  # ties by index
 
     def loss_of(count: int, sh_degree: int) -> float:
@@ -322,12 +324,13 @@ def find_reduction(
     whole = len(order), scene.gaussians.sh_degree
     choice = smallest(*whole, loss_of, config.max_psnr_loss, progress)
     if choice is None:
-        raise InputError(f"the new file's format alone loses more than {config.max_psnr_loss} dB; allow more")
+        what = f"its new format alone loses more than {config.max_psnr_loss} dB; allow more, or write .ply"
+        raise InputError(f"{name}: {what}")
     count, sh_degree = choice
     keep = contributions(scene, views.measuring) > score[order[count - 1]]
     keep[order[:count]] = True
     if (keep.sum(), sh_degree) == whole:
-        raise InputError(f"nothing can be dropped within {config.max_psnr_loss} dB; allow more")
+        raise InputError(f"{name}: nothing can be dropped within {config.max_psnr_loss} dB; allow more")
     return keep, sh_degree
 
 
