@@ -240,7 +240,7 @@ def imported(path: Path) -> float:
 
 
 KINDS = {
-    "checkpoint": FileKind("a.pth", checkpoints, imported, in_zip),
+    "checkpoint": FileKind("a.pth", checkpoints, imported, in_zip, told=1),  # its level is a guess
     "autoencoder": FileKind("a.pth", autoencoders, imported, in_zip),
     "clusters": FileKind("a.npz", clusters, imported, in_zip),
 }
