@@ -268,7 +268,7 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
     into place, and last the new companions. Interrupted anywhere, there is the old scene or the new one,
     perhaps without companions, but never a scene beside companions of another. A scene with companions that
     could not be read is not written: that would remove them. Raises InputError then, and as `check_writable`.
-    `tell`: log a warning where the origin lies in a companion.
+    `tell`: report what the format has no room for, and log a warning where the origin lies in a companion.
     """
     path = Path(path)
     if scene.unread:
@@ -277,6 +277,14 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
         )
     row = check_writable(path)
     assert row.write is not None
+    has = {
+        "view dependence": bool(scene.gaussians.sh[:, 1:].any()),
+        "antialiasing": scene.antialiased,
+        "metres per unit": scene.metres_per_unit is not None,
+        "extra properties": bool(scene.extras),
+    }
+    if tell and (lost := [what for what in row.loses if has.get(what)]):
+        report_loss("%s: %s files have no room for %s", shown(path), row.suffix, ", ".join(lost))
     sidecar, cameras, origin = _companions(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as lock, ExitStack() as renames:  # made in the reverse order of these lines
