@@ -60,11 +60,12 @@ from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.training.language.codec_fit import CodecReport
 from langsplat_core.training.radiance.trainer import budgets_for
-from tests.benchmarks.clip_spaces import TruthEncoder, read_truth_encoder
 from tests.benchmarks.oracles import (
+    TruthEncoder,
     moved_to_images,
     oracle_vectors,
     phrase_vectors,
+    read_truth_encoder,
     true_labels,
     with_wrong_vectors,
 )
@@ -100,7 +101,7 @@ class RoomSettings:
     """"demo" for the bundled one, a folder, a hub id; clip-geometry:OWN[,ALIKE], vectors made from truth with
     the geometry of CLIP, OWN being the cosine of an image with its words (0.25, 0.27, 0.29); or
     real:PATH[,RULE], real text vectors, and image vectors from what LangSplat's decoder PATH (.pth, or a
-    folder of some) makes of its sphere, by one rule or several (`tests/benchmarks/clip_spaces.py`)."""
+    folder of some) makes of its sphere, by one rule or several (`tests/benchmarks/oracles.py`)."""
     text_vectors: Path | None = None  # .npy of real text vectors for clip-geometry, names in a .txt beside it
 
 

@@ -47,7 +47,8 @@ from tests.benchmarks.answers import (
     variants,
     verdict_table,
 )
-from tests.benchmarks.clip_spaces import (
+from tests.benchmarks.extensions import FAR, alter, middle, with_floaters
+from tests.benchmarks.oracles import (
     LOST,
     OTHER,
     PROMPTS,
@@ -56,10 +57,11 @@ from tests.benchmarks.clip_spaces import (
     ClipGeometry,
     RealSpace,
     TruthEncoder,
+    oracle_vectors,
+    phrase_vectors,
     read_truth_encoder,
+    true_labels,
 )
-from tests.benchmarks.extensions import FAR, alter, middle, with_floaters
-from tests.benchmarks.oracles import oracle_vectors, phrase_vectors, true_labels
 from tests.benchmarks.phrases import (
     CountScore,
     InventoryScore,
