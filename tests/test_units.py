@@ -159,10 +159,12 @@ class Case:
 
     @cached_property
     def other(self) -> Path:
-        """A file of the scene without its table, and about an origin of its own."""
-        table = run_phrase(self.engine, "table").answer.members
-        there = self.scene.origin + self.scale * np.array([0.5, -0.25, 1.0])
-        save_scene(self.folder / "other.ply", place_scene(self.scene.take(~table), origin=there))
+        """A file of the scene with its table lifted, and about an origin of its own."""
+        scene, table = self.scene, run_phrase(self.engine, "table").answer.members
+        lifted = scene.gaussians.means + np.outer(table, 0.3 * scene.bounds()[1] * scene.up())
+        other = replace(scene, gaussians=replace(scene.gaussians, means=lifted))
+        there = scene.origin + self.scale * np.array([0.5, -0.25, 1.0])
+        save_scene(self.folder / "other.ply", place_scene(other, origin=there))
         return self.folder / "other.ply"
 
     def run(self, *words: object) -> str:
@@ -500,6 +502,7 @@ def compared(case: Case) -> Found:
     points = load_scene(other).in_world(load_scene(other).gaussians.means[::50])
     case.run("merge", path, other, "--out", folder / "both.ply", "--transform", folder / "matrix.json")
     both = load_scene(folder / "both.ply")
+    assert changed
     return {
         "changes": Same([change["kind"] for change in changed]),
         "where": Places([change["centre"] for change in changed]),
@@ -625,7 +628,7 @@ def test_images_and_answers_have_no_unit(name, scale, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", [name for name in LAWS if name not in ("compared", "exported")])
 def test_nothing_depends_on_the_unit(name, scale, tmp_path):
     check(name, Case(transform_scene(room(), TO[scale]), tmp_path, TO[scale]))
 
