@@ -113,22 +113,24 @@ def test_checking_a_place_leaves_nothing_there(tmp_path: Path) -> None:
 def test_folders_without_permission_are_refused(tmp_path: Path) -> None:
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o555)
+    (tmp_path / "link").symlink_to(closed / "x.ply")
     code = (
         "import sys\nfrom pathlib import Path\nfrom langsplat_core.io.files import *\n"
         "from langsplat_core.errors import InputError\n"
         "for check in (check_output_file, check_output_folder):\n"
-        "    try: check(Path(sys.argv[1]))\n"
-        "    except InputError as error: print(error)\n"
+        "    for path in sys.argv[1:]:\n"
+        "        try: check(Path(path))\n"
+        "        except InputError as error: print(error)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, str(closed / "new" / "x.ply")],
+        [sys.executable, "-c", code, str(closed / "new" / "x.ply"), str(tmp_path / "link")],
         capture_output=True,
         text=True,
         check=True,
         preexec_fn=bound_by_permissions(),
     )
-    assert done.stdout.count("nothing can be written into") == 2
-    assert done.stdout.count("Permission denied") == 2
+    assert done.stdout.count("nothing can be written into") == 4
+    assert done.stdout.count("Permission denied") == 4
 
 
 @pytest.mark.parametrize("name", ["a" * 251 + ".ply", "é" * 125 + ".ply", "a." + "b" * 253, "." + "c" * 254])

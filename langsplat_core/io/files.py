@@ -195,6 +195,8 @@ def _checked(target: Path) -> int:
     system = any(real.is_relative_to(place) for place in ("/proc", "/sys", "/dev"))
     if system and not real.is_relative_to("/dev/shm"):
         raise InputError(f"{shown(target)}: lies in a folder of the system's own; choose another")
+    if os.path.islink(target):  # which writing follows
+        folder = next((above for above in real.parents if os.path.lexists(above)), folder)
     try:
         with tempfile.TemporaryFile(dir=target if stat.S_ISDIR(mode) else folder):
             return mode
