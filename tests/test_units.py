@@ -497,7 +497,9 @@ def compared(case: Case) -> Found:
     pytest.importorskip("open3d")
     path, other, folder = case.path, case.other, case.folder
     changed = case.said("changes", path, other)["changes"]
-    case.run("register", other, path, "--out", folder / "matrix.json")
+    table = run_phrase(case.engine, "table").answer.members
+    save_scene(folder / "rest.ply", place_scene(case.scene.take(~table), origin=case.scene.origin + 1))
+    case.run("register", folder / "rest.ply", path, "--out", folder / "matrix.json")
     matrix = np.array(json.loads((folder / "matrix.json").read_text())["matrix"])
     points = load_scene(other).in_world(load_scene(other).gaussians.means[::50])
     case.run("merge", path, other, "--out", folder / "both.ply", "--transform", folder / "matrix.json")
