@@ -17,8 +17,8 @@ import numpy as np
 from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
-from langsplat_core.errors import STRICTNESS, InputError
-from langsplat_core.io.files import check_output_folder, shown, write_json
+from langsplat_core.errors import STRICTNESS, FormatError, InputError
+from langsplat_core.io.files import atomic_path, check_output_folder, shown, write_json
 from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.pipeline.language_field import (
@@ -36,7 +36,7 @@ from langsplat_core.pipeline.report import (
     work_folder,
     write_reports,
 )
-from langsplat_core.pipeline.stages import ProcessGroup, sole_use, stage_key
+from langsplat_core.pipeline.stages import ProcessGroup, digest_of, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import place_scene
@@ -254,7 +254,10 @@ def _rehearsals(
         write_json(done, rehearse(capture, config, budgets, train, checkpoint, run.progress))
         for left in checkpoints_of(checkpoint):
             left.unlink(missing_ok=True)
-    found: list[list[float]] = json.loads(done.read_text())
+    try:
+        found: list[list[float]] = json.loads(done.read_bytes())
+    except ValueError as error:
+        raise FormatError(f"{done}: damaged ({error}); delete it and run again") from None
     return found
 
 
@@ -268,12 +271,19 @@ def trained_gaussians(
 ) -> Gaussians:
     """Return the Gaussians of the photographs at `train`, from `work` where they were trained before."""
     done = work / f"{_radiance_key('radiance', capture, train, config, budget)}.ply"
+    stated = done.with_suffix(".digest")
     if done.exists():
         log.debug("%s: kept from an earlier run", done.name)
-        return read_ply(done)
+        found = read_ply(done)
+        if stated.exists() and stated.read_bytes() != digest_of(found).encode():  # none in earlier versions
+            raise FormatError(f"{done}: changed since it was written; delete it and run again")
+        return found
     checkpoint = done.with_suffix(".checkpoint.safetensors")
+    stated.unlink(missing_ok=True)
     gaussians = train_within(capture, budget, config, train, checkpoint, progress)
     write_ply(done, gaussians)
+    with atomic_path(stated) as temporary:
+        temporary.write_text(digest_of(read_ply(done)))
     checkpoint.unlink(missing_ok=True)
     return gaussians
 
