@@ -315,6 +315,8 @@ def test_bookmarks_kept_at_once_are_all_there(tmp_path: Path) -> None:
     Shelf(tmp_path).write(names[0], (door, window), (door,))
     Shelf(tmp_path).write(names[0], (stair,), (door,))
     assert [mark.name for mark in Shelf(tmp_path).read(names[0])] == ["stair", "window"]
+    kept = Shelf(tmp_path).write(names[1], (window, stair), (window,))  # which a project had, and no shelf
+    assert [mark.name for mark in kept] == ["window", "stair", "door"]
 
 
 @pytest.mark.parametrize("size", [3, 300_000])

@@ -256,8 +256,9 @@ class Shelf:
     ) -> tuple[Bookmark, ...]:
         """Keep the bookmarks of a scene beside those of others; return those that are kept.
 
-        before: as they were; what another window changed since then stays. InputError where the file that is
-        there makes no sense, or they are too many: it stays as it is. OSError where it cannot be written.
+        before: as they were, also where they came from a project; what another window added or changed since
+        then stays. InputError where the file that is there makes no sense, or they are too many: it stays as
+        it is. OSError where it cannot be written.
         """
         if self.folder is None:
             return bookmarks
@@ -266,6 +267,7 @@ class Shelf:
             scenes, there = self._read(scene)
             scenes.pop(str(scene.absolute()), None)
             old, own, other = (_by_key("bookmarks", plain(part)) for part in (before, bookmarks, there))
+            old = {name: entry for name, entry in old.items() if name in other}  # what is not kept yet is new
             kept = list(_both(old, own, other, 1, []).values())
             if len(kept) > MOST_BOOKMARKS:
                 raise InputError(f"with another window's there are more than {MOST_BOOKMARKS}: delete one")

@@ -321,6 +321,10 @@ def test_two_windows_save_one_project_and_lose_nothing(saved, opened, again):
     assert {bookmark.name for bookmark in session.bookmarks} == {"left", "right"}
     assert phrases(opened) == ["mug", "book", "mug or book", "lamp"]
     assert session.query("lamp").slot is None
+    act(editing.undo, opened)  # what was taken over, and nothing else
+    assert (len(opened.state.session.notes), opened.state.session.things.names) == (2, {3: "atlas"})
+    act(editing.redo, opened)
+    assert opened.state.session == session
     assert sorted(path.name for path in saved.parent.glob("*.langsplat")) == [saved.name]
 
     act(editing.transform, opened, moving(np.array([0.0, 2.0, 0.0])))

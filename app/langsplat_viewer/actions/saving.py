@@ -237,6 +237,7 @@ def _take_over(viewer: Viewer, written: Session) -> None:
     made = {name: getattr(written, name) for name in MADE}
     if plain(written) == plain(session):
         return
+    viewer.remember()  # or what is undone next is the other window's work, too
     try:
         adopt(viewer, replace(session, **made))
         viewer.state.say("with what another window has saved in it meanwhile")
