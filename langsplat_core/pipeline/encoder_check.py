@@ -28,7 +28,7 @@ from langsplat_core.query.grammar import PARTS, forms
 from langsplat_core.query.rule import RULE
 from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import Calibration, CodebookCodec, PlattScaling, Scene, Tree
-from langsplat_core.semantics.encoders import Encoder
+from langsplat_core.semantics.encoders import DEMO, Encoder
 from langsplat_core.semantics.features import masked_crop
 from langsplat_core.semantics.relevancy import bundled_vocabulary
 from langsplat_core.training.language.merge_tree import SOLID
@@ -310,6 +310,8 @@ def report_lines(report: EncoderReport) -> str:
         rejected = f"{100 * row.rejected:.0f} % of {row.absent}"
         lines.append(f"{ASKED[row.asked]:<31}{found:<20}{rejected:<23}{fitted}")
     said = "--calibrate keeps it for scenes of this encoder; it is from drawn rooms, and so marked"
+    if report.encoder == DEMO:
+        said = "this encoder has its own, from more rooms"
     lines += [
         f"\ncalibration: {said if report.calibration else f'none; {report.reason}'}",
         "here a region has one or two images, in a scene tens, and more is found; --json: to send this",

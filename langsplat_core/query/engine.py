@@ -186,8 +186,8 @@ class QueryEngine:
 
     @cached_property
     def _kept(self) -> Calibration | None:
-        """The user's own calibration for the scene's encoder; the demo encoder elsewhere stays a guess."""
-        return None if self.field.encoder_id == DEMO else kept_calibration(self.field.canonical)
+        """The user's own calibration for the scene's encoder."""
+        return kept_calibration(self.field.encoder_id, self.field.canonical)
 
     @cached_property
     def compared(self) -> LanguageField:

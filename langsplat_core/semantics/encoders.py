@@ -111,9 +111,12 @@ def keep_calibration(encoder: "PhraseEncoder", calibration: Calibration) -> Path
     return path
 
 
-def kept_calibration(canonical: Array) -> Calibration | None:
-    """Return what was kept for the encoder of (C, D) canonical vectors; a damaged file is warned of."""
-    for path in sorted(_kept_folder().glob("*.json")):
+def kept_calibration(encoder: str, canonical: Array) -> Calibration | None:
+    """Return what was kept for the encoder of (C, D) canonical vectors; a damaged file is warned of.
+
+    The demo encoder stays a guess in scenes that are no drawn rooms.
+    """
+    for path in sorted(_kept_folder().glob("*.json")) if encoder != DEMO else ():
         try:
             kept = decode_json(path.read_bytes(), _Kept, path)
             if same_vectors(np.array(kept.canonical), canonical):

@@ -61,7 +61,7 @@ from langsplat_core.scene import LEVELS, NO_ORIGIN, Calibration, Camera, Languag
 from langsplat_core.scene.codec import LinearCodec
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.language import phrase_key
-from langsplat_core.semantics.encoders import same_vectors
+from langsplat_core.semantics.encoders import kept_calibration, same_vectors
 from langsplat_core.semantics.relevancy import fit_of
 
 log = logging.getLogger("langsplat")
@@ -570,10 +570,11 @@ def _ask_group(
 def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[Verdict]:
     """Return the verdict on every scene by the index alone: on the best of some phrases."""
     best = [Verdict(False, "chance", -math.inf)] * len(group.scenes)
+    kept = kept_calibration(group.encoder_id, group.canonical)
     for text, vector in vectors.items():
         for row, (scene, fits, common) in enumerate(zip(group.scenes, *fits_in(group, vector), strict=True)):
             if scene.is_indexed:
-                judged = scene.bars, scene.calibration, float(common)
+                judged = scene.bars, scene.calibration or kept, float(common)
                 verdict = judge(triple(fits), named(text), "auto", *judged)
                 best[row] = max(best[row], verdict, key=lambda found: found.margin)
     return best

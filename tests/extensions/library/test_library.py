@@ -37,9 +37,9 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import named
 from langsplat_core.query.rule import judge, triple
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene import Calibration, Gaussians, PlattScaling, Scene
 from langsplat_core.scene.transform import place_scene
-from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_core.semantics.encoders import keep_calibration, load_text_encoder
 from langsplat_core.semantics.relevancy import bundled_vocabulary
 from tests.support.fakes import CENTRES, NAMES, PER_BLOB, WORDS, FakeEncoder, axis, named_scene
 from tests.support.file_kinds import FileKind, few_and_many, in_safetensors
@@ -97,6 +97,18 @@ def test_the_index_has_the_fits_of_the_engine(folder, phrase):
             verdict = judge(triple(fits), "thing", "auto", scene.bars, scene.calibration, float(common))
             assert (verdict.outcome, verdict.probability) == (answer.verdict, answer.probability)
             assert verdict.margin == pytest.approx(answer.judgement.margin, abs=0.2)
+
+
+def test_own_calibration_counts_before_a_scene_is_opened(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    library = update_library(folder, load_encoder=load)
+    assert [hit.probability for hit in find(library, "plant", load)[0].hits] == [None] * 3
+    encoder = FakeEncoder()
+    encoder.id = library.groups[0].encoder_id
+    keep_calibration(encoder, Calibration(*[PlattScaling(0.0, 3.0, 0.0)] * 3))
+    answered = find(library, "plant", load)[0]
+    assert None not in [hit.probability for hit in answered.hits]
+    assert (answered.count("found"), answered.count("not here")) == (2, 1)
 
 
 def test_the_best_scenes_come_first_and_with_a_place(folder):
