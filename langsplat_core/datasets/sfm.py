@@ -63,7 +63,7 @@ def load_photos(
     masked = [(labels[path], _content(mask)) for path in paths if (mask := mask_beside(path))]
     workspace = open_workspace(work, ["photographs", 4, SIDE, contents, *([masked] if masked else [])])
     files, before = numbered(paths), has_model(workspace / "sparse")
-    if not has_model(workspace / "sparse"):
+    if not before:
         try:
             run_apart(_locate, workspace, files, workspace=workspace, progress=progress)
         except FAILURES as error:

@@ -60,9 +60,6 @@ def read_cameras(path: Path | str) -> tuple[Camera, ...]:
     told = [unread("entries", {quoted(name, 40) for one in stated for name in one if name not in known})]
     if half := sum((entry.cx is None) != (entry.cy is None) for entry in entries):
         told.append(f"{half} cameras have one of cx and cy alone, and the middle is taken for the other")
-    poses = {(entry.img_name, entry.position, entry.rotation) for entry in entries if entry.img_name}
-    if again := len(poses) - len({name for name, *_ in poses}):
-        told.append(f"{again} cameras have the name of another")
     report_losses(path, told)
     return tuple(_camera(entry, f"{path}: camera {index}") for index, entry in enumerate(entries))
 

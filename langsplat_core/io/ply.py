@@ -195,8 +195,14 @@ class PlyFile:
         yield unread("elements", (f"{each.name} ({each.count} rows)" for each in others))
         if self._beyond:
             yield f"{self._beyond} numbers do not fit the types of their properties"
+        if self._order and any(each.lists for each in self.elements.values()):
+            return  # where the last row ends only walking them tells, which takes long
         self._seek(None)
-        left = self._size - self._file.tell() if self._order else sum(map(bool, map(bytes.strip, self._file)))
+        left = (
+            self._size - self._file.tell()
+            if self._order
+            else sum(bool(line.strip()) for line in self._lines())
+        )
         if left:
             yield f"{left} {'bytes' if self._order else 'lines'} behind the last row not read"
 

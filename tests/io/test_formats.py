@@ -659,13 +659,11 @@ def changed_sidecar(data: bytes, rng: np.random.Generator) -> bytes:
 def changed_cameras(data: bytes, rng: np.random.Generator) -> bytes:
     cameras = json.loads(data)
     at = int(rng.integers(len(cameras)))
-    match rng.integers(4):
+    match rng.integers(3):
         case 0:
             del cameras[at][str(rng.choice(sorted(cameras[at].keys() - {"img_name"})))]
         case 1:
             cameras[at]["k1"] = 0.1
-        case 2:
-            cameras.append(cameras[at] | {"position": [1, 2, 3]})
         case _:
             cameras = [dict(sorted(camera.items())) for camera in cameras]
     return json.dumps(cameras).encode()

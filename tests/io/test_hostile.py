@@ -104,6 +104,17 @@ def test_colours_of_every_type_become_bytes(tmp_path, colour, row, point, shade)
     np.testing.assert_array_equal(colours, [shade])
 
 
+def test_faces_behind_points_play_no_part(put: Callable[..., Path], caplog: pytest.LogCaptureFixture) -> None:
+    """Of a mesh of scanners, whose lists of corners may be long, and here are cut."""
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
+    header += "".join(f"property float {name}\n" for name in "xyz")
+    header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    header += "element face 9\nproperty list uchar int corners\nend_header\n"
+    points, _ = read_cloud(put(header.encode() + bytes(15) + b"\3\0"))
+    np.testing.assert_array_equal(points, [[0, 0, 0]])
+    assert not caplog.messages
+
+
 # Headers of .npy files: what NumPy writes is read, anything else refused, whatever it looks like.
 
 

@@ -407,6 +407,12 @@ def test_camera_names_lose_the_suffix_of_an_image(put, stored, name):
     assert read_cameras(put(text_of([entry(img_name=stored)])))[0].name == name
 
 
+def test_cameras_may_share_a_name(put, caplog):
+    """INRIA's list of NeRF's synthetic scenes has an r_0 that trained and an r_0 that did not."""
+    assert len(read_cameras(put(text_of([entry(), entry(position=[0, 0, 1])])))) == 2
+    assert not caplog.messages
+
+
 TURNED = np.array(entry()["rotation"])
 MALFORMED = {
     "not a list": {"a": 1},

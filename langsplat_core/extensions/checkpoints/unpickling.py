@@ -66,12 +66,11 @@ def load_torch(path: Path) -> Any:
 
     open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
     stand_ins: Any = [(IgnoredArray if name in _ARRAYS else _Ignored, name) for name in _OF_NUMPY]
-    with warnings.catch_warnings(), torch.serialization.safe_globals(stand_ins):
+    with _mappable(path) as file, warnings.catch_warnings(), torch.serialization.safe_globals(stand_ins):
         warnings.simplefilter("ignore")
         try:
-            with _mappable(path) as file:
-                archived = _look_through(file)
-                return torch.load(file, map_location="cpu", weights_only=True, mmap=archived)
+            archived = _look_through(file)
+            return torch.load(file, map_location="cpu", weights_only=True, mmap=archived)
         except FormatError as error:
             raise FormatError(f"{path}: {error}") from None
         except Exception:  # noqa: BLE001  a damaged file raises whatever it hits first

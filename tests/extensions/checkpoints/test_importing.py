@@ -243,6 +243,9 @@ def test_archives_with_deflated_members_are_read(tmp_path):
         for name in whole.namelist():
             archive.writestr(name, whole.read(name))
     assert_same(read_foreign([packed]).scene.gaussians, G)
+    content = packed.read_bytes()
+    packed.write_bytes(content.replace(content[200:220], bytes(20), 1))
+    refused([packed], r"^\S*b\.pth: not a readable archive")
 
 
 FAR = replace(G, means=G.means + np.float32(2**20))
