@@ -99,7 +99,6 @@ bench: system  ## speed against error, on this machine
 FRESH := --tiers clutter --seeds 401 402 403 404 405
 report: system  ## every report under docs/benchmarks, again: hours (ONLY="rooms scale": some of them)
 	$(if $(ONLY),,$(BIN)/langsplat bench raster --out docs/benchmarks)
-	$(if $(ONLY),,$(BIN)/langsplat bench query assets/demo/scene.ply --out docs/benchmarks)
 	for name in $(or $(ONLY),rooms verdicts phrases clean lifting scale); do \
 	  case $$name in rooms|verdicts|phrases|clean) rooms="$(FRESH)";; *) rooms=;; esac; \
 	  $(BIN)/python -m tests.benchmarks $$name $$rooms --out docs/benchmarks || exit; done

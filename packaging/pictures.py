@@ -14,7 +14,6 @@ from imgui_bundle.immapp import testing  # isort: skip
 import numpy as np
 
 from langsplat_core.config import AutoencoderConfig
-from langsplat_core.extensions.benchmarks.query_speed import with_codec
 from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.training.language.codec_fit import train_autoencoder
@@ -106,7 +105,8 @@ def _beside(ctx: Any, window: Window) -> None:
     field = scene.language
     codewords = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None])
     codec = train_autoencoder(codewords, AutoencoderConfig(steps=2_000))
-    language = replace(with_codec(field, codec), tree=None)
+    latents = np.where(field.known[..., None], codec.encode(codewords)[field.latents[..., 0]], 0)
+    language = replace(field, latents=latents, codec=codec, tree=None)
     save_scene(path, replace(scene, language=language, path=path))
     opening.open_beside(viewer, path)
     while viewer.beside is None or not any(viewer.beside.state.shown_results()):

@@ -347,7 +347,6 @@ COMMANDS = (
     "convert s.npz t.ply --codec.kind=autoencoder",
     "compact s.ply",
     "bench raster",
-    "bench query s.ply",
 )
 
 

@@ -31,7 +31,6 @@ from langsplat_core.config import Count, CountOrZero, PictureConfig
 from langsplat_core.display.composing import compose_upwards
 from langsplat_core.display.displays import Channels
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.benchmarks.query_speed import repeated
 from langsplat_core.extensions.benchmarks.raster_speed import Size, peak_memory, resident_memory, restart_peak
 from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.io.ply import write_ply
@@ -47,6 +46,7 @@ from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.relevancy import bundled_vocabulary
 from tests.benchmarks.fresh import in_fresh_interpreter
 from tests.benchmarks.room import publish
+from tests.support.scenes import repeated
 
 COARSE = ((1.0, False), (0.5, False), (0.25, False), (0.5, True), (0.25, True))  # resolution, whether merged
 PARTS = 4  # that phrases and images are measured in: what grows is seen from one to the next

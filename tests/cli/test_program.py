@@ -183,7 +183,6 @@ LINES = {  # words that work: positions, and options; what would take long ends 
     "eval lerf-ovs": "s.ply . --",
     "eval 3d-ovs": "s.ply . --",
     "bench raster": "-- --scenes absent.ply --out b",
-    "bench query": "absent.ply -- --out b",
     "serve": "s.ply --",
 }
 

@@ -321,3 +321,11 @@ def find_mask_weights(
     """The mask weights of all views, in memory."""
     pairs = [view_pairs(rasterizer, gaussians, *view, settings) for view in views]
     return MaskWeights(pairs, len(gaussians))
+
+
+def repeated(scene: Scene, count: int) -> Scene:
+    """`count` Gaussians: the scene's over and over, each moved by a random step of its own size."""
+    larger = scene.take(np.resize(np.arange(len(scene.gaussians)), count))
+    gaussians = larger.gaussians
+    steps = np.random.default_rng(0).normal(size=(count, 3)) * np.exp(gaussians.log_scales)
+    return replace(larger, gaussians=replace(gaussians, means=gaussians.means + steps))

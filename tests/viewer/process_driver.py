@@ -25,7 +25,6 @@ from imgui_bundle import imgui, immapp
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 
 import glfw  # isort: skip
-from langsplat_core.extensions.benchmarks.query_speed import repeated
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import viewpoint
@@ -35,6 +34,7 @@ from langsplat_viewer.options import ViewerOptions
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, open_window
 from tests.support.fakes import FakeEncoder
+from tests.support.scenes import repeated
 
 DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"
 STEP = 0.02  # radians a picture

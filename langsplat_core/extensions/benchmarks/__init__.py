@@ -13,6 +13,5 @@ EXTENSION = Extension(
         "eval gr-lerf": f"{_HERE}.commands:EvalGrLerf",
         "eval 3d-ovs": f"{_HERE}.commands:EvalOvs3d",
         "bench raster": f"{_HERE}.raster_speed:BenchRaster",
-        "bench query": f"{_HERE}.query_speed:BenchQuery",
     },
 )

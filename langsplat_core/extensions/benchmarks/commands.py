@@ -40,13 +40,7 @@ class _Eval:
 
     def evaluate(self, read: "Callable[[Path], Benchmark]", profile: Profile) -> None:
         """Score what was given, print the tables and write the files asked for."""
-        from langsplat_core.extensions.benchmarks.report import (
-            Evaluated,
-            beside_published,
-            run_benchmark,
-            save_json,
-            table,
-        )
+        from langsplat_core.extensions.benchmarks.report import Evaluated, run_benchmark, save_json, table
         from langsplat_core.semantics.encoders import load_text_encoder
 
         if len(self.paths) != (1 if self.maps else 2):
@@ -61,9 +55,6 @@ class _Eval:
         with TerminalProgress() as progress:
             report = run_benchmark(benchmark, profile, subject, load_text_encoder, self.only, progress)
         print(table(report))
-        published = beside_published(report)
-        if published:
-            print(f"\n{published}", end="")
         if self.json is not None:
             save_json(self.json, report)
 

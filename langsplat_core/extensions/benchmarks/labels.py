@@ -41,10 +41,7 @@ class MaskFile:
     path: Path
 
     def draw(self, size: Size) -> Array:
-        """Return the mask on a grid of `size`, (H, W) bool.
-
-        True is above half of 255, or above 0 where the file holds no more than 0 and 1.
-        """
+        """Return the (H, W) bool mask on a grid of `size`: above half of 255, or above 0 of 0 and 1."""
         grey = read_grey(self.path)
         return resized(grey > (127 if grey.max(initial=0) > 1 else 0), size)
 

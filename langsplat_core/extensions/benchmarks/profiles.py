@@ -160,10 +160,7 @@ def read_maps(maps: Array, rule: MapRule) -> Prediction:
 
 
 def peak_pixels(maps: Array, rule: MapRule) -> Array:
-    """(P, 2) column and row of the highest pixel over all levels' filtered maps.
-
-    More than one where several of that level are as high and the rule tries all.
-    """
+    """(P, 2) column and row of the highest pixels over all filtered maps; one, or all of a level's ties."""
     smooth = [mean_filtered(level, rule.peak_window, rule.border) for level in maps]
     best = smooth[int(np.argmax([values.max() for values in smooth]))]
     pixels = np.argwhere(best == best.max())[:, ::-1]
@@ -171,10 +168,7 @@ def peak_pixels(maps: Array, rule: MapRule) -> Array:
 
 
 def mean_filtered(values: Array, window: int, border: Border) -> Array:
-    """(H, W) means over `window` x `window` pixels.
-
-    An even window reaches one pixel further up and left, as cv2's does.
-    """
+    """(H, W) means over `window`^2 pixels; an even one reaches further up and left, as cv2's does."""
     if window <= 1:
         return values
     if border == "mirror":

@@ -185,10 +185,7 @@ def run_plan(
     progress: Progress = silent,
     keep: Callable[[RasterReport], None] = lambda _: None,
 ) -> RasterReport:
-    """Measure; a few minutes for the default plan.
-
-    `keep` is given what there is after every scene and size, so that an interrupted run leaves that.
-    """
+    """Measure, for minutes; `keep` is given what there is after each scene and size."""
     machine = describe_machine()
     backends = _backends(machine)
     progress("bench: compiling", 0.0)
@@ -475,10 +472,7 @@ class ReferenceWindows:
         return Error(max(float(error.max()) for error in errors), off, flips)
 
     def masked(self, image: Array) -> Array:
-        """Return `image` with 0 outside the windows and in their bands.
-
-        This is what a backend must gather to be compared: a window knows nothing of the pixels outside.
-        """
+        """Return `image` with 0 outside the windows, which know nothing of the rest, and in their bands."""
         kept = np.zeros_like(image)
         for window in self.windows:
             kept[window.at] = image[window.at] * ~window.band[..., None]

@@ -137,10 +137,7 @@ def scored_size(size: Size, max_rows: int) -> Size:
 
 
 def inside_any_box(peaks: Array, boxes: Array | None, size: Size, grid: Size) -> bool:
-    """Return True where any of the (P, 2) peaks lies in any of the (B, 4) boxes, borders included.
-
-    peaks: column and row on `grid` (width, height); boxes: on the label's grid of `size`.
-    """
+    """Return True where a peak (P, 2) on `grid` lies in a box (B, 4) of the label's `size`, borders too."""
     if boxes is None or not len(peaks):
         return False
     scaled = boxes * np.tile(np.divide(grid, size), 2)
@@ -180,10 +177,7 @@ class BenchmarkReport:
 
 
 def means(queries: Sequence[QueryScore], group: Callable[[QueryScore], Hashable] = id) -> Means:
-    """Return the mean of the means of groups of queries, each group with the same weight.
-
-    By default each query is a group; zeros where there are none.
-    """
+    """Return the mean of the means of groups of queries, by default of queries; zeros without any."""
     groups: dict[Hashable, list[tuple[float, ...]]] = {}
     for one in queries:
         shares = one.iou, np.nan if one.hit is None else one.hit, one.iou > 0.25, one.iou > 0.5
@@ -283,49 +277,6 @@ def save_json(path: Path, report: BenchmarkReport) -> None:
         "left_out": report.left_out,
     }
     write_json(path, content)
-
-
-# Published figures on the benchmarks, beside the own: mIoU and localisation, percent.
-#
-# LERF and LangSplat: from the paper of LangSplat (CVPR 2024), 3D-OVS's own figures too; N2F2 (ECCV 2024),
-# LangSplatV2 (NeurIPS 2025) and Occam's LGS (BMVC 2025) as later papers repeat them. Figures of other
-# machines, masks and trainings: to see where one stands, not to rank by a point.
-
-_PUBLISHED = {
-    "lerf-ovs": """
-              figurines  teatime    ramen      waldo_kitchen
-LERF          38.6/75.0  45.0/84.8  28.2/62.0  37.9/72.7
-LangSplat     44.7/80.4  65.1/88.1  51.2/73.2  44.5/95.5
-LangSplatV2   56.4/82.1  72.2/93.2  51.8/74.7  59.1/95.5
-Occam's_LGS   58.6/80.4  70.2/93.2  51.0/74.7  65.3/81.8
-""",
-    "3d-ovs": """
-              bed   bench  room  sofa  lawn
-LERF          73.5  53.2   46.6  27.0  73.7
-3D-OVS        89.5  89.3   92.8  74.0  88.2
-LangSplat     92.5  94.2   94.1  90.0  96.1
-N2F2          93.8  92.6   93.5  92.1  96.3
-""",
-}
-
-
-def beside_published(report: BenchmarkReport) -> str:
-    """Return a Markdown table of the report's scenes that others published too, and of their figures.
-
-    It is "" where there is none.
-    """
-    if report.benchmark not in _PUBLISHED:
-        return ""
-    head, *lines = (line.split() for line in _PUBLISHED[report.benchmark].strip().splitlines())
-    scenes, rows = [name for name in head if name in report.scenes], summary(report)
-    if not scenes:
-        return ""
-    own = {name: (rows[name].iou, rows[name].localisation) for name in scenes}
-    ours = ["/".join(_percent(share) for share in own[name] if share is not None) for name in scenes]
-    others = (
-        (method.replace("_", " "), *(cells[head.index(name)] for name in scenes)) for method, *cells in lines
-    )
-    return markdown(("mIoU % / localisation %", *scenes), [("this scene", *ours), *others])
 
 
 # A benchmark's labels, and whoever answers them, brought together by names.
@@ -436,10 +387,7 @@ def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Pat
 def _other_cameras(
     own: Mapping[str, Camera], labelled: LabelledScene, progress: Progress
 ) -> Mapping[str, Camera]:
-    """Return the dataset's views by name, read where the scene lacks a labelled one; they share its world.
-
-    InputError where no labelled frame is among either.
-    """
+    """Return the dataset's views by name, where the scene lacks one; InputError where neither has any."""
     wanted = [frame.name for frame in labelled.frames]
     if all(name in own for name in wanted):
         return {}

@@ -4,7 +4,6 @@ is measured of rasterizers and of queries."""
 import json
 import logging
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,7 +30,6 @@ from langsplat_core.extensions.benchmarks.profiles import (
     read_maps,
     voted,
 )
-from langsplat_core.extensions.benchmarks.query_speed import BenchQuery, measure_queries
 from langsplat_core.extensions.benchmarks.raster_speed import reference_windows, run_plan
 from langsplat_core.extensions.benchmarks.report import (
     Evaluated,
@@ -603,34 +601,12 @@ def test_a_tiny_run_writes_three_sane_files(tmp_path):
     assert Image.open(tmp_path / "raster.png").size[0] > 1000
 
 
-# The query benchmark.
-
-SMALL = BenchQuery(Path(), size=(40, 30), phrases=2, together=3, repeats=1, codec_steps=40)
-
-
-def test_a_scene_without_a_codebook_is_refused():
-    with pytest.raises(InputError, match="codebook"):
-        measure_queries(blob_scene(), FakeEncoder(), SMALL)
-
-
-@pytest.mark.long
-def test_the_command_writes_what_it_measured(tmp_path, capsys):
-    small = "--size 64 48 --phrases 2 --together 2 --repeats 1 --codec-steps 30"
-    words = ["bench", "query", "assets/demo/scene.ply", *small.split(), "--out", tmp_path]
-    assert run(*words) == 0
-    report = json.loads((tmp_path / "query.json").read_text())["report"]
-    assert report["size"] == [64, 48]
-    assert [cost["way"] for cost in report["costs"]] == ["paper's order", "cells", "codebook"]
-    assert report["costs"][2]["lookup"]["p99"] < 1e-6  # its latents stand for the codewords themselves
-    assert (tmp_path / "query.md").read_text() in capsys.readouterr().out
-    assert run(*words, "--repeats", 0) == 2
-
-
 @pytest.mark.parametrize(
     "words",
     [
-        *("eval lerf-ovs s.ply d --json /proc/x.json", "eval 3d-ovs s.ply d --json /proc/x"),
-        *("bench raster --out /proc/x", "bench query s.ply --out /proc/x"),
+        "eval lerf-ovs s.ply d --json /proc/x.json",
+        "eval 3d-ovs s.ply d --json /proc/x",
+        "bench raster --out /proc/x",
     ],
 )
 def test_commands_try_the_place_to_write_first(words: str, capsys: pytest.CaptureFixture[str]) -> None:
