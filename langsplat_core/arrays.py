@@ -63,10 +63,7 @@ def across(direction: Array) -> Array:
 
 
 def decimals_of(lengths: Array, least: int) -> int:
-    """Return the decimals that lengths in any unit are rounded to: `least`, more for small ones.
-
-    The largest of them keeps at least `least` significant digits.
-    """
+    """Return the decimals that lengths are rounded to: the largest keeps `least` significant digits."""
     largest = np.abs(lengths).max(initial=0.0)
     return least if not 0 < largest < 0.1 else least - int(np.floor(np.log10(largest)))
 

@@ -140,10 +140,7 @@ def _imported(text: str) -> Iterator[Path]:
 
 
 def plain(array: Array) -> Array:
-    """Return the array as float32, contiguous and writeable: numba compiles once per type.
-
-    Only a read-only array is copied for that reason; kernels never write to their inputs.
-    """
+    """Return contiguous, writeable float32, a copy where need be: numba compiles once per type."""
     return np.require(array, np.float32, ["C", "W"])
 
 
@@ -159,10 +156,7 @@ class Workers:
         self._pool, self._process = ThreadPoolExecutor(self.threads, "kernels"), os.getpid()
 
     def run(self, compiled: Callable[..., Any], count: int, *arguments: Any) -> list[Any]:
-        """Run compiled(first, last, *arguments) for pieces [first, last) that cover range(count).
-
-        Returns what they return, in order.
-        """
+        """Return what compiled(first, last, *arguments) returns, in order, for pieces of range(count)."""
         if compiled in _SHAPES:
             _check_shapes(compiled, arguments)
         pieces = min(count, self.threads * _PIECES_PER_THREAD if self.threads > 1 else 1)

@@ -106,10 +106,7 @@ def _problem(setting: Setting) -> str | None:
 
 
 def _flat(value: Any) -> Iterator[Any]:
-    """Return the values in tuples and lists of them.
-
-    An absent one and a word in place of a number are none.
-    """
+    """Return the values in tuples and lists of them, without absent ones and words for numbers."""
     if isinstance(value, tuple | list):
         for part in value:
             yield from _flat(part)
@@ -143,10 +140,7 @@ Positive = Annotated[float, Range(0.0, 1e9, above=True)]
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """Constants of image formation; see `INRIA` and `GSPLAT` for the two named profiles.
-
-    Sources: graphdeco-inria/diff-gaussian-rasterization and gsplat.
-    """
+    """Constants of image formation, of INRIA's diff-gaussian-rasterization (`INRIA`) and of `GSPLAT`."""
 
     # Gaussians with camera z <= near are not drawn, world units; but for published code it follows from the
     # scene, see `scene.near_plane`

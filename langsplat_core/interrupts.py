@@ -28,10 +28,7 @@ def end(program: str, number: int, more: str = "") -> NoReturn:
 
 
 def end_in_a_line(program: str) -> None:
-    """Let signals end the process at once from now on.
-
-    While modules are imported and arguments are read there is nothing to keep.
-    """
+    """Let signals end the process at once from now on: nothing is there to keep yet."""
     for number in SAID:
         if signal.getsignal(number) != signal.SIG_IGN:  # as a shell's background jobs have SIGINT
             signal.signal(number, lambda number, _: end(program, number))

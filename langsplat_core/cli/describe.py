@@ -94,10 +94,7 @@ class Describe:
 
 
 def _plain(value: Any, sure: bool) -> Any:
-    """Words, spots and entries, ready for JSON.
-
-    A share of the softmax over a vocabulary is a probability too where that is `sure`.
-    """
+    """Words, spots and entries, ready for JSON; softmax shares are probabilities too where that is `sure`."""
     if isinstance(value, tuple):
         return [_plain(item, sure) for item in value]
     if not is_dataclass(value):
@@ -251,10 +248,7 @@ class Teach:
 
 
 def _pointed(engine: QueryEngine, camera: int, at: str, level: Level) -> Array:
-    """(N,) bool: the region in a pixel, "X,Y" as --at gives it.
-
-    Raises InputError for what is no pixel of the camera, and for one without a region.
-    """
+    """(N,) bool: the region in a pixel "X,Y"; InputError for none of the camera's, or without a region."""
     scene, place = engine.scene, re.fullmatch(r"([0-9]{1,9}), ?([0-9]{1,9})", at)
     if not scene.cameras:
         raise InputError("the scene has no cameras, so --at means nothing")

@@ -139,10 +139,7 @@ def found_answer(engine: QueryEngine, text: str, level: LevelChoice) -> QueryRes
 
 
 def chosen_instances(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:
-    """Return the instances of these numbers, the best is 1; all without numbers.
-
-    Raises InputError for another.
-    """
+    """Return the instances of these numbers, the best is 1; all without numbers. InputError for others."""
     if not found:
         raise InputError("what was found lies nowhere on a surface: nothing to select")
     for number in numbers:

@@ -172,10 +172,7 @@ class _StandardError(io.FileIO):
 
 
 def _prepare_standard_streams() -> None:
-    """Have a closed standard output fail when it is written to, and standard error never.
-
-    Names that cannot be encoded are printed with escapes.
-    """
+    """Have a closed standard output fail when written to, standard error never; escape what is no text."""
     for number in (1, 2):
         try:
             os.fstat(number)

@@ -128,10 +128,7 @@ def sharpness(frame: Any) -> float:
 
 
 def _save(frame: Any, aspect: float, folder: Path, tell: Tell) -> None:
-    """Write an image, turned and coloured as it is shown, under the next number.
-
-    aspect: of its pixels, width over height; tell: is told of colours that are not known.
-    """
+    """Write an image as it is shown under the next number; aspect: of its pixels, width over height."""
     from av.video.reformatter import Colorspace, Interpolation
 
     deep = frame.color_trc in (HLG, PQ)  # whose dark shades need more than 8 bits

@@ -54,10 +54,7 @@ def compose(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> 
 
 
 def compose_upwards(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> Array:
-    """(H, W, 4) uint8, the image of `compose` with row 0 at the bottom, as OpenGL has it.
-
-    Opaque unless the picture is transparent.
-    """
+    """(H, W, 4) uint8, the image of `compose` as OpenGL has it: row 0 at the bottom, opaque by default."""
     extra = channels.alpha[..., None] if channels.extra is None else channels.extra
     planes = tuple(np.asarray(plane, np.float32) for plane in (channels.rgb, channels.alpha, extra))
     style = Style(

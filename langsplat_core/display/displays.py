@@ -113,10 +113,7 @@ def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | 
 
 
 def heat_ranges(answers: Answers, scale: tuple[float, float] | None = None) -> Ranges:
-    """Relevancies at which the heat of each slot is 0 and 1, by one `scale` or by each answer's own.
-
-    A weak match gets no hotter than a half.
-    """
+    """Relevancies of heat 0 and 1 of each slot, by `scale` or its own; weak matches reach half."""
     ranges = []
     for answer in answers:
         strength = 0.0 if answer is None else STRENGTH[answer.verdict]
@@ -162,10 +159,7 @@ UNLIKE = 0.35, 0.6, 0.85  # brightnesses that nodes of one hue are told apart by
 
 
 def nodes(subject: Subject) -> Array | None:
-    """(N, 3) colours of the tree's nodes at a level, each its own; grey where there is none.
-
-    None for a scene that keeps no tree.
-    """
+    """(N, 3) colours of the tree's nodes at a level, grey where there is none; None without a tree."""
     if subject.language is None or subject.language.tree is None or subject.level is None:
         return None
     found, of = np.unique(subject.language.tree.at(subject.level), return_inverse=True)

@@ -48,10 +48,7 @@ class _Entry(Struct):
 
 
 def read_cameras(path: Path | str) -> tuple[Camera, ...]:
-    """Return the cameras in the file, in its order; what is passed over or guessed is reported.
-
-    Raises InputError and FormatError.
-    """
+    """Return the cameras in the file, in its order, and report losses; InputError and FormatError."""
     path = Path(path)
     text = read_file(path, SIZE_LIMIT)
     entries = decode_json(text, list[_Entry], path)

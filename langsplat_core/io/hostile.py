@@ -85,10 +85,7 @@ def write_npy(path: Path, array: Array, behind: bytes = b"") -> None:
 
 
 def read_npy(path: Path) -> Array:
-    """Return the array of numbers in a .npy file.
-
-    Raises InputError where it cannot be opened, else FormatError.
-    """
+    """Return the array of numbers in a .npy file; InputError where it cannot be opened, else FormatError."""
     file, size = open_for_reading(path)
     with file:
         return _parse(file, size, str(path))

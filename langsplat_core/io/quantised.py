@@ -74,10 +74,7 @@ def without_largest(quats: Array) -> tuple[Array, Array]:
 
 
 def mirrored(gaussians: Gaussians, signs: Array) -> Gaussians:
-    """Return the Gaussians along axes that have the (3,) `signs`, 1 or -1.
-
-    Mirroring an axis turns the rotations about the two others round.
-    """
+    """Return the Gaussians along axes that have the (3,) `signs`, 1 or -1; turns about the others reverse."""
     x, y, z = signs = signs.astype(np.float32)
     odd = np.array([[axis in axes for axis in "xyz"] for axes in _ODD[: gaussians.sh.shape[1]]])
     with np.errstate(invalid="ignore"):

@@ -127,10 +127,7 @@ def read_sog_scene(path: Path | str) -> Scene:
 
 
 def _decode(fetch: Fetch, meta_path: Path, size: int, files: Iterable[str]) -> Scene:
-    """Decode the scene, of `size` bytes, whose meta file `fetch` finds by the last part of `meta_path`.
-
-    files: names of those that it may have.
-    """
+    """Decode the scene, of `size` bytes, whose `files` `fetch` finds by the last part of `meta_path`."""
     text = fetch(meta_path.name, META_LIMIT)
     version = decode_json(text, _Versioned, meta_path).version
     if version != 2:

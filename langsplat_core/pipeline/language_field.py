@@ -85,10 +85,7 @@ MOST_CONFIDENCE = 65_504.0  # pixels; the largest number that float16 holds
 
 
 class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
-    """Cameras with the features of what each saw, read when a view is looked at.
-
-    Hundreds of label maps are more than memory holds.
-    """
+    """Cameras with what each saw, read when a view is looked at: label maps are more than memory holds."""
 
     def __init__(self, cameras: tuple[Camera, ...], features: Sequence[ImageFeatures]) -> None:
         self.cameras, self.features = cameras, features
@@ -233,10 +230,7 @@ class _Stages:
         return load_lifting_rasterizer(self.config.lift.backend)
 
     def codec(self) -> tuple[Codec, CodecReport]:
-        """Return the codec, fitted to lifted vectors and, where that helps, to the masks' own.
-
-        Where latents are averaged themselves it is fitted to the masks' vectors alone.
-        """
+        """Return the codec, fitted to lifted vectors, where that helps also to the masks' own."""
 
         def make() -> Arrays:
             settings, masks = self.config.codec, np.concatenate(self.inputs[0])
@@ -311,10 +305,7 @@ class _Stages:
         self.processes.barrier()
 
     def tree(self, field: LanguageField) -> Tree:
-        """Return the tree of the scene.
-
-        It has no votes where latents are averaged themselves, which needs no mask weights.
-        """
+        """Return the scene's tree, without votes where latents are averaged, which needs no mask weights."""
 
         def make() -> Arrays:
             self.progress("building the tree", 0.5)

@@ -96,10 +96,7 @@ def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
 
 
 def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """Return warnings of a poor scene that was trained without an error, one sentence each, with a remedy.
-
-    scores: of held-out views, or none; cameras: all that were trained on.
-    """
+    """Return a sentence with a remedy for each sign of a poor scene; scores: of held-out views."""
     found = []
     if scores:
         psnr = float(np.mean([score.psnr for score in scores]))
@@ -125,10 +122,7 @@ def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> 
 
 
 def camera_groups(positions: Array) -> list[Array]:
-    """Return rows of (M, 3) positions in groups that lie `APART`, the largest first.
-
-    Cameras that stand together are one group; a single camera on its own is none.
-    """
+    """Return rows of (M, 3) positions of two or more that lie `APART` as groups, the largest first."""
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
     from scipy.spatial.distance import pdist, squareform
 

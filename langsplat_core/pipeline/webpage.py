@@ -194,10 +194,7 @@ def page_shaders() -> dict[str, list[str]]:
 def language_tables(
     engine: QueryEngine, rows: Array, progress: Progress = silent
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return what answers need: numbers and words, and tensors.
-
-    rows: (M,) Gaussians of the page.
-    """
+    """Return the numbers, words and tensors that answers need; rows: (M,) Gaussians of the page."""
     field, regions = engine.field, engine.regions
     codebook = field.codec.decode(np.arange(field.codec.size)[:, None])
     scale = engine.scale
@@ -303,10 +300,7 @@ def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any
 
 
 def page_text(title: str, data: bytes) -> str:
-    """Return the HTML file.
-
-    Its policy lets nothing run but its own script, and nothing be fetched.
-    """
+    """Return the HTML file, whose policy lets only its own script run, and nothing be fetched."""
     folder = files("langsplat_core") / "web"
     modules = [folder.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES]
     script = "\n".join(module.split(BEGIN)[1].split(END)[0] for module in modules)

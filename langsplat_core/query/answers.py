@@ -250,10 +250,7 @@ SPAN = 0.02  # the least distance between the floor and the peak that is divided
 def by_peak(
     phrase: str, relevancy: Array, surface: Surface, scale: Scale, found: float, level: LevelChoice
 ) -> QueryResult:
-    """Return the answer as published: the level with the highest smoothed peak, cut half way to the floor.
-
-    found: relevancy from which a phrase counts as found.
-    """
+    """Return the published answer: highest peak, cut half way to the floor; found: from which relevancy."""
     smoothed = np.stack([surface.smooth(values) for values in relevancy])
     scores = triple(smoothed.max(1, initial=0))
     chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)

@@ -198,10 +198,7 @@ class Describer:
         return surface_areas(self.engine.scene.gaussians)
 
     def at_gaussians(self, rows: Array, weights: Array | None = None, top: int = 5) -> Levels:
-        """Return words for the Gaussians at `rows` (M indices, or a boolean mask of length N) taken together.
-
-        weights: (M,) >= 0, how much each counts; by default its surface.
-        """
+        """Return words for Gaussians at `rows` (M, or (N,) bool), by `weights` (M,), else their surface."""
         rows = np.flatnonzero(rows) if rows.dtype == bool else rows
         counted = self.areas[rows] if weights is None else np.asarray(weights, np.float64)
         if weights is None and not counted.any():  # without any surface they still have features

@@ -315,10 +315,7 @@ class Suggestions:
 
 
 def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = silent) -> Suggestions:
-    """Return examples from a scene's inventory and phrasebook, each asked and found, in seconds.
-
-    There are none where nothing can be asked.
-    """
+    """Return examples from a scene's inventory and phrasebook, asked and found, in seconds; maybe none."""
     here: tuple[str, ...] = ()
     taught: tuple[str, ...] = ()
     try:

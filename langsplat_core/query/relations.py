@@ -86,10 +86,7 @@ def body(positions: Array, frame: Array) -> Body:
 
 
 def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[Array]:
-    """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks.
-
-    tree: tells apart things that touch, by its wholes that masks voted for.
-    """
+    """(M,) bool -> surface numbers of each thing, by the tree's voted wholes, largest first, no specks."""
     wholes = None if tree is None else tree.voted(WHOLE)
     parts = told_apart(surface, np.flatnonzero(inside), wholes, join=True)
     parts.sort(key=len, reverse=True)

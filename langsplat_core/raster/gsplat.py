@@ -57,10 +57,7 @@ def drawn_settings(settings: RasterSettings) -> RasterSettings:
 
 
 def require_device() -> None:
-    """Raise BackendError unless gsplat draws, forwards and backwards, on a CUDA device of this machine.
-
-    The first use on a machine may compile for some minutes.
-    """
+    """Raise BackendError unless gsplat draws both ways on a CUDA device; the first use compiles."""
     if not has_device():
         raise BackendError("torch finds no CUDA device")
     shapes = {"means": (1, 3), "log_scales": (1, 3), "quats_wxyz": (1, 4), "opacity_logits": (1,)}

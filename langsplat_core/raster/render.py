@@ -102,10 +102,7 @@ def splat_colours(view: View, gaussians: Gaussians, values: Array | None = None)
 
 
 def colours_seen(gaussians: Gaussians, camera: Camera, rows: Array | None = None) -> Array:
-    """(N, 3) float32 display colours >= 0 of the Gaussians as seen from the camera; invalid rows are 0.
-
-    rows: (M,) int32, to have those of these alone.
-    """
+    """(N, 3) float32 colours >= 0 seen from the camera, 0 if invalid; rows: (M,) int32, these alone."""
     from langsplat_core.raster.cpu.projection import colours  # numba takes a second to import
 
     if camera.orthographic:

@@ -166,10 +166,7 @@ class Tree:
         return np.stack([np.where(levels[row] == level, row, NO_NODE) for level, row in enumerate(voted)])
 
     def voted_by(self, things: Array) -> "Tree":
-        """Return the tree with a vote for each node that is mostly of `things`, see `build_tree`.
-
-        For scenes that do not know how many photographs said so.
-        """
+        """Return the tree with one vote for each node mostly of `things`, for want of photographs' counts."""
         votes = np.zeros((self.count, 2), np.uint16)
         for level, row in enumerate(things):
             at = self.at(level)

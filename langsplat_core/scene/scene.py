@@ -196,10 +196,7 @@ def near_plane(gaussians: Gaussians, cameras: Sequence[Camera], most: float | No
 
 
 def bounds_of(gaussians: Gaussians) -> tuple[Array, float]:
-    """Robust centre (3,) and radius in world units, > 0: medians, so that floaters do not count.
-
-    Neither depends on how the world's axes lie.
-    """
+    """Robust centre (3,) and radius > 0, world units: medians without floaters, however the axes lie."""
     valid = gaussians.valid()
     means = gaussians.means[valid].astype(np.float64)
     if len(means) == 0:
@@ -327,10 +324,7 @@ class Scene:
         return made
 
     def raster_settings(self, profile: RasterSettings | None = None) -> RasterSettings:
-        """`profile` with the antialiasing and the focal length that this scene was trained with.
-
-        Without one, the published constants with the scene's own near plane.
-        """
+        """`profile`, or what is published with the scene's near plane, with the scene's own filters."""
         formed = replace(INRIA, near=self.near) if profile is None else profile
         return replace(formed, antialiased=self.antialiased, focal=self._focal)
 

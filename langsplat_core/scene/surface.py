@@ -104,10 +104,7 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
 
 
 def surface_areas(gaussians: Gaussians) -> Array:
-    """(N,) float64 opacity times the two longest axes of each Gaussian, world units^2, 0 for invalid rows.
-
-    Cut at the 99 % quantile: a veil of a few huge Gaussians is no surface.
-    """
+    """(N,) float64 opacity times the two longest axes, units^2, at most the 99 % quantile; 0 if invalid."""
     valid = gaussians.valid()
     scales = np.sort(np.where(valid[:, None], gaussians.log_scales, -np.inf).astype(np.float64), axis=1)
     opacity = sigmoid(np.where(valid, gaussians.opacity_logits, -np.inf).astype(np.float64))

@@ -70,10 +70,7 @@ class Similarity:
         return turned
 
     def camera(self, camera: Camera) -> Camera:
-        """Return `camera` moved along, which sees the transformed world as it saw the world.
-
-        InputError where it would lie farther out than a camera file may say.
-        """
+        """Return `camera` moved along with the world; InputError where it would lie too far out."""
         position = self.points(camera.position)
         if np.abs(position).max() > FARTHEST:
             raise InputError(f"a camera would lie more than {FARTHEST:g} units from the origin; move by less")
@@ -122,10 +119,7 @@ def turning(direction: Array, onto: Array) -> Similarity:
 
 
 def similarity(matrix: Array) -> Similarity:
-    """Return the similarity of a (4, 4) or (3, 4) matrix.
-
-    InputError for one that is mirrored, flat, sheared, projective or not finite.
-    """
+    """Return a matrix's similarity; InputError: mirrored, flat, sheared, projective or not finite."""
     matrix = np.asarray(matrix, np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError("a transform is a matrix of 4 x 4 numbers, or 3 x 4")

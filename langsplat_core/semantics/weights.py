@@ -98,10 +98,7 @@ def weights_path(model: str, option: str) -> Path:
 
 
 def local_path(model: str) -> Path:
-    """Return where `model` lies if it is a file or folder here.
-
-    `~` and a folder on another machine, which is asked for it, are the user's own to write.
-    """
+    """Return where `model` lies if it is a file or folder here; `~` and other machines are the user's own."""
     if not isinstance(model, FromFile):
         return Path(os.path.expanduser(model))
     return Path(os.devnull if model[:2].replace("\\", "/") == "//" else model)

@@ -191,10 +191,7 @@ def _places(values: Array | None, unit: Unit) -> Any:
 
 
 def towards(scene: Scene, answer: QueryResult) -> Camera:
-    """Return the camera of the scene that shows most of the best of an answer.
-
-    It is counted by pixels of the box of the answer; a scene without cameras is given a new one.
-    """
+    """Return the camera that shows most pixels of the best answer's box; a new one where there are none."""
     assert answer.box is not None
     low, high = answer.box
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
@@ -270,10 +267,7 @@ async def _serve(server: "MCPServer[Any]") -> None:
 
 
 def build_server(door: Door) -> "MCPServer[Any]":
-    """Return the door as tools of the protocol.
-
-    A question that cannot be answered is a tool error of one line.
-    """
+    """Return the door as tools of the protocol; what cannot be answered is a tool error of one line."""
     from mcp.server import MCPServer
     from mcp.server.mcpserver import Image as Picture
     from mcp.server.mcpserver.exceptions import ToolError

@@ -159,10 +159,7 @@ def converted(
 
 
 def _read(id: str, file: Path) -> Tensors:
-    """Return the tensors of a file, without the wrappings of a training's checkpoint.
-
-    None of its code is run.
-    """
+    """Return the tensors of a file, without a checkpoint's wrappings; none of its code is run."""
     import torch
     from safetensors.torch import load_file
 
@@ -338,10 +335,7 @@ def _sam_config(tensors: Tensors) -> Settings:
 
 
 def _decoder_config(tensors: Tensors, first: str) -> Settings:
-    """Return settings of the halves for prompts and masks, by the shapes.
-
-    `first`: of the two layers of an "mlp".
-    """
+    """Return settings of the halves for prompts and masks by shapes; `first`: of an "mlp"'s layers."""
     tokens, size = _shape(tensors, "mask_decoder.mask_tokens.weight", 2)
     decoder = "mask_decoder.transformer.layers.0."
     narrow = _shape(tensors, f"{decoder}cross_attn_token_to_image.q_proj.weight", 2)[0]

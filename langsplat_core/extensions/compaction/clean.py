@@ -67,10 +67,7 @@ class Floaters:
 def find_floaters(
     scene: Scene, cameras: tuple[Camera, ...], largest: int, progress: Progress = silent
 ) -> Floaters:
-    """Return the floaters of `scene`, seen from `cameras`.
-
-    largest: Gaussians of a region that may be one; the largest region of all is never one.
-    """
+    """Return the floaters that `cameras` see: regions of at most `largest`, but for the largest of all."""
     gaussians = scene.gaussians
     suspicion = np.zeros(len(gaussians), np.int8)
     share = _free_space(scene, cameras, progress)
@@ -105,10 +102,7 @@ def _gaps(gaussians: Gaussians, surface: Surface) -> Array:
 
 
 def _small_regions(surface: Surface, near: Array, largest: int) -> Array:
-    """Rows of the Gaussians in regions of at most `largest`, but for the largest of all.
-
-    near: (M, k) bool, which neighbours touch.
-    """
+    """Rows in regions of at most `largest` but the largest; near: (M, k) bool, which neighbours touch."""
     count, width = near.shape
     if count == 0:
         return surface.rows
@@ -122,10 +116,7 @@ def _small_regions(surface: Surface, near: Array, largest: int) -> Array:
 
 
 def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -> Array:
-    """Return the (N,) share of the views of each centre that see through it to a surface.
-
-    Views in which it is hidden do not count; 0 where only one sees through it.
-    """
+    """Return the (N,) share of the views not hidden that see through each centre; 0 where but one does."""
     gaussians = scene.gaussians
     ahead, on = np.zeros(len(gaussians), int), np.zeros(len(gaussians), int)
     for index, camera in enumerate(cameras):
@@ -168,10 +159,7 @@ class CleanReport:
 def clean(
     scene: Scene, views: Views, config: CleanConfig, progress: Progress = silent
 ) -> tuple[Array, CleanReport]:
-    """Return the rows (N,) bool of `scene` that stay, and the report.
-
-    Raises InputError where nothing can be drawn or the photographs show something else.
-    """
+    """Return the (N,) bool rows that stay, and the report; InputError where photographs disagree."""
     valid = scene.gaussians.valid()
     if not valid.any():
         raise InputError("the scene holds nothing that can be drawn: there is nothing to clean")

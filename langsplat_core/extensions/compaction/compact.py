@@ -89,10 +89,7 @@ class Views:
     origin: str  # where they come from, for the report
 
     def measured(self, scene: Scene) -> list[MeasuringView]:
-        """Return the measuring views with the images of the original `scene`.
-
-        Raises InputError where the photographs show something else than the scene.
-        """
+        """Return the measuring views with the scene's images; InputError where photographs show another."""
         found = []
         for camera, photograph in zip(self.measuring, self.photographs, strict=True):
             truth = None if photograph is None else photograph.astype(np.float32) / 255
@@ -157,10 +154,7 @@ def _thinned(items: Sequence[T], most: int) -> list[T]:
 
 
 def _divided(items: list[T]) -> tuple[list[T], list[T]]:
-    """Return the items that rank, and those that measure: every `HOLD_OUT`-th.
-
-    Half of fewer than twelve measure, so that the loss is not that of one or two.
-    """
+    """Return what ranks, and what measures: every `HOLD_OUT`-th, or half of fewer than twelve."""
     step = HOLD_OUT if len(items) >= 12 else 2
     measuring = items[step // 2 :: step]
     return [item for i, item in enumerate(items) if i % step != step // 2], measuring
@@ -189,10 +183,7 @@ def contributions(scene: Scene, cameras: Sequence[Camera], progress: Progress = 
 
 
 def psnr_losses(scene: Scene, views: Sequence[MeasuringView], assumed_psnr: float) -> Array:
-    """Return the (V,) dB lost by `scene` in each view; negative where it comes nearer to a photograph.
-
-    `assumed_psnr` (dB) is the original's, used for views without a photograph.
-    """
+    """Return the (V,) dB lost in each view, < 0 for gains; assumed_psnr: dB without a photograph."""
     losses = []
     for view in views:
         image = draw(scene, view.camera)

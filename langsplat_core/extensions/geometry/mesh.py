@@ -176,10 +176,7 @@ def _cleaned(mesh: Mesh) -> Mesh:
 
 
 def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
-    """Return a watertight surface through the mesh (Poisson), and how much of it was made up.
-
-    Made up to close holes is what is farther than two voxels from any vertex, world units squared.
-    """
+    """Return a watertight surface (Poisson), and its area over two voxels from any vertex, units^2."""
     import open3d
     from scipy.spatial import cKDTree
 

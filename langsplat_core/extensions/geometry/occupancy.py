@@ -142,10 +142,7 @@ def _moved(points: Array, transform: Array) -> Array:
 
 @kernel
 def trace(eye: Array, ends: Array, hits: Array, passes: Array) -> None:
-    """Walk from `eye` (3,) to each of `ends` (P, 3), in voxels, voxel by voxel (Amanatides and Woo 1987).
-
-    Counts stop at the largest number.
-    """
+    """Count voxels walked from `eye` (3,) to `ends` (P, 3) (Amanatides and Woo 1987), up to the largest."""
     most = np.iinfo(np.uint16).max
     shape = hits.shape
     cell, last, step = np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(3, np.int64)
@@ -252,10 +249,7 @@ def _between(plan: FloorMap, blocked: Array, start: Array, end: Array) -> bool:
 
 
 def collider(occupancy: Occupancy) -> tuple[Array, Array]:
-    """Return squares around everything that is occupied: (V, 3) corners, metres, (F, 4) int64 faces.
-
-    Seen from outside, corners run counterclockwise.
-    """
+    """Return squares around all that is occupied, counterclockwise: (V, 3) corners, m, (F, 4) int64 faces."""
     solid = np.pad(occupancy.occupied, 1)
     loop = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])  # counterclockwise from above
     corners = []

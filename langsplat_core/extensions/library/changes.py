@@ -205,10 +205,7 @@ _TERMS = {
 
 
 def colour_term(lab: Array) -> str:
-    """Return the basic colour term nearest to a colour (3,) in CIE L*a*b*.
-
-    Lightness counts half, for the shade.
-    """
+    """Return the basic colour term nearest to a colour (3,) in CIE L*a*b*, lightness counted half."""
     terms = to_lab(np.array(list(_TERMS.values())) / 255)
     return list(_TERMS)[int((((terms - lab) * (0.5, 1, 1)) ** 2).sum(1).argmin())]
 

@@ -162,10 +162,7 @@ class Library:
 
 
 def scenes_in(folder: Path) -> list[Path]:
-    """Every scene below a folder with a language field beside it, by name; hidden folders are left out.
-
-    Of several scenes beside one field the first. InputError where there is no such folder.
-    """
+    """Every scene with a field below a folder, one a field, none hidden; InputError without the folder."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; name one with scenes in it")
     found: list[Path] = []
@@ -373,10 +370,7 @@ def write_library(index: Path, digests: Sequence[Digest]) -> None:
 
 
 def read_library(index: Path, folder: Path) -> Library:
-    """Return the library that an index describes.
-
-    Raises InputError where it cannot be opened, and FormatError for what breaks a rule of its layout.
-    """
+    """Return the library that an index describes; InputError or FormatError."""
     open_for_reading(index)[0].close()  # the same messages for a missing file as everywhere
     try:
         with safe_open(index, framework="numpy") as file:

@@ -480,10 +480,7 @@ def walk(
     row_: Callable[..., None],
     close_: Callable[..., None],
 ) -> tuple[Array, int]:
-    """Blend the tile; return its transmittance and the end of the intersections visited.
-
-    The end comes early where no pixel runs any more.
-    """
+    """Blend the tile; return its transmittance and the end of the intersections, once no pixel runs."""
     x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     transmittance = start_tile(tile, tiles)

@@ -38,10 +38,7 @@ def is_software(ctx: moderngl.Context) -> bool:
 
 
 def create_egl_context() -> moderngl.Context:
-    """Return an OpenGL context of 4.1 or newer that needs no display: EGL on Linux.
-
-    Raises BackendError where there is no driver for one.
-    """
+    """Return an OpenGL context >= 4.1 without a display (EGL); BackendError without a driver."""
     linux = sys.platform.startswith("linux")
     attempts: list[dict[str, Any]] = [{"backend": "egl"}, {"backend": "egl", **_VERSIONED}] if linux else [{}]
     problem: Exception | None = None
@@ -186,10 +183,7 @@ class SceneTextures:
         return texture
 
     def upload(self, values: Array) -> moderngl.Texture:
-        """(N, C <= 3) values, a row for every Gaussian of the scene -> a texture that a splat can draw.
-
-        The caller releases it.
-        """
+        """(N, C <= 3) values, a row a Gaussian -> a texture that a splat draws; the caller releases it."""
         padded = np.zeros((self.size[0] * self.size[1], 4), np.float32)
         padded[: len(self.rows), : values.shape[1]] = values[self.rows]
         return self._ctx.texture(self.size, 4, padded, dtype="f4")

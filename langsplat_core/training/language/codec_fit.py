@@ -53,10 +53,7 @@ def everyday_vocabulary(encoder: PhraseEncoder, phrases: tuple[str, ...] = ()) -
 
 
 def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> tuple[float, float]:
-    """Return the mean and the 99 % quantile of the change of relevancy, over vectors and phrases.
-
-    With (M, D) `made` in place of (M, D) `vectors`, both float32 unit vectors; 0 where M = 0.
-    """
+    """Return mean and 99 % quantile of the change of relevancy by (M, D) unit `made`; 0 where M = 0."""
     if not len(vectors):
         return 0.0, 0.0
     errors = np.empty((len(vectors), len(vocabulary.phrases)), np.float32)
@@ -157,10 +154,7 @@ def train_autoencoder(
 
 
 def _settle_statistics(encoder: Any, data: Any) -> None:
-    """Recompute batch statistics over the data with final weights.
-
-    Running averages lag behind them, and with few vectors that lag is most of the reconstruction error.
-    """
+    """Recompute batch statistics with final weights: running averages lag, most of few vectors' error."""
     import torch
 
     for module in encoder:
@@ -175,10 +169,7 @@ def _settle_statistics(encoder: Any, data: Any) -> None:
 
 
 def folded_layers(network: Any) -> tuple[tuple[Array, Array], ...]:
-    """Return (out, in) weights and biases of a torch `Sequential`.
-
-    Each batch normalisation is folded into the layer before it.
-    """
+    """Return (out, in) weights and biases of a torch `Sequential`, batch normalisations folded in."""
     from torch import nn
 
     layers: list[tuple[Array, Array]] = []

@@ -41,10 +41,7 @@ class MaskGroups:
 
 
 def group_masks(vectors: Sequence[Array], groups: int = 2_048) -> MaskGroups:
-    """Return at most `groups` groups of the masks; where there are not more masks than that, each is its own.
-
-    vectors: of each view, (M, D) float32 unit CLIP vectors.
-    """
+    """Return at most `groups` groups of the masks, or each its own; vectors: (M, D) float32 unit a view."""
     joined = np.concatenate(vectors)
     of_mask, centres = np.arange(len(joined)), joined
     if len(joined) > groups:

@@ -60,10 +60,7 @@ class MergeTree:
         return int(self.patches.max(initial=-1)) + 1
 
     def cut(self, cost: float) -> Array:
-        """Return the (P,) int32 number, from 0, of the largest node around each patch up to a cost.
-
-        Nothing within the node costs more than `cost`.
-        """
+        """Return the (P,) int32 number of the largest node around each patch that costs at most `cost`."""
         total = self.count + len(self.children)
         highest, owner = np.zeros(total), np.arange(total)
         for node, (children, own) in enumerate(zip(self.children, self.costs, strict=True), self.count):
@@ -94,10 +91,7 @@ def find_tree(
     eyes: Array,
     progress: Progress = silent,
 ) -> MergeTree:
-    """Return the tree of a scene.
-
-    counts: number of masks of each view; eyes: (V, 3) positions of the cameras.
-    """
+    """Return the tree of a scene; counts: masks of each view; eyes: (V, 3) positions of cameras."""
     everywhere = np.full(len(gaussians), -1, np.int32)
     if len(surface.rows) == 0:
         return MergeTree(everywhere, np.zeros((0, 2), np.int32), np.zeros(0))
@@ -360,10 +354,7 @@ def _boxes(footprints: Footprints, camera: Camera, patches: Array, count: int) -
 
 
 def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
-    """(P,) channel of each patch, -1 for those not shown, and (C, rows, columns) patches in each cell.
-
-    The largest boxes choose first.
-    """
+    """(P,) channel of each patch or -1, the largest box first, and (C, rows, columns) patches of cells."""
     channel_of = np.full(len(boxes), -1)
     owners: list[Array] = []
     rows, columns = (int(boxes[:, side].max(initial=0)) for side in (3, 2))

@@ -157,10 +157,7 @@ Backend = Literal["auto", "cpu", "cuda"]
 
 
 def renderer_for(backend: Backend, settings: RasterSettings = INRIA) -> DifferentiableRenderer:
-    """Return the renderer a user asked for; `auto` takes CUDA where gsplat really draws there, else the CPU.
-
-    Raises BackendError when `cuda` is asked for and cannot work.
-    """
+    """Return the renderer asked for; auto: CUDA where gsplat draws, else the CPU; BackendError."""
     if backend == "cpu" or (backend == "auto" and not torch.cuda.is_available()):
         return CpuRenderer(settings)
     try:
@@ -218,10 +215,7 @@ def evaluate_views(
 
 
 def _psnr_exposed(image: Tensor, target: Tensor, counted: Tensor) -> float | None:
-    """PSNR of an image whose halves, left and right, each have the exposure that fits the other best.
-
-    None where a half has no pixel that counts.
-    """
+    """PSNR of an image whose halves' exposures fit one another's best; None where a half is masked."""
     left, right = counted.clone(), counted.clone()
     left[:, image.shape[1] // 2 :] = False
     right[:, : image.shape[1] // 2] = False

@@ -323,10 +323,7 @@ def save_checkpoint(path: Path, state: TrainingState, made_from: str) -> None:
 
 
 def load_checkpoint(path: Path, made_from: str, device: torch.device) -> TrainingState:
-    """Read what `save_checkpoint` wrote.
-
-    Raises FormatError for a file that is no checkpoint and InputError for one of another run.
-    """
+    """Read what `save_checkpoint` wrote; FormatError if it is none, InputError if of another run."""
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

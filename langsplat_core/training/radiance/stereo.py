@@ -130,10 +130,7 @@ def warp(camera: Camera, other: Camera) -> tuple[Array, Array]:
 def sweep(
     index: int, others: Sequence[int], cameras: Sequence[Camera], greys: Sequence[Array], known: Array
 ) -> tuple[Array, Array]:
-    """Return the (H, W) depths of view `index` by its neighbours `others`, and their scores.
-
-    greys: (H, W) float32 in [0, 1].
-    """
+    """Return the (H, W) depths of a view by neighbours, and scores; greys: (H, W) float32 in [0, 1]."""
     camera, grey, run = cameras[index], greys[index], shared_workers().run
     planes = inverse_depths(camera, cameras, known)
     best = np.full((BEST, PLANES, *grey.shape), -1, np.float32)

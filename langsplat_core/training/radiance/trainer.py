@@ -87,10 +87,7 @@ class Schedule:
         return self.densify_from < step < self.densify_until and step % self.densify_every == 0
 
     def clears_free_space(self, step: int) -> bool:
-        """Return True where Gaussians that stand before known surfaces are removed after the step.
-
-        The last steps mend what a removal leaves.
-        """
+        """Return True where Gaussians before surfaces go after this step; the last steps mend that."""
         return self.densify_from < step <= 0.9 * self.steps and step % self.densify_every == 0
 
     def prunes_large(self, step: int) -> bool:
@@ -359,10 +356,7 @@ def _with_points(capture: Capture, depths: Sequence[DepthMap], config: RadianceC
 
 
 def _extent(capture: Capture, gaussians: Gaussians) -> float:
-    """Return the cameras' extent, a twentieth of their distance to the Gaussians at least.
-
-    One camera, or cameras in one place, have no extent.
-    """
+    """Return the cameras' extent, at least a twentieth of their distance to the Gaussians."""
     centre = np.mean([camera.position for camera in capture.cameras], axis=0)
     distance = float(np.median(np.linalg.norm(gaussians.means - centre, axis=1)))
     return max(capture.extent(), 0.05 * distance)
@@ -494,10 +488,7 @@ def checkpoints_of(checkpoint: Path) -> list[Path]:
 
 
 def supported(found: Sequence[Sequence[float]], budgets: Sequence[RadianceBudget]) -> RadianceBudget:
-    """Return the budget that rehearsals `found` best.
-
-    A larger one only where it gains in every one of them; the smallest where no view could be held out.
-    """
+    """Return the largest budget that gains in every rehearsal; the smallest where none was held out."""
     best = 0
     for index in range(1, len(found)):
         if _pays([more - less for more, less in zip(found[index], found[best], strict=False)]):
