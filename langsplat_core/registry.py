@@ -70,9 +70,7 @@ def part(kind: Kind, name: str) -> Any:
     """Return one part of an extension; InputError where there is none of that name or it is broken."""
     known = references(kind)
     if name not in known:
-        raise InputError(
-            f"no extension has {name!r} among its {kind}; there are {shortened(known) or 'none'}"
-        )
+        raise InputError(f"no extension has {name!r} among its {kind}; known: {shortened(known) or 'none'}")
     found = _imported(kind, name, known[name])
     if found is None:
         raise InputError(f"{name!r} cannot be used: its extension is broken; mend or remove it")

@@ -44,9 +44,7 @@ _taught = "Your own words, as `langsplat teach --into FILE` writes them, beside 
 _encoder = tyro.conf.arg(help="Text encoder folder or hub id, in place of the one the scene names.")
 AnyScene = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Any readable scene.")]
 TrainedScene = Annotated[tyro.conf.Positional[Path], _trained]
-WrittenScene = Annotated[
-    tyro.conf.Positional[Path], tyro.conf.arg(help="Scene to write: .ply, .spz or .splat.")
-]
+WrittenScene = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Scene to write: .ply, .spz ...")]
 EncoderOption = Annotated[str, _encoder]
 JsonOption = Annotated[bool, tyro.conf.arg(help="Print JSON, lengths in world units.")]
 ScaleOption = Annotated[

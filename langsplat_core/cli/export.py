@@ -130,9 +130,7 @@ class Convert:
     def _read(self) -> Scene:
         importer = self._importer()
         if importer is not None and self.rematch is not None:
-            raise InputError(
-                "--rematch is for one scene; import the checkpoints first, then rematch the result"
-            )
+            raise InputError("--rematch is for one scene; import the checkpoints, then rematch those")
         if importer is not None:
             request = ImportRequest(self.sources, self.encoder, self.levels, self.phrases, self.codec)
             with TerminalProgress() as progress:
@@ -271,18 +269,14 @@ class SetScale:
 
     def run(self) -> None:
         if (self.metres is None) != (self.between is None):
-            raise InputError(
-                "--metres and --between belong together: a length, and the points it lies between"
-            )
+            raise InputError("--metres and --between belong together: a length, and the points at its ends")
         if self.metres is not None and self.metres_per_unit is not None:
             raise InputError("give either --metres with --between, or --metres-per-unit")
         factor = self.metres_per_unit
         if self.metres is not None and self.between is not None:
             units = math.dist(self.between[:3], self.between[3:])
             if not 0 < units < math.inf:
-                raise InputError(
-                    f"--between: points {units:g} units apart; their distance must be above 0 and finite"
-                )
+                raise InputError(f"--between: points {units:g} units apart; expected more than 0, and finite")
             factor = self.metres / units
         if factor is not None:
             write_metres(self.scene, factor)

@@ -464,9 +464,7 @@ class Select:
     def _check(self) -> None:
         """InputError for what needs no scene to be known: it should not cost the loading of one."""
         if not self.texts:
-            raise InputError(
-                "no phrase given; for example: langsplat select scene.ply 'red cup' --out cup.ply"
-            )
+            raise InputError("no phrase given; say: langsplat select scene.ply 'red cup' --out cup.ply")
         check_writable(self.out)
         check_keeps(self.out, self.scene)
         folder = self.out.parent

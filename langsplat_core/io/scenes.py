@@ -272,9 +272,7 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
     """
     path = Path(path)
     if scene.unread:
-        raise InputError(
-            f"not written without what lies beside it; mend or remove it first: {scene.unread[0]}"
-        )
+        raise InputError(f"not written without what lies beside it; mend or remove that: {scene.unread[0]}")
     row = check_writable(path)
     assert row.write is not None
     has = {

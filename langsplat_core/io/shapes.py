@@ -88,9 +88,7 @@ def check_suffix(path: Path | str, suffixes: Sequence[str]) -> Path:
     """Return `path`; InputError unless it ends in one of `suffixes`."""
     path = Path(path)
     if path.suffix.lower() not in suffixes:
-        raise InputError(
-            f"{path}: what is asked for is written as {' or '.join(suffixes)}; choose such a name"
-        )
+        raise InputError(f"{path}: this is written as {' or '.join(suffixes)}; choose such a name")
     return path
 
 

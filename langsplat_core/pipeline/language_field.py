@@ -110,9 +110,7 @@ def check_lift(config: TrainConfig) -> None:
 def check_masks(features: Iterable[ImageFeatures]) -> None:
     """Raise InputError where no photograph has a mask; only files up to the first with one are read."""
     if not any(len(seen.vectors) for seen in features):
-        raise InputError(
-            "no masks were found in any photograph; try --masks.source graph, or larger photographs"
-        )
+        raise InputError("no photograph has masks; try --masks.source graph, or larger photographs")
 
 
 def language_field(

@@ -123,9 +123,7 @@ def _check_viewpoint(tree: Phrase, viewpoint: Camera | None) -> None:
     if viewpoint is None and isinstance(tree, Relation | Superlative):
         free = isinstance(tree, Superlative) and tree.kind in ("nearest", "farthest") and tree.anchor is None
         if free or tree.kind in SAID_BY_VIEWER:
-            raise InputError(
-                f"'{tree.kind}' depends on where one looks from; give a camera, or say it otherwise"
-            )
+            raise InputError(f"'{tree.kind}' depends on where one stands; give a camera, or say it otherwise")
     for child in children(tree):
         _check_viewpoint(child, viewpoint)
 

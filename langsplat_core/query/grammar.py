@@ -113,9 +113,7 @@ def check_names(words: Sequence[str]) -> None:
     if not words:
         raise InputError("the query is empty; type a word such as 'cup'")
     if only(STOP_WORDS, words):
-        raise InputError(
-            f"'{' '.join(words)[:60]}' names nothing to look for; type a thing such as 'red mug'"
-        )
+        raise InputError(f"'{' '.join(words)[:60]}' names nothing to look for; type a thing, as 'red mug'")
 
 
 Side = Literal["on", "in", "near", "left of", "right of", "above", "below", "behind", "in front of"]

@@ -46,9 +46,7 @@ def load_rasterizer(name: str, **resources: Any) -> Rasterizer:
             rasterizer: Rasterizer = getattr(import_module(backend.module), backend.class_name)(**resources)
     except (ImportError, OSError, BackendError) as error:
         reason = " ".join(str(error).split())
-        raise BackendError(
-            f"rasterizer {name!r} cannot load ({reason}); try --backend {backend.otherwise}"
-        ) from error
+        raise BackendError(f"rasterizer {name!r}: {reason}; try --backend {backend.otherwise}") from error
     return rasterizer
 
 

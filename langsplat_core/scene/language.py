@@ -227,9 +227,7 @@ class PlattScaling:
         slopes = (self.whole, self.finer)
         bounded = (np.abs([self.constant, *slopes]) <= LARGEST).all()
         if not (bounded and sum(slopes) > 0 and 0.5 <= self.found <= 1):
-            raise ValueError(
-                f"{self}: expected numbers up to {LARGEST:g}, rising with fits, and found in [0.5, 1]"
-            )
+            raise ValueError(f"{self}: expected up to {LARGEST:g}, rising with fits, and found in [0.5, 1]")
 
     def probability(self, fits: Fits) -> float:
         """Return the probability, in (0, 1), that what is asked for is there."""

@@ -308,9 +308,7 @@ class TorchText:
         self.tokenizer = _tokenizer(weights, int(config.vocab_size))
         self._end = _special_token(weights, self.tokenizer, "eos_token", ("<|endoftext|>", "</s>", "<eos>"))
         self._begin = [_special_token(weights, self.tokenizer, "bos_token", (begin,))] if begin else []
-        self._pad = (
-            _special_token(weights, self.tokenizer, "pad_token", ("<pad>", "</s>")) if not begin else 0
-        )
+        self._pad = 0 if begin else _special_token(weights, self.tokenizer, "pad_token", ("<pad>", "</s>"))
 
     def encode(self, texts: list[str]) -> Array:
         import torch

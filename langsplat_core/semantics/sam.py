@@ -178,9 +178,7 @@ def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
             raise InputError(f"masks.source {config.source}: choose one of {known}")
         return registry.part("mask_sources", config.source)(config, device)
     if not config.sam:
-        raise InputError(
-            "masks.source sam: name the weights too, such as `--masks.sam facebook/sam-vit-huge`"
-        )
+        raise InputError("masks.source sam: name weights too, such as `--masks.sam facebook/sam-vit-huge`")
     half_on = HALF_ON if torch_device(device).startswith(HALF_ON) else None
     return SamMasks(load_segmenter(config.sam, device), config, half_on)
 

@@ -149,7 +149,7 @@ def test_two_processes_without_a_mask_both_end_before_training(tmp_path: Path) -
     codes, texts = train_by_two(room, tmp_path / "two.ply", *picky)
     assert codes == [2, 2], texts
     for text in texts:
-        assert text.strip().splitlines()[-1].count("no masks were found") == 1
+        assert text.strip().splitlines()[-1].count("no photograph has masks") == 1
         assert "Traceback" not in text
     assert not list(tmp_path.glob("two.work/radiance*"))
 

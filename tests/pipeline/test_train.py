@@ -229,7 +229,7 @@ class Blind(MaskSource):
 def test_without_any_mask_no_gaussians_are_trained(room, tmp_path):
     out, said = tmp_path / "scene.ply", []
     progress = Progress(lambda at: said.append(at.stage))
-    with pytest.raises(InputError, match=r"no masks were found.*--masks\.source graph"):
+    with pytest.raises(InputError, match=r"no photograph has masks.*--masks\.source graph"):
         train_scene(room, out, tiny_settings(room), progress=progress, masks_of=lambda _: Blind())
     assert "masks and vectors" in said
     assert "training Gaussians" not in said

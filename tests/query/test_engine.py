@@ -87,7 +87,7 @@ def test_check_phrase_raises_what_asking_would():
     with pytest.raises(UnknownWordError, match="did you mean 'plant'") as unknown:
         check_phrase(engine, "mug near the plamt")
     assert unknown.value.near == {"plamt": ("plant",)}
-    with pytest.raises(InputError, match="where one looks from"):
+    with pytest.raises(InputError, match="where one stands"):
         check_phrase(engine, "mug behind the plant")
     with pytest.raises(InputError, match="empty"):
         check_phrase(engine, "?")

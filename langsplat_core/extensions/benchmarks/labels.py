@@ -322,9 +322,7 @@ def read_gr_lerf(folder: Path) -> Benchmark:
         path.parents[1] for path in sorted({*folder.glob("json/test_json"), *folder.glob("*/json/test_json")})
     ]
     if not found:
-        raise InputError(
-            f"{folder}: not in the layout of GR-LERF; expected <scene>/json/test_json/<frame>.json in it"
-        )
+        raise InputError(f"{folder}: not in the layout of GR-LERF; expected <scene>/json/test_json/*.json")
     scenes = {}
     for scene in found:
         paths = sorted((scene / "json" / "test_json").glob("*.json"))

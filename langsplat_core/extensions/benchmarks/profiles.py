@@ -236,9 +236,7 @@ def _read_relevancy(path: Path) -> Array:
     values = read_npy(path) if path.suffix == ".npy" else _image(path)
     values = values[None] if values.ndim == 2 else values
     if values.ndim != 3 or 0 in values.shape or len(values) > len(LEVELS):
-        raise FormatError(
-            f"{path}: shape {values.shape}; expected (H, W), or (L, H, W) with at most 3 levels"
-        )
+        raise FormatError(f"{path}: shape {values.shape}; expected (H, W), or (L, H, W), at most 3 levels")
     if not np.isfinite(values).all():
         raise FormatError(f"{path}: holds numbers that are not finite")
     return values.astype(np.float64)

@@ -257,9 +257,7 @@ def notes(report: BenchmarkReport) -> list[str]:
     frames = {(query.scene, query.frame): query.trained_on for query in queries}
     trained = [frame for (_, frame), was in frames.items() if was]
     if trained:
-        lines.append(
-            f"{len(trained)} of {len(frames)} labelled frames are training views: {shortened(trained)}"
-        )
+        lines.append(f"{len(trained)} of {len(frames)} labelled frames were trained on: {shortened(trained)}")
     if report.left_out:
         lines.append(f"{len(report.left_out)} labels left out: {shortened(report.left_out)}")
     return lines
@@ -356,9 +354,7 @@ def _scene_source(
     assert subject.scene is not None
     path = subject.scene / f"{labelled.name}.ply" if subject.scene.is_dir() else subject.scene
     if not path.exists():
-        raise InputError(
-            f"{path}: no such scene; leave {labelled.name} out with --only, or name the right folder"
-        )
+        raise InputError(f"{path}: no such scene; leave {labelled.name} out (--only), or name another folder")
     # Published maps are read as published.
     rule: AnswerRule = "peak" if isinstance(profile.rule, MapRule) else "regions"
     engine = QueryEngine(searchable(path), load_encoder, encoder_id=subject.encoder, rule=rule)

@@ -318,9 +318,7 @@ def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[i
         report_loss("%s: its level is a guess, %s; --levels says which it is", carriers[0].path, guess)
         return chosen, guess
     paths = ", ".join(str(carrier.path) for carrier in carriers)
-    raise InputError(
-        f"{paths}: of which levels? Say, for example, --levels {' '.join(LEVELS[: len(carriers)])}"
-    )
+    raise InputError(f"{paths}: of which levels? Say them, as --levels {' '.join(LEVELS[: len(carriers)])}")
 
 
 def _numbered(path: Path) -> int | None:

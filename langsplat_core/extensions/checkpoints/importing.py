@@ -186,9 +186,7 @@ def _of_levels(
     if len(featured) > len(LEVELS):
         raise InputError(f"{featured[-1].path}: a fourth checkpoint with features; there are three levels")
     if method == OPEN_GAUSSIAN:
-        raise InputError(
-            f"{featured[0].path}: of OpenGaussian; its features are in cluster_lang.npz, name it too"
-        )
+        raise InputError(f"{featured[0].path}: of OpenGaussian; name its features, cluster_lang.npz, too")
     if method in ONE_LEVEL and not asked:
         _only(featured, f"scenes of {method}, which knows no levels")
         numbers, how = [len(LEVELS) - 1], f"{method} knows none, whole is filled"
@@ -215,9 +213,7 @@ def _of_levels(
     if empty:
         notes.append(f"without features: {', '.join(empty)}")
     if pruned:
-        notes.append(
-            f"{pruned} of the checkpoints lack some Gaussians, which have no features at their levels"
-        )
+        notes.append(f"{pruned} of the checkpoints lack some Gaussians, which have no features there")
     codec = autoencoder.codec if autoencoder is not None and method == LANGSPLAT else None
     return ForeignScene(method, _scene(base), tuple(levels), tuple(paths), codec, notes=tuple(notes))
 

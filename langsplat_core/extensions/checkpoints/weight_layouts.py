@@ -263,9 +263,7 @@ def _check(model: Settings, config: Settings) -> None:
     }
     for (part, name), number in found.items():
         if model[part].get(name, number) != number:
-            raise ValueError(
-                f"{OPEN_CLIP_CONFIG} states {name} {model[part][name]}, the tensors have {number}"
-            )
+            raise ValueError(f"{OPEN_CLIP_CONFIG} states {name} {model[part][name]}, tensors have {number}")
 
 
 def _clip_tensors(tensors: Tensors) -> dict[str, Any]:

@@ -168,9 +168,7 @@ def _cleaned(mesh: Mesh) -> Mesh:
     piece = connected_components(links, directed=False)[1][mesh.triangles[:, 0]]
     kept = mesh.triangles[np.bincount(piece)[piece] >= SPECK] if len(piece) else mesh.triangles
     if len(kept) == 0:
-        raise InputError(
-            "too few views show the same surface; ask for fewer --views, or a coarser --resolution"
-        )
+        raise InputError("too few views show the same surface; take fewer --views, or a coarser --resolution")
     used, triangles = np.unique(kept, return_inverse=True)
     return Mesh(mesh.vertices[used], triangles.reshape(-1, 3), mesh.colour[used], mesh.name)
 

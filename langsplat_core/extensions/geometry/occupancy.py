@@ -105,9 +105,7 @@ def find_occupancy(scene: Scene, to_map: Array, resolution: float, progress: Pro
     a grid of more than `MOST_CELLS`.
     """
     if not scene.cameras:
-        raise InputError(
-            "the scene has no cameras, so nobody knows what is free; a map needs a trained scene"
-        )
+        raise InputError("the scene has no cameras, so nothing says what is free; map a trained scene")
     rays = []
     for number, camera in enumerate(scene.cameras):
         progress(STAGE, number / (2 * len(scene.cameras)))
@@ -202,9 +200,7 @@ def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None =
         return np.asarray(labels == 1 + np.bincount(labels[labels > 0] - 1).argmax())
     cell = np.floor((np.array(start) - plan.origin) / plan.resolution).astype(int)
     if (cell < 0).any() or (cell >= plan.free.shape).any() or labels[tuple(cell)] == 0:
-        raise InputError(
-            f"--start {start[0]:g} {start[1]:g}: the robot does not fit there, or it was not seen"
-        )
+        raise InputError(f"--start {start[0]:g} {start[1]:g}: the robot does not fit there, or nobody saw it")
     return np.asarray(labels == labels[tuple(cell)])
 
 

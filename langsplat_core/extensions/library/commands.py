@@ -204,9 +204,7 @@ def _in_words(change: Change, unit: Unit) -> str:
     at = f"{unit.place(change.centre)} {unit.name}"
     if change.kind == "moved":
         assert change.moved is not None
-        by = (
-            f"{length_text(unit.length * change.distance, least=2)} {unit.name} ({unit.format(change.moved)})"
-        )
+        by = f"{length_text(unit.length * change.distance, least=2)} {unit.name}, {unit.format(change.moved)}"
         return f"moved: {name} by {by}, now at {at}"
     if change.colours is not None:
         before, now = change.colours

@@ -142,9 +142,7 @@ def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor],
     """Return the (GRID, GRID) mean depths of what a camera sees of the `values`, NaN where little is."""
     small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
     z = camera.project(values["means"].detach().cpu().numpy())[1].clip(0).astype(np.float32)
-    length = near_power(
-        max(float(np.median(z)), 1e-30)
-    )  # of a unit in which colours keep the digits of depths
+    length = near_power(max(float(np.median(z)), 1e-30))  # of a unit in which colours keep depths' digits
     shade = np.repeat((z[:, None, None] / np.float32(length) - 0.5) / C0, 3, axis=2)
     grey = torch.from_numpy(shade.astype(np.float32)).to(values["means"].device)
     with torch.no_grad():

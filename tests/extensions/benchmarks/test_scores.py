@@ -475,7 +475,7 @@ def test_our_own_answer_in_views_that_are_matched_by_name(blobs_on_disk):
     assert min(of_phrase(report, word).iou for word in ("mug", "book")) > 0.95
     first, second = seen(0, views[0]), seen(0, views[1])
     assert (first & second).sum() / (first | second).sum() < 0.8
-    assert "1 of 1 labelled frames are training views: photo.1.x" in table(report)
+    assert "1 of 1 labelled frames were trained on: photo.1.x" in table(report)
 
 
 def test_the_papers_absolute_cut(blobs_on_disk):

@@ -205,7 +205,7 @@ def test_open_gaussian(tmp_path, as_ply):
         write_ply(path, Scene(G, extras=dict(zip(names, instance.T, strict=True))))
     else:
         path = save_model(tmp_path / "chkpnt90000.pth", G, tensor(instance), tensor(instance))
-        refused([path], r"cluster_lang\.npz, name it too")
+        refused([path], r"cluster_lang\.npz, too")
     both = [path, tmp_path / "cluster_lang.npz"]
     got = read_foreign(both)
     assert got.method == "OpenGaussian"
