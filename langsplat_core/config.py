@@ -47,10 +47,7 @@ class Setting:
 
 
 def check_settings(settings: object, option: str = "--") -> None:
-    """InputError for the first number in `settings`, a dataclass, that is outside the range of its field.
-
-    `option` is what precedes the fields' names on the command line, such as ``--codec.``.
-    """
+    """InputError for the first number out of its field's range; `option`: before names, as ``--codec.``."""
     for setting in numeric_settings(settings, option):
         problem = _problem(setting)
         if problem:

@@ -123,10 +123,7 @@ def remedy(package: str) -> str:
 
 @contextmanager
 def optional_imports(error: type[LangSplatError] = BackendError) -> Iterator[None]:
-    """Turn a failed import of a package of `EXTRAS` into `error` with the line that installs it.
-
-    A context manager for a block, or a decorator of a function.
-    """
+    """Turn a failed import of `EXTRAS` into `error` with the line that installs it; also a decorator."""
     try:
         yield
     except ModuleNotFoundError as missing:

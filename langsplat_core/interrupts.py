@@ -39,10 +39,7 @@ def end_in_a_line(program: str) -> None:
 
 @contextlib.contextmanager
 def handled(handler: Handler) -> Iterator[None]:
-    """Call `handler` for both signals inside the block; the handlers of before are back afterwards.
-
-    A signal that is ignored stays so. Other threads than the main one never receive any.
-    """
+    """Call `handler` for both signals inside the block, unless ignored before; the main thread's alone."""
     in_main = threading.current_thread() is threading.main_thread()
     wanted = [number for number in SAID if in_main and signal.getsignal(number) != signal.SIG_IGN]
     before = {number: signal.signal(number, handler) for number in wanted}

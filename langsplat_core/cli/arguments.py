@@ -54,10 +54,7 @@ WordsOption = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help=_taught)
 
 
 def check_arguments(command: object) -> None:
-    """Raise InputError for the first argument of a command, a dataclass, that it cannot work with.
-
-    That is a number outside of its range, a text that is not UTF-8, or a place that cannot be written to.
-    """
+    """Raise InputError for the first argument out of its range, not UTF-8, or not to be written to."""
     check_settings(command)
     for option, value, hint in named_values(command):
         for text in value if isinstance(value, tuple) else (value,):
@@ -80,10 +77,7 @@ def named(args: Sequence[str], option: str) -> str:
 
 
 def codec_settings(args: Sequence[str], default: CodecConfig) -> CodecConfig:
-    """Return the default settings of the codec that `args` choose by `--codec.kind`.
-
-    That is `default` itself where it is of that kind or none is chosen. InputError for an unknown kind.
-    """
+    """Return settings of the codec that `--codec.kind` in `args` chooses, else `default`; InputError."""
     kind = named(args, "--codec.kind") or default.kind
     if kind not in CODEC_CONFIGS:
         raise InputError(f"--codec.kind {kind}: choose one of {', '.join(CODEC_CONFIGS)}")

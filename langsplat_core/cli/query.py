@@ -324,10 +324,7 @@ def _reasons(evidence: dict[str, Any] | None = None) -> list[str]:
 
 
 def once(load: LoadEncoder, instead: str = "") -> LoadEncoder:
-    """Return `load`, called but once for each encoder: a hub out of reach is not asked again either.
-
-    instead: the encoder that is loaded in place of any other.
-    """
+    """Return `load`, or that of `instead`, called once for each encoder, also where a hub is out of reach."""
     known: dict[str, TextEncoder | EncoderError] = {}
 
     def load_once(model: str) -> TextEncoder:

@@ -115,11 +115,7 @@ def train_command(args: Sequence[str]) -> type[Train]:
 
 
 def with_file(args: Sequence[str]) -> list[str]:
-    """Return the words of `langsplat train ...` with those of the file that --config names before all others.
-
-    So options beside it win. Raises InputError that names file and key for what is no option, or not of its
-    kind.
-    """
+    """Return the words of `langsplat train ...` behind those of --config's file; InputError names its key."""
     name = named(args, "--config")
     if not name:
         return list(args)

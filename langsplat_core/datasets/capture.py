@@ -235,10 +235,7 @@ def surrounded_views(cameras: Sequence[Camera], every: int, beside: Sequence[int
 
 
 def _stands(cameras: Sequence[Camera]) -> Array:
-    """Return (M, 6) place and direction of every camera, in typical steps from one camera to the next.
-
-    Rounded, as another processor's last digits must not choose other views.
-    """
+    """Return (M, 6) place and direction of cameras in typical steps, rounded: processors differ."""
     places = np.array([camera.position for camera in cameras])
     directions = np.array([camera.rotation[2] for camera in cameras])
     gaps = np.linalg.norm(places[:, None] - places[None], axis=2)

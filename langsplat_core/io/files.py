@@ -100,10 +100,7 @@ def write_json(path: Path, content: object) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Wait until nobody else, in this process or others, is in such a block of the same `folder`.
-
-    Where there are no locks, or the folder may not be read, all go on at once.
-    """
+    """Wait until nobody else is in such a block of the same `folder`; without locks all go on at once."""
     handle = -1
     if fcntl is not None:
         with suppress(OSError):
@@ -149,10 +146,7 @@ def check_output_file(path: Path | str) -> None:
 
 
 def check_output_folder(path: Path | str) -> None:
-    """Raise InputError, in one line, where files cannot be written into a folder `path`.
-
-    It may be missing yet; see `check_output_file`.
-    """
+    """Raise InputError where files cannot be written into a folder, which may be missing yet."""
     mode = _checked(Path(path))
     if mode and not stat.S_ISDIR(mode):
         raise InputError(f"{shown(path)}: is a file; name a folder")

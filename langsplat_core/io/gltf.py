@@ -164,10 +164,7 @@ def read_gltf_scene(path: Path | str) -> Scene:
 
 
 def _parts(file: "_File", middle: Array) -> Iterator[Gaussians]:
-    """Yield the Gaussians of every primitive that has some, placed by their nodes, along glTF's axes.
-
-    middle: (3,), what they become relative to.
-    """
+    """Yield the Gaussians of every primitive, placed by nodes, in glTF's axes, relative to middle (3,)."""
     for matrix, primitive in _placed(file):
         if EXTENSION not in primitive.extensions:
             file.bare += 1

@@ -92,10 +92,7 @@ def read_npy(path: Path) -> Array:
 
 
 def read_npz(path: Path, free: int = FREE) -> dict[str, Array]:
-    """Return the arrays in an .npz file, by their names without .npy. Raises as `read_npy` does.
-
-    free: bytes that they may take however small the file is.
-    """
+    """Return an .npz file's arrays by name, as `read_npy`; free: bytes they may take in a small file."""
     arrays = {}
     with opened_archive(path, ".npz file", free) as archive:
         for member in archive.names:

@@ -382,10 +382,7 @@ METRES = "metres_per_unit"
 
 
 def read_ply(path: Path | str) -> Gaussians:
-    """Return the Gaussians of a 3DGS PLY file, plain or compressed, where they lie in the world.
-
-    Raises as `read_ply_scene` does.
-    """
+    """Return the Gaussians of a 3DGS PLY file where they lie in the world; raises as `read_ply_scene`."""
     return read_ply_scene(path).world_gaussians()
 
 

@@ -133,10 +133,7 @@ class Stored:
 
 
 def read_stored(path: Path) -> Stored:
-    """Return everything in the sidecar `path`.
-
-    Raises InputError when it cannot be opened and FormatError when it breaks a rule of the layout.
-    """
+    """Return everything in the sidecar `path`; InputError where it cannot be opened, else FormatError."""
     with _faults(path):
         tensors, about = _read(path, FIELD)
         if about["levels"] != ",".join(LEVELS):
@@ -471,10 +468,7 @@ def pack_positions(means: Array) -> tuple[Array, Array]:
 
 
 def unpack_positions(packed: Array, corners: Array) -> tuple[Array, float]:
-    """Return the (N, 3) float64 positions, NaN for what was not finite, and the longest step of an axis.
-
-    They are exact to half a step.
-    """
+    """Return (N, 3) float64 positions, exact to half a step, NaN if not finite, and the longest step."""
     low, span = _box(corners)
     means = (packed[:, None] >> _SHIFTS & np.uint64(_STEPS)).astype(np.float64) / _STEPS * span + low
     means[packed == _NOWHERE] = np.nan

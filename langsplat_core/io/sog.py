@@ -302,10 +302,7 @@ def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
 
 
 def _coded(values: Array, counts: Array) -> tuple[Array, Array]:
-    """Return (N, C) uint8 codes, and the (256,) rising values that they stand for.
-
-    These have the least squared error over the rows that count, by Lloyd's algorithm in one dimension.
-    """
+    """Return (N, C) uint8 codes and their (256,) rising values: Lloyd's algorithm over rows that count."""
     known = np.sort(values[counts].ravel())
     if len(known) == 0:
         return np.zeros(values.shape, np.uint8), np.zeros(CODES)

@@ -151,10 +151,7 @@ def _unpacked(data: bytes, size: int, path: Path) -> bytes:
 
 
 def _axes(records: bytes, path: Path, tell: Tell) -> int:
-    """Return the axes that the extension records name, 1 to 8; of several that count the first.
-
-    Records of other layouts, which older programs wrote, end the search.
-    """
+    """Return the axes that the first such extension record names, 1 to 8; old layouts end the search."""
     at, axes, others = 0, 0, set[str]()
     while at + 8 <= len(records):
         kind, length = struct.unpack_from("<II", records, at)
@@ -199,10 +196,7 @@ FRACTIONAL_BITS = 12  # what other writers use: steps of 1/4096, up to 2048
 
 
 def read_spz_scene(path: Path | str) -> Scene:
-    """Return the Gaussians of a .spz file, and whether they are to be drawn antialiased.
-
-    Raises InputError when the file cannot be opened and FormatError when it breaks a rule of the format.
-    """
+    """Return the scene of a .spz file; InputError where it cannot be opened, else FormatError."""
     path = Path(path)
     file, size = open_for_reading(path)
     with file:

@@ -122,10 +122,7 @@ def language_field(
     progress: Progress,
     processes: ProcessGroup | None = None,
 ) -> tuple[LanguageField, CodecReport]:
-    """Return the language field of the views' mask vectors, and what its codec loses.
-
-    Raises InputError where no view has a mask, and for a codebook whose numbers the lifting would average.
-    """
+    """Return the field of the views' masks, and its codec's loss; InputError without any mask."""
     check_lift(config)
     check_masks(features for _, features in views)
     stages = _Stages(gaussians, views, encoder, config, work, progress, processes or ProcessGroup())
@@ -143,10 +140,7 @@ def language_field(
 def field_of(
     latents: Latents, codec: Codec, encoder: PhraseEncoder, phrases: tuple[str, ...]
 ) -> LanguageField:
-    """Return the field of latents and confidences, without a tree.
-
-    It holds all that a query needs of the encoder; its phrasebook has each of `phrases` once.
-    """
+    """Return a treeless field with all that queries need of the encoder, and each of `phrases` once."""
     names = list(dict.fromkeys(phrase_key(phrase) for phrase in phrases))
     return LanguageField(
         *latents,

@@ -66,10 +66,7 @@ class PageReport:
 def write_page(
     path: Path, scene: Scene, engine: QueryEngine | None, title: str, progress: Progress = silent
 ) -> PageReport:
-    """Write `scene` as an HTML file; InputError for one of which nothing can be drawn.
-
-    engine: of the same scene, None where it is only to be looked at. title: plain text.
-    """
+    """Write `scene` as an HTML file, searched by `engine`; InputError where nothing can be drawn."""
     opacities = sigmoid(scene.gaussians.opacity_logits.astype(np.float64))
     rows = np.flatnonzero(scene.gaussians.valid() & (opacities >= 1 / 255))
     rows = rows[np.argsort(along_curve(scene.gaussians.means[rows]), kind="stable")]

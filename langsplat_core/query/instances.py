@@ -128,11 +128,7 @@ class Instance:
 
 
 def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: bool) -> list[Array]:
-    """Divide the Gaussians `numbers` (K,) of a surface into single things.
-
-    wholes: (N,) voted wholes, which tell apart things that touch; join: what is of one is one, connected or
-    not.
-    """
+    """Divide Gaussians `numbers` (K,) into things by voted `wholes` (N,); join: a whole is one thing."""
     if wholes is None:
         return surface.parts(numbers)
     owner = wholes[surface.rows[numbers]]

@@ -72,10 +72,7 @@ class _Claim:
 
 
 def scene_inventory(describer: Describer, progress: Progress = silent) -> list[InventoryEntry]:
-    """Return every word that is true in the scene, whole things first, then by surface.
-
-    A word is listed once, at the coarsest level where it is claimed and found.
-    """
+    """Return every word true in the scene, once, at its coarsest level; wholes first, then by surface."""
     field, known = describer.engine.field, describer.known
     of = np.full(known.shape, -1, np.int64)
     latents, of[known] = field.codec.unique(field.latents[known])
@@ -94,10 +91,7 @@ def scene_inventory(describer: Describer, progress: Progress = silent) -> list[I
 
 
 def _claims(describer: Describer, latents: Array, of: Array, level: int) -> Iterator[_Claim]:
-    """Yield groups of words at a level, those that cover most first.
-
-    latents: (M, d) the distinct ones of the field; of: (N,) int64 number of each Gaussian's, -1 for none.
-    """
+    """Yield a level's groups of words, the largest first; of: (N,) rows of the (M, d) latents, or -1."""
     words, areas = describer.words[level], describer.areas
     best, shares = words.best(latents, RUNNERS_UP)
     if best.size == 0:  # no words, or no features
@@ -338,10 +332,7 @@ def _is_found(engine: QueryEngine, phrase: str) -> bool:
 
 
 def completions(text: str, phrases: Sequence[str], at_most: int = 6) -> list[str]:
-    """Return phrases that go on from what was typed, then what was typed with its last word completed.
-
-    Nothing where no text is, or a word has ended.
-    """
+    """Return phrases that go on from what was typed, then its last word completed; none behind spaces."""
     typed = phrase_key(text)
     if not typed or text[-1:].isspace():
         return []

@@ -143,10 +143,7 @@ def decoded_relevancy(
 
 
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
-    """Return the peak (column, row, value) of a (H, W) map after a mean filter of `window` px.
-
-    The paper's window is 20. It never exceeds the image; borders repeat the edge pixels.
-    """
+    """Return the peak (column, row, value) of a (H, W) map's means over `window` px, edges repeated."""
     from scipy.ndimage import uniform_filter  # here, since the window, which needs none, imports this module
 
     window = max(1, min(window, *relevancy.shape))

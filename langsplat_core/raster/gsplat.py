@@ -81,10 +81,7 @@ def draw(
     sh_degree: int | None = None,
     view_matrix: Array | None = None,
 ) -> DifferentiableImage:
-    """Blend (N, C) `values`; or with `sh_degree`, the colours of (N, K, 3) spherical harmonics.
-
-    view_matrix: (4, 4) world to camera, in place of the camera's own.
-    """
+    """Blend (N, C) `values`, or of `sh_degree` (N, K, 3) harmonics; view_matrix: (4, 4), for the camera's."""
     from gsplat import rasterization
 
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
@@ -176,10 +173,7 @@ class GsplatRasterizer:
         require_device()
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> GsplatView:
-        """Project with gsplat, which honours near, far, dilation and antialiased and fixes the rest.
-
-        Raises BackendError for other settings that are not the profiles'.
-        """
+        """Project with gsplat, which fixes all but near, far, dilation and antialiased: BackendError."""
         for name in ("fov_clamp", "alpha_min", "transmittance_min"):
             if getattr(settings, name) != getattr(INRIA, name):
                 raise BackendError(f"rasterizer 'cuda' cannot change {name}; use --backend cpu")

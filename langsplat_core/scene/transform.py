@@ -202,10 +202,7 @@ def between_worlds(to: Similarity, origin: Array, target: Array) -> Similarity:
 
 
 def place_scene(scene: Scene, to: Similarity = IDENTITY, origin: Array | None = None) -> Scene:
-    """Return the scene transformed by a map of positions in the world, relative to another `origin` (3,).
-
-    Without one it becomes that which `origin_of` finds for the result.
-    """
+    """Return the scene under a map of the world, relative to `origin` (3,), else that of `origin_of`."""
     centre, radius = scene.bounds()
     if origin is None:
         axes = np.concatenate([np.eye(3), -np.eye(3)])

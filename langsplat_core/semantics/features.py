@@ -68,10 +68,7 @@ class FeatureStore:
         return self.folder / f"{quoted}.features.npz"
 
     def has(self, name: str, key: str | None = None) -> bool:
-        """Return True where a whole file for `name` exists; with `key`, only if it was saved with that key.
-
-        A damaged file counts as absent, and is warned of once: what it held is then made again.
-        """
+        """Return True for a whole file of `name`, with that `key` if given; damage is warned of once."""
         try:
             return exists(self.path(name)) and key in (None, self._read(name)[1])
         except InputError as error:

@@ -57,10 +57,7 @@ def latent_relevancy(
     canonical: Array,
     temperature: float = LanguageField.temperature,
 ) -> Array:
-    """Return the (M, Q) relevancy of what (M, d) latents stand for, exact, in bounded memory.
-
-    Latents have any length; phrases: (Q, D); canonical: (C, D). An unobserved latent gets relevancy 0.
-    """
+    """Return exact (M, Q) relevancy of (M, d) latents, 0 if unobserved; texts (Q, D) and (C, D)."""
     out = np.zeros((len(latents), len(phrases)), np.float32)
     known = np.flatnonzero(codec.known(latents))
     texts = np.concatenate([phrases, canonical])

@@ -178,10 +178,7 @@ def mean_filtered(values: Array, window: int, border: Border) -> Array:
 
 
 def voted(mask: Array, vote: Vote, window: int) -> Array:
-    """(H, W) bool after a majority vote over `window` x `window` pixels inside the image; a tie is False.
-
-    "clipped": the image's last row and column are never counted, as in LangSplat's code.
-    """
+    """(H, W) bool majority of `window`^2 pixels, ties False; "clipped": last row and column never count."""
     if vote == "none" or window <= 1:
         return mask
     counted = np.ones(mask.shape)

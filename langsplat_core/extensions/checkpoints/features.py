@@ -157,10 +157,7 @@ Part = Carrier | Clusters | Autoencoder
 
 
 def read_part(path: Path) -> Part:
-    """Read a file of any method, told by its content.
-
-    Raises InputError where it cannot be opened, FormatError where it is nothing known or damaged.
-    """
+    """Read a file of any method by its content; InputError where unopened, FormatError where unknown."""
     file, _ = open_for_reading(path)
     with file:
         start = file.read(8)

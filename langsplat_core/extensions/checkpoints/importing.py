@@ -81,10 +81,7 @@ class ForeignScene:
         return next((features.dim for features in self.levels if features is not None), 0)
 
     def rows(self, level: int, indices: Array) -> Array:
-        """(n, D or d) float32 vectors or latents of any length at `level`; zero for no features.
-
-        Raises FormatError where one is not finite, or its square would not be.
-        """
+        """(n, D or d) float32 of any length at `level`, zero for none; FormatError if infinite or huge."""
         features = self.levels[level]
         if features is None:
             raise ValueError(f"no features of level {LEVELS[level]}")

@@ -464,10 +464,7 @@ def _siglip_config(weights: Weights) -> Any:
 
 
 def _read_scalar(weights: Weights, name: str) -> float:
-    """Return a number that is among the weights, without loading the rest of them; NaN where it is not there.
-
-    Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
-    """
+    """Return a number among the weights, the rest unread; NaN where, as in half a model, there is none."""
     from safetensors import safe_open
 
     with loading_errors(weights.id, "readable"):

@@ -251,10 +251,7 @@ def _has_changed(size: int, sums: Array, images: float) -> bool:
 
 
 def _codewords_seen(engine: QueryEngine) -> tuple[Array, Array, Array]:
-    """(U, D) vectors of distinct codewords, from the mean of the scene.
-
-    Their (N,) number at level whole, -1 for none; and the (N,) areas of Gaussians.
-    """
+    """(U, D) codewords less their mean, (N,) numbers at level whole, -1 for none, and (N,) areas."""
     field, level = engine.field, len(LEVELS) - 1
     number, areas = np.full(len(field), -1), surface_areas(engine.scene.gaussians)
     known = field.known[level]

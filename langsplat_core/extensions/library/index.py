@@ -445,10 +445,7 @@ def _dot(row: Array, vector: Array) -> np.float32:
 def _region_means(
     first: int, last: int, vector: Array, columns: Columns, starts: Array, means: Array, sound: Array
 ) -> None:
-    """Add to `means` (R,), of scenes [first, last), the mean relevancy of every region.
-
-    Of a scene with a number out of place, set `sound` (S,) to False.
-    """
+    """Add mean relevancies to `means` (R,); `sound` (S,) is False for scenes with numbers out of place."""
     for scene in range(first, last):
         k, m, r = starts[scene]
         last_k, last_m, last_r = starts[scene + 1]

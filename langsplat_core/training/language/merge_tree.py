@@ -256,10 +256,7 @@ class _Merger:
 
 
 def merge(patches: Patches, progress: Progress = silent) -> tuple[Array, Array]:
-    """Return the (K, 2) int32 nodes that are merged and the (K,) float64 costs, in their order.
-
-    See `MergeTree`. Of equal costs the older nodes merge first.
-    """
+    """Return (K, 2) int32 nodes merged and (K,) float64 costs, in order; of equal ones the older first."""
     nodes, count = _Merger(patches), len(patches.areas)
     waiting = [(nodes.cost(a, b), a, b) for a in range(count) for b in nodes.neighbours[a] if a < b]
     heapq.heapify(waiting)

@@ -276,10 +276,7 @@ def no_exposures(views: int, device: torch.device) -> Tensor:
 
 
 def fit_exposures(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, float]:
-    """Return the (V, 4, 3) exposure of each view beyond what all have in common, and what that gains in dB.
-
-    pairs: (..., 3) image and target of each view.
-    """
+    """Return (V, 4, 3) exposures beyond the common one, and their gain, dB; pairs: image, target (..., 3)."""
     common = fit_exposure(pairs)
     pairs = [(with_exposure(image, common), target) for image, target in pairs]
     exposures = torch.stack([fit_exposure([pair]) for pair in pairs])

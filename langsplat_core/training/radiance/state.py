@@ -143,10 +143,7 @@ def start(gaussians: Gaussians, seed: int, device: torch.device) -> TrainingStat
 
 
 def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | None = None) -> None:
-    """Keep the Gaussians at the indices `keep` with their moments, then append `added` with zero ones.
-
-    Statistics start afresh, because the rows they belong to have changed.
-    """
+    """Keep the Gaussians `keep` with moments, append `added` with zero ones, begin statistics afresh."""
     for name in PARAMETERS:
         old = state.values[name].detach()
         new = old.new_empty((0, *old.shape[1:])) if added is None else added[name]
@@ -169,10 +166,7 @@ def clean_gradients(state: TrainingState) -> None:
 
 
 def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
-    """Update every parameter that has a gradient by Adam (Kingma and Ba 2015); gradients are dropped.
-
-    A parameter without gradient (harmonics of a degree not yet in use) is left alone entirely.
-    """
+    """Update each parameter that has a gradient by Adam (Kingma and Ba 2015), and drop the gradients."""
     for name, value in state.values.items():
         if value.grad is None or value.numel() == 0:
             continue

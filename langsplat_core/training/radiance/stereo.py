@@ -53,10 +53,7 @@ class DepthMap:
 
 
 def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = silent) -> list[DepthMap]:
-    """Find the depths of the photographs at `indices` that another one confirms, at 320 px.
-
-    Photographs without neighbours have no map. Masked pixels have no depth.
-    """
+    """Find depths that another photograph confirms, at 320 px, but masked ones and without neighbours."""
     small = capture.shrunk(indices, 320)
     masks = [np.True_ if (mask := small.mask(index)) is None else mask for index in range(len(small))]
     # Windows reach into what is masked: it is the same in all photographs.

@@ -204,10 +204,7 @@ def train_radiance(
 
 
 class _Views:
-    """Photographs and cameras of the training views, whole and at half size.
-
-    On a GPU they are copied to it; else they stay as they are, which for many is in files (`photos.in_file`).
-    """
+    """Photographs and cameras of training views, whole and halved, on a GPU copied, else as they are."""
 
     def __init__(self, capture: Capture, indices: Sequence[int], device: torch.device) -> None:
         def kept(image: Array | None) -> Array | Tensor | None:
