@@ -28,11 +28,7 @@ CORE: Mapping[str, str] = MappingProxyType({
 
 
 def parse(args: list[str]) -> Runnable:
-    """Return the command that the words of a command line name.
-
-    Raises SystemExit as tyro does, with its message on stderr; InputError for a command that does not exist,
-    and for an unusable `--config`.
-    """
+    """Return the command that the words name; SystemExit as of tyro, InputError for none and `--config`."""
     before = list(takewhile(FLAGS.__contains__, args))
     args = args[len(before) :]
     check_commands(args)

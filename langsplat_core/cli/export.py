@@ -276,7 +276,7 @@ class SetScale:
         if self.metres is not None and self.between is not None:
             units = math.dist(self.between[:3], self.between[3:])
             if not 0 < units < math.inf:
-                raise InputError(f"--between: points {units:g} units apart; expected more than 0, and finite")
+                raise InputError(f"--between: points {units:g} units apart; must be above 0 and finite")
             factor = self.metres / units
         if factor is not None:
             write_metres(self.scene, factor)

@@ -233,11 +233,7 @@ class QueryScene:
         print(f"answers: {engine.basis.long}")
 
     def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
-        """Return the phrases that can be asked.
-
-        The others are named on stderr with the reason, before anything is searched. Raises that reason where
-        none is left.
-        """
+        """Return the phrases that can be asked, others said on stderr; raise why where none is left."""
         phrases = [phrase for text in self.texts for phrase in split_phrases(text) or [text]]
         reasons: dict[str, list[str]] = {}  # why not -> these phrases
         if len(phrases) > 1:

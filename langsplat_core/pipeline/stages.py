@@ -40,11 +40,7 @@ DIGEST = "digest"  # name beside the arrays of a stage
 
 
 def stage_key(name: str, version: int, *inputs: Any) -> str:
-    """Return a short name such as ``radiance-7293f2d8d936`` that changes with any setting or input.
-
-    `inputs` are dataclasses, strings, numbers or lists of them; `version` is raised when the stage's
-    code changes what it makes.
-    """
+    """Return a name as ``radiance-7293f2d8d936``, another for other inputs or `version` of the code."""
     plain = [asdict(item) if is_dataclass(item) and not isinstance(item, type) else item for item in inputs]
     text = json.dumps([name, version, plain], sort_keys=True, default=str)
     return f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"

@@ -329,11 +329,7 @@ class SamMasks(MaskSource):
     def _passing(
         self, encoded: EncodedImage, answer: tuple[Any, Any], crop: Array, shape: tuple[int, int]
     ) -> tuple[Array, Any]:
-        """Return masks that pass the tests for themselves.
-
-        (M, 7) level, predicted IoU, stability and box in the image, and (M, h, w) logits, low resolution,
-        still on the device.
-        """
+        """Return (M, 7) level, IoU, stability, box of masks that pass, and (M, h, w) logits on the device."""
         import torch
 
         ious, logits = (found.flatten(0, 1).float() for found in answer)

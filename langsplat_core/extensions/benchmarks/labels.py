@@ -250,11 +250,7 @@ WANTED_PICTURES = "expected segmentations/classes.txt in it, or in folders of it
 
 
 def read_3d_ovs(folder: Path) -> Benchmark:
-    """Return the labels in `folder`: one scene's, or several scenes' folders.
-
-    What a view has an image of is asked there. Raises InputError for a folder of another layout and
-    FormatError for a scene that breaks it.
-    """
+    """Return labels of a scene's `folder` or of several; InputError: another layout, FormatError: broken."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; {WANTED_PICTURES}")
     scenes = [folder] if _is_scene(folder) else [path for path in sorted(folder.iterdir()) if _is_scene(path)]

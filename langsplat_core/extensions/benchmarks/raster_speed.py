@@ -210,11 +210,7 @@ def run_plan(
 def sweep(
     counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int
 ) -> list[tuple[int, tuple[int, int]]]:
-    """Return the numbers of Gaussians and image sizes of the random scenes, small ones first.
-
-    They are every count at the middle size, and every size at `pivot` Gaussians. The time of large ones is
-    foretold from small ones.
-    """
+    """Return every count at the middle size and every size at `pivot`, small ones first: they foretell."""
     middle = sorted(sizes)[len(sizes) // 2]
     pairs = {(count, middle) for count in counts} | {(pivot, size) for size in sizes}
     return sorted(pairs, key=lambda pair: (pair[0], pair[1][0] * pair[1][1]))
@@ -573,11 +569,7 @@ def _cell(value: float | None, form: str) -> str:
 
 
 def plot(rows: Sequence[Measurement], path: Path) -> None:
-    """Draw milliseconds over Gaussians, a panel an operation, at the size with most counts.
-
-    Solid for the fewest, dashed for the most channels. The last panel is the error away from cut-offs over
-    milliseconds, of all cases.
-    """
+    """Draw ms over Gaussians by operation, fewest channels solid, most dashed, and errors over ms."""
     import matplotlib
 
     matplotlib.use("Agg")

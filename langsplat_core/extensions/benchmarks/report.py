@@ -189,11 +189,7 @@ def means(queries: Sequence[QueryScore], group: Callable[[QueryScore], Hashable]
 
 
 def summary(report: BenchmarkReport) -> dict[str, Means]:
-    """Return the rows of the table: scenes, then means of scenes, of frames and of queries.
-
-    The last mean, over all queries, stands also for what was answered and for views not trained on, where
-    they differ.
-    """
+    """Return the table's rows: scenes, then means of scenes, frames, queries, answered and held-out ones."""
     queries = report.queries
     rows = {name: means([one for one in queries if one.scene == name]) for name in report.scenes}
     rows["macro, mean of scenes"] = means(queries, lambda query: query.scene)
@@ -300,11 +296,7 @@ def run_benchmark(
     only: Sequence[str] = (),
     progress: Progress = silent,
 ) -> BenchmarkReport:
-    """Score `subject` on the scenes of `benchmark`, or those named by `only`.
-
-    Raises InputError for a scene or maps that do not belong to the labels, EncoderError where the text
-    encoder cannot be loaded.
-    """
+    """Score `subject` on the scenes, or `only` some; InputError where they do not match, EncoderError."""
     if subject.paper_order and (subject.maps is not None or not isinstance(profile.rule, MapRule)):
         raise InputError(
             "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"
@@ -327,11 +319,7 @@ def run_benchmark(
 
 
 def _chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Evaluated) -> list[str]:
-    """Return the names of the `labelled` scenes to score.
-
-    These are `only`, or the one that a scene file is named after where several could be meant. Raises
-    InputError for a name that is not labelled.
-    """
+    """Return the `labelled` scenes to score: `only`, or that of the scene file's name; InputError."""
     wrong = [name for name in only if name not in labelled]
     if wrong:
         raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(labelled)}")

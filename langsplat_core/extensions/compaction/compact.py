@@ -297,11 +297,7 @@ def find_reduction(
     config: BudgetConfig,
     progress: Progress = silent,
 ) -> tuple[Array, int]:
-    """Return the rows (N,) bool of `scene` that stay, and their SH degree.
-
-    `measured` are those of ``views.measuring``. Raises InputError where nothing is visible, nothing fits the
-    budget or nothing can be dropped.
-    """
+    """Return the (N,) bool rows that stay, and the SH degree; InputError where nothing fits or may go."""
     name = "the scene" if scene.path is None else shown(scene.path)
     score = contributions(scene, views.ranking, progress)
     if not score.any():

@@ -99,11 +99,7 @@ def map_axes(room: Room, metres: float, origin: Array = NO_ORIGIN) -> Array:
 
 
 def find_occupancy(scene: Scene, to_map: Array, resolution: float, progress: Progress = silent) -> Occupancy:
-    """Voxels along the rays of the scene's cameras.
-
-    resolution: metres. Raises InputError for a scene without cameras, one whose cameras see nothing, and for
-    a grid of more than `MOST_CELLS`.
-    """
+    """Voxels, `resolution` metres, along the cameras' rays; InputError: none, blind, too many cells."""
     if not scene.cameras:
         raise InputError("the scene has no cameras, so nothing says what is free; map a trained scene")
     rays = []
@@ -186,11 +182,7 @@ def floor_map(occupancy: Occupancy, step: float, height: float) -> FloorMap:
 
 
 def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None = None) -> Array:
-    """Return the cells in which the middle of a robot may be, (X, Y) bool.
-
-    They are as far as its radius, metres, from obstacles, and connected with `start`, or with most others.
-    Raises InputError where there are none.
-    """
+    """Return (X, Y) bool cells for a robot's middle, clear by `radius`, joined to `start`; InputError."""
     blocked = np.pad(~plan.free, 1, constant_values=True)
     clear = (ndimage.distance_transform_edt(~blocked)[1:-1, 1:-1] - 0.5) * plan.resolution >= radius
     labels, count = ndimage.label(clear)

@@ -97,11 +97,7 @@ def find_planes(points: Array, near: float, least: float, seed: int = 0) -> list
 
 
 def find_room(scene: Scene, seed: int = 0) -> Room:
-    """Return floor and up of a scene.
-
-    The floor is the largest level plane with hardly any surface below it. Raises InputError for a scene
-    without a surface.
-    """
+    """Return up, and the largest level plane with little below it; InputError without a surface."""
     points, normals = sample_surface(scene.gaussians, SAMPLES, seed)
     up, near = scene.up(), NEAR * scene.bounds()[1]
     level = np.abs(normals @ up) >= LEVEL

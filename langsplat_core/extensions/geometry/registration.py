@@ -138,11 +138,7 @@ def _aligned(
 
 
 def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:
-    """Return the share of pixels at which two scenes have surfaces at the same depth.
-
-    It is of the pixels that both fill, as seen by cameras of both; 0 where no camera sees enough of both.
-    transform: (4, 4), moving to fixed.
-    """
+    """Return the share of pixels, filled in both as cameras of both see, of one depth; 0 without overlap."""
     there = similarity(transform)
     views = [(camera, there.inverse().camera(camera)) for camera in _some(fixed)]
     views += [(there.camera(camera), camera) for camera in _some(moving)]

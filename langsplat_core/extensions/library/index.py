@@ -506,11 +506,7 @@ def find(
     at_most: int = 20,
     progress: Progress = silent,
 ) -> list[Answered]:
-    """Return a phrase in every scene, group by group, the most certain answers first.
-
-    The first `at_most` scenes of a group that answer are opened and asked exactly; the verdicts of the others
-    are those of the index.
-    """
+    """Return a phrase in every scene, best first; `at_most` scenes of a group are opened and asked."""
     return [_ask_group(library, group, phrase, load_encoder, at_most, progress) for group in library.groups]
 
 
@@ -570,11 +566,7 @@ def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[Verdict]:
 
 
 def _vector(library: Library, group: EncoderGroup, text: str, load_encoder: LoadEncoder | None) -> Array:
-    """Return the (D,) unit vector of a phrase.
-
-    It is the encoder's, checked against the group's canonical vectors, else that of the first phrasebook that
-    has it. Raises EncoderError and, for no phrase, InputError.
-    """
+    """Return a phrase's (D,) unit vector, by the checked encoder or a phrasebook; EncoderError."""
     dim = group.canonical.shape[1]
     codec = LinearCodec(np.eye(1, dim, dtype=np.float32))
     none = np.zeros((len(LEVELS), 0, 1), np.float32), np.zeros((len(LEVELS), 0), np.float32)
@@ -594,11 +586,7 @@ def _vector(library: Library, group: EncoderGroup, text: str, load_encoder: Load
 
 
 def draw(scene: Scene, size: tuple[int, int], answer: QueryResult | None = None) -> Array:
-    """(H, W, 3) uint8 picture of a scene, of `size` (width, height).
-
-    With an answer from the training camera nearest to its place that has it in its image, with the answer as
-    a heat map.
-    """
+    """(H, W, 3) uint8 of a scene; an `answer` as heat, from the nearest camera that has it in its image."""
     fitted = [camera.with_intrinsics(camera.intrinsics.fitted(*size)) for camera in scene.cameras]
     camera = fitted[0] if fitted else scene.framing_camera(size)
     if answer is None:

@@ -198,11 +198,7 @@ FEWEST_GAUSSIANS = 64  # pruning never leaves fewer; the most opaque ones stay
 
 
 def accumulate(state: TrainingState, means_px_grad: Tensor, visible: Tensor, size: tuple[int, int]) -> None:
-    """Add one step to the statistic.
-
-    means_px_grad: (N, 2) loss gradient per pixel of mean position; visible: (N,) bool; size: (width, height)
-    of the image.
-    """
+    """Add a step: (N, 2) gradients per pixel of means, (N,) bool `visible`, image size (width, height)."""
     to_ndc = means_px_grad.new_tensor([0.5 * size[0], 0.5 * size[1]])
     x, y = (torch.nan_to_num(means_px_grad, 0.0, 0.0, 0.0) * to_ndc).unbind(1)
     state.grad_sum += torch.hypot(x, y) * visible

@@ -77,11 +77,7 @@ def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = s
 
 
 def neighbouring_views(cameras: Sequence[Camera], known: Array) -> list[list[int]]:
-    """Return for each view the at most four views that it is best compared with.
-
-    Those that see the middle of what it sees from about 12 degrees aside: wider angles tell depth better and
-    look less alike.
-    """
+    """Return each view's at most four best partners: they see its middle from about 12 degrees aside."""
     distance, positions = look_distance(cameras), np.stack([camera.position for camera in cameras])
     found = []
     for index, camera in enumerate(cameras):

@@ -456,11 +456,7 @@ def climb(budgets: int, rehearsals: int, score: Callable[[int, int], float]) -> 
 
 
 def _held_out(cameras: Sequence[Camera]) -> list[list[int]]:
-    """Return the views that the rehearsals leave out, one rehearsal after the other.
-
-    An eighth in each, so that it is like the training itself, and three in all at least, since single ones
-    differ by a decibel or two.
-    """
+    """Return the views that each rehearsal leaves out: an eighth, and three in all at least."""
     views: list[list[int]] = []
     taken: list[int] = []
     while len(taken) < 3 and (more := surrounded_views(cameras, 8, taken)):
