@@ -335,7 +335,7 @@ def write_project(path: Path, project: Project, apart: Path, before: Project | N
     before: what it held when it was last read or written here. What another window has made since then is
     taken over. Of what both changed `project` counts, and the other's file is kept as `apart`.
     """
-    folder, scene = path.absolute().parent, Path(project.scene)
+    folder, scene = Path(os.path.abspath(path)).parent, Path(project.scene)
     named = scene.relative_to(folder).as_posix() if scene.is_relative_to(folder) else str(scene)
     with locked(folder):
         if path.exists():
@@ -417,9 +417,8 @@ def _rigid(move: Move) -> Move:
     """Return a move whose matrix is a similarity: itself where it is one, so that files can be compared."""
     matrix = move.to.matrix
     exact = similarity(matrix)
-    return (
-        move if np.allclose(exact.matrix, matrix, 1e-12, 1e-12 * move.to.scale) else replace(move, to=exact)
-    )
+    alike = np.allclose(exact.matrix, matrix, 1e-12, 1e-12 * move.to.scale)
+    return move if alike else replace(move, to=exact)
 
 
 def _from_version_1(top: dict[str, Any]) -> dict[str, Any]:

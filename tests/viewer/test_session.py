@@ -342,6 +342,17 @@ def test_two_windows_save_one_project_and_lose_nothing(saved, opened, again):
     assert len(read_project(saved).session.moves) == 2
 
 
+def test_paths_with_dots_lead_to_the_same_scene(viewer, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "blobs.ply").touch()
+    monkeypatch.chdir(tmp_path / "here")
+    act(opening.open_file, viewer, Path("../blobs.ply"))
+    path = saving.save_project(viewer, Path(".."))
+    act(saving.save_project, viewer)  # to the same file, which is of the same scene
+    assert errors(viewer) == []
+    assert json.loads(path.read_text())["scene"] == "blobs.ply"
+
+
 def test_places_in_files_are_in_the_world(opened, saved, again, monkeypatch, tmp_path):
     """A scene that is read about another origin is shown, noted and filmed where it was."""
     path, view = saving.save_path(opened, tmp_path), saving.save_view(opened, tmp_path)

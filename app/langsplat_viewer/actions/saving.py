@@ -3,6 +3,7 @@
 Everything goes to new files, never over old ones, but a project to the file that it came from.
 """
 
+import os
 from collections.abc import Callable
 from concurrent.futures import wait
 from dataclasses import replace
@@ -206,7 +207,7 @@ def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
         return None
     path = state.project or _new_file(viewer, folder, PROJECTS)
     project = Project(
-        scene=str(state.path.absolute()),
+        scene=os.path.abspath(state.path),
         gaussians=len(state.scene.gaussians),
         origin=(float(state.origin[0]), float(state.origin[1]), float(state.origin[2])),
         view=Bookmark("view", pose_of(state.view), state.view.distance),
