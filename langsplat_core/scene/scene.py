@@ -215,12 +215,12 @@ def geometric_median(points: Array) -> Array:
     for _ in range(100):
         offsets = points - centre
         away = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
-        if not (mean := float(away.mean())):  # all in one place
+        if not (usual := float(np.median(away))):  # most are in one place
             break
-        pull = 1 / np.maximum(away, 1e-9 * mean)
+        pull = 1 / np.maximum(away, 1e-9 * usual)
         step = pull / pull.sum() @ offsets
         centre = centre + step
-        if np.linalg.norm(step) <= 1e-6 * mean:
+        if np.linalg.norm(step) <= 1e-6 * usual:
             break
     return np.asarray(centre)
 

@@ -57,6 +57,16 @@ def test_a_thin_scene_is_seen_from_its_broad_side(angle: float) -> None:
     assert abs(ahead @ normal) / np.linalg.norm(ahead) > 0.75  # a quarter more would be better
 
 
+def test_a_few_floaters_do_not_move_the_middle() -> None:
+    gaussians = random_gaussians(200)
+    centre, radius = Scene(gaussians).bounds()
+    means = gaussians.means.copy()
+    means[::50] = 1e30
+    moved, larger = Scene(replace(gaussians, means=means)).bounds()
+    assert np.linalg.norm(moved - centre) < 0.1 * radius
+    assert larger == pytest.approx(radius, rel=0.1)
+
+
 # Fewer Gaussians that look much the same.
 
 
