@@ -23,7 +23,16 @@ import numpy as np
 import pycolmap
 
 from langsplat_core.datasets.colmap import read_model
-from langsplat_core.datasets.workspace import FEWEST_MATCHES, MASKS, MATCHES, CameraGroup, Pair, disk_full
+from langsplat_core.datasets.workspace import (
+    DIGEST,
+    FEWEST_MATCHES,
+    MASKS,
+    MATCHES,
+    CameraGroup,
+    Pair,
+    digest_of_model,
+    disk_full,
+)
 from langsplat_core.errors import FormatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress
@@ -160,6 +169,7 @@ def store_model(model: Model, folder: Path) -> None:
         raise disk_full(folder) from None
     if len(written.points) != model.num_points3D():
         raise disk_full(folder)
+    (unfinished / DIGEST).write_text(digest_of_model(unfinished))
     shutil.rmtree(folder / "sparse", ignore_errors=True)
     unfinished.rename(folder / "sparse")
     for name in ("database.db", "pairs.txt"):

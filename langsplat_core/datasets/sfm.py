@@ -15,7 +15,7 @@ from PIL import Image
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.capture import Capture, capture_of, random_points
-from langsplat_core.datasets.colmap import good_points, has_model, located_photos, read_model
+from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
 from langsplat_core.datasets.photos import (
     EXIF_IFD,
     develop,
@@ -26,17 +26,19 @@ from langsplat_core.datasets.photos import (
     read_photo,
 )
 from langsplat_core.datasets.workspace import (
+    DIGEST,
     FAILURES,
     MASKS,
     UNREADABLE,
     CameraGroup,
     Matches,
     Pair,
+    digest_of_model,
     open_workspace,
     read_matches,
     run_apart,
 )
-from langsplat_core.errors import InputError, printable_line, report_loss, shortened
+from langsplat_core.errors import FormatError, InputError, printable_line, report_loss, shortened
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
 from langsplat_core.progress import Progress
@@ -71,7 +73,7 @@ def load_photos(
             raise InputError(
                 f"structure from motion failed ({reason}); remove {workspace} and try again"
             ) from None
-    model = read_model(workspace / "sparse") if has_model(workspace / "sparse") else None
+    model = _stored_model(workspace) if has_model(workspace / "sparse") else None
     matches = read_matches(workspace, files, {image.name for image in model.images} if model else ())
     lost = _left_out(matches, contents)
     found = len(matches.located)
@@ -239,9 +241,18 @@ def _triangulated(
             run_apart(
                 _match_and_triangulate, workspace, names, cameras, workspace=workspace, progress=progress
             )
-        return *good_points(read_model(workspace / "sparse")), ""
     except (*FAILURES, InputError) as error:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), f" ({printable_line(error, 200)})"
+    return *good_points(_stored_model(workspace)), ""
+
+
+def _stored_model(workspace: Path) -> SparseModel:
+    """Return the finished model of a workspace; FormatError where its files changed since it was written."""
+    folder = workspace / "sparse"
+    stated = folder / DIGEST  # none in earlier versions
+    if stated.is_file() and stated.read_bytes() != digest_of_model(folder).encode():
+        raise FormatError(f"{workspace}: its model changed since it was written; delete it and run again")
+    return read_model(folder)
 
 
 def _match_and_triangulate(

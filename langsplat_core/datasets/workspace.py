@@ -20,12 +20,13 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from langsplat_core.errors import printable_line, shortened
+from langsplat_core.errors import FormatError, printable_line, shortened
 from langsplat_core.io import apart
 from langsplat_core.progress import Progress
 
 MASKS = "masks"  # in the workspace: black where no features are wanted
 MATCHES = "matches.json"  # features and pairs
+DIGEST = "digest"  # in a finished model's folder: of its files, and of the matches
 FAILURES = (RuntimeError, ValueError, IndexError)  # what pycolmap raises
 ROOM = 64_000_000  # bytes that a step may want: 8 photographs of 8192 features take 20 MB, with the journal
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # sums of several differ from run to run
@@ -63,6 +64,13 @@ def run_apart(function: Callable[..., Any], *arguments: Any, workspace: Path, pr
         if shutil.disk_usage(workspace).free < ROOM:
             raise disk_full(workspace) from None
         raise error if isinstance(error, FAILURES) else RuntimeError(f"it {error}") from None
+
+
+def digest_of_model(folder: Path) -> str:
+    """Return a digest of the files of a workspace's model, and of its graph of matches."""
+    paths = [path for path in (*sorted(folder.iterdir()), folder.with_name(MATCHES)) if path.name != DIGEST]
+    contents = [(path.name, path.read_bytes()) for path in paths if path.is_file()]
+    return hashlib.sha256(repr(contents).encode()).hexdigest()
 
 
 def disk_full(folder: Path) -> OSError:
@@ -172,7 +180,10 @@ class Matches:
 
 def read_matches(folder: Path, files: dict[str, Path], located: Collection[str]) -> Matches:
     """Return a workspace's graph of matches; files: by their names there; located: names with a camera."""
-    kept = json.loads((folder / MATCHES).read_text())
+    try:
+        kept = json.loads((folder / MATCHES).read_bytes())
+    except ValueError as error:
+        raise FormatError(f"{folder}: its matches are damaged ({error}); delete it and run again") from None
     row = {name: index for index, name in enumerate(files)}
     names, unlike = (
         tuple(path.relative_to(path.parents[level]).as_posix() for path in files.values()) for level in (0, 1)
