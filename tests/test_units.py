@@ -640,8 +640,9 @@ def far(place: str, folder: Path) -> Case:
     return Case(replace(room(), origin=np.array(ORIGINS[place])), folder, moving(np.array(ORIGINS[place])))
 
 
-def test_files_of_far_scenes_are_of_the_world(tmp_path):
-    check("written", far("UTM", tmp_path))
+@pytest.mark.parametrize("name", ["written", pytest.param("printed", marks=pytest.mark.long)])
+def test_files_of_far_scenes_are_of_the_world(name, tmp_path):
+    check(name, far("UTM", tmp_path))
 
 
 @pytest.mark.slow

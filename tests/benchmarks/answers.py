@@ -28,7 +28,6 @@ from langsplat_core.config import (
     CodebookConfig,
     CodecConfig,
     Count,
-    DatasetConfig,
     LiftConfig,
     LinearConfig,
 )
@@ -53,8 +52,6 @@ from tests.benchmarks.scoring import (
     separation,
     spread,
 )
-
-WHOLE = DatasetConfig(max_side=65_536)  # photographs are not shrunk
 
 
 @dataclass(frozen=True)
@@ -144,18 +141,13 @@ def score_table(reports: Sequence[RoomReport]) -> str:
             of_rooms = [of_kind(room.measured[0], kind) for room in rooms]
             count = sum(queries for queries, *_ in of_rooms)
             if count:
-                spreads = [_spread(values) for values in zip(*(row[1:] for row in of_rooms), strict=True)]
-                ceilings = [direct_share(room.measured[0], kind, "ceiling") for room in rooms]
-                spreads.append(_spread(ceilings) if any(ceilings) else "-")
+                shares = 100 * np.array([row[1:] for row in of_rooms]).T
+                ceilings = 100 * np.array([direct_share(room.measured[0], kind, "ceiling") for room in rooms])
+                spreads = [
+                    spread(values) for values in (*shares, ceilings if any(ceilings) else ceilings[:0])
+                ]
                 lines.append((tier, kind, count, *spreads))
     return markdown(head, lines)
-
-
-def _spread(shares: Sequence[float]) -> str:
-    """Percent, with the standard deviation of several."""
-    if len(shares) == 1:
-        return _percent(shares[0])
-    return f"{_percent(float(np.mean(shares)))} +/- {_percent(float(np.std(shares, ddof=1)))}"
 
 
 def room_table(reports: Sequence[RoomReport]) -> str:

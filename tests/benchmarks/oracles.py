@@ -30,6 +30,7 @@ shares of noise that last, the mixing (`MODIFIER`, `OWNER`), `JITTER` and `LOST`
 """
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -184,7 +185,7 @@ SPECTRUM = ((0.5, 21), (0.8, 86), (0.95, 193))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TruthEncoder:
+class TruthEncoder(ABC):
     """What both have in common: an image-text encoder that looks at the truth in place of photographs."""
 
     found: float = LanguageField.found
@@ -195,35 +196,29 @@ class TruthEncoder:
     _kept: dict[str, Array] = field(default_factory=dict, init=False, repr=False)  # of regions, in all views
 
     @property
-    def id(self) -> str:
-        """Name by which it is asked for."""
-        raise NotImplementedError
+    @abstractmethod
+    def id(self) -> str: ...  # by which it is asked for
 
     @property
-    def digest(self) -> str:
-        """Digest of everything that its vectors depend on."""
-        raise NotImplementedError
+    @abstractmethod
+    def digest(self) -> str: ...  # of everything that its vectors depend on
 
     @property
-    def names(self) -> Mapping[str, int]:
-        """Row of every word that has a vector of its own."""
-        raise NotImplementedError
+    @abstractmethod
+    def names(self) -> Mapping[str, int]: ...  # row of every word that has a vector of its own
 
-    def word(self, word: str) -> Array:
-        """Return the (D,) unit own direction of a word."""
-        raise NotImplementedError
+    @abstractmethod
+    def word(self, word: str) -> Array: ...  # (D,) unit own direction
 
-    def text(self, key: str) -> Array:
-        """Return the (D,) unit vector of a phrase."""
-        raise NotImplementedError
+    @abstractmethod
+    def text(self, key: str) -> Array: ...  # (D,) unit vector of a phrase
 
+    @abstractmethod
     def image(self, truth: Truth, number: int, generator: np.random.Generator) -> Array:
         """Return the (D,) vector of what a region of the truth shows in one view."""
-        raise NotImplementedError
 
-    def mask_noise(self, generator: np.random.Generator, count: int) -> Array:
-        """Return (count, D) noise of masks."""
-        raise NotImplementedError
+    @abstractmethod
+    def mask_noise(self, generator: np.random.Generator, count: int) -> Array: ...  # (count, D), in one view
 
     def in_room(self, truth: Truth, seed: int) -> "TruthEncoder":
         """Return the encoder for one room."""
@@ -323,19 +318,16 @@ class ClipGeometry(TruthEncoder):
 
     @property
     def id(self) -> str:
-        """Name by which it is asked for."""
         return f"{PREFIX}{self.own:g},{self.alike:g}"
 
     @property
     def digest(self) -> str:
-        """Digest of everything that its vectors depend on."""
         texts = self.vectors.read_bytes() if self.vectors else b""
         stated = f"{VERSION} {self.id} {self.prompts} {hashlib.sha256(texts).hexdigest()}"
         return hashlib.sha256(stated.encode()).hexdigest()[:12]
 
     @property
     def names(self) -> Mapping[str, int]:
-        """Rows of the file's words."""
         return self._file[0]
 
     @property
@@ -344,7 +336,6 @@ class ClipGeometry(TruthEncoder):
         return (self.own - OTHER) / float(np.sqrt(1 - self.prompts))
 
     def text(self, key: str) -> Array:
-        """Return the (D,) unit vector of a phrase."""
         own = np.sqrt(1 - self.prompts) * self.direction(key)
         return np.asarray(unit(np.sqrt(self.prompts) * self._middle + own))
 
@@ -360,7 +351,6 @@ class ClipGeometry(TruthEncoder):
         return self._kept[key]
 
     def mask_noise(self, generator: np.random.Generator, count: int) -> Array:
-        """Return (count, D) noise of masks in one view."""
         return np.sqrt(1 - LASTING) * self._noise_scale * noise(generator, count, self._axes)
 
     def _shows(self, region: Region | None) -> Array:
@@ -412,7 +402,6 @@ class ClipGeometry(TruthEncoder):
 
     @cached_property
     def _file(self) -> tuple[dict[str, int], Array]:
-        """Names and (V, D) float64 unit vectors."""
         return ({}, np.zeros((0, DIM))) if self.vectors is None else named_vectors(self.vectors)
 
     def word(self, word: str) -> Array:
@@ -458,21 +447,6 @@ ADJECTIVES = 8  # with names of their own
 Rule = Callable[[Array, Array, np.random.Generator], Array]
 
 
-def by_cosine(own: Array, others: Array, generator: np.random.Generator) -> Array:
-    """Nearest by cosine, whatever else is near."""
-    return own
-
-
-def by_rank(own: Array, others: Array, generator: np.random.Generator) -> Array:
-    """Fewest names nearer, in no order where these are equally many."""
-    return generator.uniform(size=len(own)) - (others > own[:, None]).sum(1)
-
-
-def by_margin(own: Array, others: Array, generator: np.random.Generator) -> Array:
-    """Farthest ahead of the nearest other name."""
-    return own - others.max(1)
-
-
 def by_softmax(own: Array, others: Array, generator: np.random.Generator) -> Array:
     """As often as a softmax over names at CLIP's temperature says the phrase there (Gumbel's trick)."""
     logits = 100 * np.concatenate([own[:, None], others], axis=1)
@@ -481,9 +455,10 @@ def by_softmax(own: Array, others: Array, generator: np.random.Generator) -> Arr
 
 
 RULES: Mapping[str, Rule] = {
-    "cosine": by_cosine,
-    "rank": by_rank,
-    "margin": by_margin,
+    "cosine": lambda own, others, generator: own,  # whatever else is near
+    # Fewest names nearer, in no order where these are equally many.
+    "rank": lambda own, others, generator: generator.uniform(size=len(own)) - (others > own[:, None]).sum(1),
+    "margin": lambda own, others, generator: own - others.max(1),
     "softmax": by_softmax,
 }
 
@@ -498,12 +473,10 @@ class RealSpace(TruthEncoder):
 
     @property
     def id(self) -> str:
-        """Name by which it is asked for."""
         return f"{REAL}{self.path}" + (f",{self.rule}" if self.rule else "")
 
     @cached_property
     def digest(self) -> str:
-        """Digest of everything that its vectors depend on."""
         files = [path.read_bytes() for path in [*self._decoders, self._texts]]
         stated = f"{VERSION} {self.rule} " + " ".join(hashlib.sha256(file).hexdigest() for file in files)
         return hashlib.sha256(stated.encode()).hexdigest()[:12]
@@ -518,7 +491,6 @@ class RealSpace(TruthEncoder):
         return next(iter(sorted(folder.glob("*text*.npy"))), folder / "text.npy")
 
     def check(self) -> None:
-        """Raise InputError where files are missing."""
         files = [*(self._decoders or [self.path / "*.pth"]), self._texts]
         if self.rule not in ("", *RULES) or not all(path.is_file() for path in files):
             raise InputError(
@@ -527,7 +499,6 @@ class RealSpace(TruthEncoder):
             )
 
     def in_room(self, truth: Truth, seed: int) -> "RealSpace":
-        """Return the encoder of a room."""
         space = replace(self, path=self._decoders[seed % len(self._decoders)])
         return replace(space, rows=space.named(truth, np.random.default_rng((seed, 23))))
 
@@ -584,7 +555,6 @@ class RealSpace(TruthEncoder):
         return np.asarray(np.sqrt(1 - LOST) * decoded + np.sqrt(LOST) * lost)
 
     def mask_noise(self, generator: np.random.Generator, count: int) -> Array:
-        """Return (count, D) noise of masks in one view."""
         return np.sqrt(LOST * (1 - LASTING)) * noise(generator, count, self._axes)
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
@@ -593,11 +563,9 @@ class RealSpace(TruthEncoder):
 
     @property
     def names(self) -> Mapping[str, int]:
-        """Rows of the words of the room."""
         return self.rows
 
     def word(self, word: str) -> Array:
-        """Return the (D,) unit own direction of a word's name."""
         vector = self._vectors[self.names[word]]
         return np.asarray(unit(vector - (vector @ self._middle) * self._middle))
 
@@ -666,7 +634,6 @@ class RealSpace(TruthEncoder):
 
     @cached_property
     def _decoded(self) -> Array:
-        """(P, D) unit: the set."""
         return np.asarray(unit(self._codec.decode(self._points.astype(np.float32)).astype(np.float64)))
 
     @cached_property

@@ -279,10 +279,9 @@ def grouped(rows: Iterable[Row], *names: str) -> dict[Any, list[Row]]:
 
 
 def spread(values: Array) -> str:
-    """Mean and standard deviation of percentages, as cells of tables have them."""
-    if len(values) == 0:
-        return "-"
-    return f"{values.mean():.1f} +/- {values.std(ddof=1) if len(values) > 1 else 0:.1f}"
+    """Mean of percentages, with the standard deviation of several, as cells of tables have them."""
+    deviation = f" +/- {values.std(ddof=1):.1f}" if len(values) > 1 else ""
+    return f"{values.mean():.1f}{deviation}" if len(values) else "-"
 
 
 def of_kind(measured: Measured, kind: str) -> tuple[int, float, float, float]:

@@ -22,7 +22,6 @@ from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.checkpoints.langsplat_files import autoencoder_from, write_autoencoder
 from langsplat_core.extensions.checkpoints.unpickling import load_torch
-from langsplat_core.io.scenes import save_scene
 from langsplat_core.pipeline.encoder_check import REJECTED, fit_scaling
 from langsplat_core.progress import silent
 from langsplat_core.query.grammar import PARTS
@@ -59,7 +58,6 @@ from tests.benchmarks.oracles import (
     TruthEncoder,
     oracle_vectors,
     phrase_vectors,
-    read_truth_encoder,
     true_labels,
 )
 from tests.benchmarks.phrases import (
@@ -74,7 +72,7 @@ from tests.benchmarks.phrases import (
 from tests.benchmarks.room import InRooms, RoomSettings, Variant
 from tests.benchmarks.scale import COARSE, errors
 from tests.benchmarks.scoring import Asked, evaluate_direct
-from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, blobs, cameras
+from tests.support.fakes import PER_BLOB, FakeEncoder, blobs, cameras
 from tests.support.scenes import random_camera, random_gaussians
 
 THINGS = [3 * letter for letter in "abcdefghijklmnopqrtuvwxyz"]
@@ -288,32 +286,6 @@ def test_vectors_of_a_file_are_found_by_name(tmp_path):
     assert encoder.digest != ClipGeometry(0.31).digest
 
 
-@pytest.mark.parametrize("text", ["0.1", "0.5,0.9", "high", "", "0.31,0.99", "nan"])
-def test_impossible_cosines_are_refused_in_one_line(text):
-    with pytest.raises(InputError) as refused:
-        read_truth_encoder(f"clip-geometry:{text}")
-    assert "\n" not in str(refused.value)
-    assert read_truth_encoder("demo") is None  # no such encoder, and no mistake
-
-
-@pytest.mark.parametrize("missing", ["decoder", "texts", "rule", "canonical phrases"])
-def test_incomplete_real_spaces_are_refused_in_one_line(space, missing, tmp_path):
-    copied = [tmp_path / path.name for path in (space, *space.parent.glob("*text.*"))]
-    for copy in copied:
-        copy.write_bytes((space.parent / copy.name).read_bytes())
-    if missing == "decoder":
-        copied[0].unlink()
-    for copy in copied[1:]:
-        if missing == "texts":
-            copy.unlink()
-        elif copy.suffix == ".txt" and missing == "canonical phrases":
-            copy.write_text(copy.read_text().replace("stuff", "staff"))
-    name, truth = f"real:{tmp_path}{',nearest' if missing == 'rule' else ''}", row_of_things(tmp_path)[0]
-    with pytest.raises(InputError) as refused:
-        read_truth_encoder(name).in_room(truth, 0)
-    assert "\n" not in str(refused.value)
-
-
 TRUE = PlattScaling(-1.0, 18.0, 6.0)
 
 
@@ -375,14 +347,14 @@ def test_verdict_table_states_means_over_rooms():
     table = verdict_table(ROOM + parts)
     assert [cells(table, n)[1] for n in range(2, 5)] == ["thing", "colour + thing", "part"]
     tier, _, phrases, accepted, rejected, area, *at = cells(table, 2)
-    assert (tier, phrases, accepted, rejected) == ("clutter", "8", "75.0 +/- 0.0", "75.0 +/- 0.0")
+    assert (tier, phrases, accepted, rejected) == ("clutter", "8", "75.0", "75.0")
     pairs = [a > b for a in (0.2, 0.8, 0.9, 0.95) for b in (0.01, 0.02, 0.5, 0.76)]
-    assert area == f"{100 * np.mean(pairs):.1f} +/- 0.0"
-    assert at == ["75.0 +/- 0.0"] * 3  # of four absent things none but the best is the limit
-    assert cells(table, 4)[2:5] == ["3", "50.0 +/- 0.0", "100.0 +/- 0.0"]
+    assert area == f"{100 * np.mean(pairs):.1f}"
+    assert at == ["75.0"] * 3  # of four absent things none but the best is the limit
+    assert cells(table, 4)[2:5] == ["3", "50.0", "100.0"]
     other = [replace(r, seed=2, found=True) for r in ROOM]
     assert cells(verdict_table(ROOM + other), 2)[3] == f"87.5 +/- {100 * np.std([0.75, 1], ddof=1):.1f}"
-    assert cells(verdict_table([row("object", 0.9)]), 2)[3:] == ["100.0 +/- 0.0", *["-"] * 5]
+    assert cells(verdict_table([row("object", 0.9)]), 2)[3:] == ["100.0", *["-"] * 5]
 
 
 def test_calibration_curve_weighs_present_and_absent_alike():
@@ -563,7 +535,8 @@ def test_truth_masks_are_the_regions_of_the_truth(run):
         "rooms --tiers",
         "rooms --views 5",
         "rooms --codec.kind autoencoder --codec.batch 1",
-        "rooms --encoder clip-geometry:0.9",
+        *(f"rooms --encoder clip-geometry:{text}" for text in ("0.1", "0.5,0.9", "high", "", "0.31,0.99")),
+        *(f"rooms --encoder real:{text}" for text in ("absent.pth", ".", ".,nearest")),
         "scale --rows 0",
     ],
 )
@@ -586,7 +559,7 @@ def test_counts_give_nothing_its_due():
     table = count_table(rows)
     assert cells(table, 6)[:3] == ["ours", "none", "2"]
     assert [cells(table, line)[3:] for line in (6, 7, 8)] == [
-        [f"{share} +/- 0.0" for share in shares.split()]
+        [f"{share}" for share in shares.split()]
         for shares in ("50.0 50.0 50.0 50.0", "25.0 40.0 50.0 50.0", "50.0 80.0 100.0 50.0")
     ]
     assert cells(count_table(rows + [scored(0, 0, seed=2)]), 6)[3] == "75.0 +/- 35.4"
@@ -648,14 +621,3 @@ def test_scale_measures_every_part_at_small_sizes(tmp_path, monkeypatch):
     stretches = [row for row in rows if "what" in row]
     assert [row["times"] for row in stretches if "phrase" in row["what"]] == [1, 2, 2, 2, 2]
     assert sum(row["times"] for row in stretches if "image" in row["what"]) == 3
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("lack", ["field", "with_cameras"])
-def test_scale_refuses_scenes_without_field_or_cameras(lack, tmp_path, capsys):
-    path = tmp_path / "scene.ply"
-    save_scene(path, blob_scene(**{lack: False}))
-    for part in ("moving", "endurance"):
-        words = ["scale", str(path), "--only", part, "--out", str(tmp_path / "out")]
-        assert main(PROGRAM, lambda words=words: parse(words)) == 2
-        assert str(path) in capsys.readouterr().err

@@ -17,7 +17,6 @@ from langsplat_core.io.sidecar import write_language
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene, TaughtWord
 from langsplat_core.scene.language import tree_of_wholes
-from langsplat_core.scene.transform import moving, place_scene
 from tests.support.backends import Measure
 from tests.support.file_samples import assert_same_extras, random_field, sog_files, write_folder
 from tests.support.processes import refusal, run
@@ -232,38 +231,6 @@ def test_the_original_is_never_replaced(command, source, capsys):
     box = ["--box", -9, -9, -9, 9, 9, 9] if command == "crop" else []
     assert "would replace" in refusal(capsys, command, source, source, *box)
     assert source.read_bytes() == content
-
-
-def places(content: object, key: str = "") -> list[list[float]]:
-    """All numbers of what was printed as JSON, in threes where they are of places."""
-    if isinstance(content, dict):
-        return [row for name, value in content.items() for row in places(value, name)]
-    if isinstance(content, list) and key in ("place", "centre", "box"):
-        return np.reshape(content, (-1, 3)).tolist()
-    if isinstance(content, list):
-        return [row for value in content for row in places(value, key)]
-    return [[content]] if isinstance(content, int | float) else []
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("at", [(500_123.25, 5_412_345.5, 312.0), (4.0e6, 7.0e5, 4.9e6)], ids=["UTM", "ECEF"])
-@pytest.mark.parametrize("command", ["query", "describe", "crop"])
-def test_a_far_scene_answers_like_one_at_zero(tmp_path, capsys, command, at):
-    save_scene(tmp_path / "far.ply", place_scene(load_scene(DEMO), moving(np.array(at))))
-    words = {"query": ["red mug", "book left of the mug", "--json"], "describe": ["--outline", "--json"]}
-    said = []
-    for scene, place in ((DEMO, np.zeros(3)), (tmp_path / "far.ply", np.array(at))):
-        if command == "crop":
-            box = (place - 0.5).tolist() + (place + 0.5).tolist()
-            assert run("crop", scene, tmp_path / "cropped.ply", "--box", *box) == 0
-            cropped = load_scene(tmp_path / "cropped.ply")
-            said.append(cropped.in_world(cropped.gaussians.means) - place)
-            continue
-        capsys.readouterr()
-        assert run(command, scene, *words[command]) == 0
-        rows = places(json.loads(capsys.readouterr().out))
-        said.append(np.concatenate([np.array(row) - (place if len(row) == 3 else 0) for row in rows]))
-    np.testing.assert_allclose(said[1], said[0], rtol=0, atol=1e-6)
 
 
 def test_clean_reports_what_it_removes(scene, source, tmp_path, capsys):

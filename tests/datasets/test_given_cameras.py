@@ -430,23 +430,6 @@ def test_a_truncated_binary_model_is_refused(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("cameras.txt", "1 PINHOLE 40 30 50 50 20\n"),
-        ("cameras.txt", "1 PANORAMA 40 30 50 50 20 15\n"),
-        ("cameras.txt", "2 PINHOLE 40 30 50 50 20 15\n"),
-        ("images.txt", "1 0 0 0 0 0 0 0 1 a.png\n\n"),
-        ("points3D.txt", "1 0 0 0 1 2 300 0.5\n"),
-    ],
-)
-def test_a_broken_line_of_a_text_model_is_refused(tmp_path: Path, name: str, text: str) -> None:
-    (write_colmap(tmp_path, "txt") / name).write_text(text)
-    message = refuse(tmp_path, tmp_path / "work")
-    assert "sparse" in message
-    assert len(message) < 400
-
-
-@pytest.mark.parametrize(
     ("name", "found"),
     [
         ("a" * 5000 + ".png", ["b"]),  # no file system holds it

@@ -34,14 +34,13 @@ from langsplat_core.datasets.photos import (
     unique_names,
 )
 from langsplat_core.datasets.video import extract_frames, kept_frames
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import PictureError, is_video, picture_size
 from langsplat_core.progress import WorkCancelledError, silent
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene, look_at
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
-from tests.support.file_kinds import TEXTS
 from tests.support.photographs import (
     CONFIG,
     mask_file,
@@ -49,7 +48,6 @@ from tests.support.photographs import (
     refuse,
     write_colmap,
     write_photos,
-    write_picture,
 )
 from tests.support.processes import files_of_at_most, stop_at
 
@@ -83,34 +81,15 @@ def test_every_kind_of_picture_becomes_rgb(tmp_path: Path) -> None:
         assert np.abs(got.astype(int) - grey[..., None]).max() <= 1, name
 
 
-def bomb(path: Path) -> None:
-    """A PNG of a hundred bytes whose header claims 60 000 x 60 000 pixels."""
-    write_picture(path)
-    data = bytearray(path.read_bytes())
-    data[16:24] = struct.pack(">II", 60_000, 60_000)
-    path.write_bytes(data)
-
-
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        lambda path: path.write_bytes(b""),
-        lambda path: path.write_bytes(path.read_bytes()[:200]),
-        bomb,
-    ],
-)
-def test_a_broken_photograph_is_left_out_and_named(
-    tmp_path: Path,
-    spoil,  # type: ignore[no-untyped-def]
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_broken_photograph_is_left_out_and_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_colmap(tmp_path)
-    spoil(tmp_path / "images/a.png")
+    (tmp_path / "images/a.png").write_bytes(b"")
     capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
     assert [camera.name for camera in capture.cameras] == ["b"]
     assert "a.png" in caplog.text
 
-    spoil(tmp_path / "images/b.png")
+    whole = (tmp_path / "images/b.png").read_bytes()
+    (tmp_path / "images/b.png").write_bytes(whole[:200])
     assert "a.png" in refuse(tmp_path, tmp_path / "work")
 
 
@@ -539,15 +518,6 @@ def test_work_folder_keeps_whole_sets_of_frames_alone(clip: Path, tmp_path: Path
 def test_containers_of_videos_are_read(suffix: str, tmp_path: Path) -> None:
     video = write_video(tmp_path / f"a{suffix}", [scene(k) for k in range(12)])
     assert len(extract_frames(video, tmp_path / "out", 4)) == 4
-
-
-@pytest.mark.parametrize("content", [b"", b"no video at all" * 50, *TEXTS])
-def test_other_files_are_no_videos(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "a.mp4").write_bytes(content)
-    with pytest.raises(FormatError, match=r"a\.mp4: not a readable video \([^\[:]+\); copy it again"):
-        extract_frames(tmp_path / "a.mp4", tmp_path / "out", 5)
-    with pytest.raises(InputError, match="no such file"):
-        extract_frames(tmp_path / "b.mp4", tmp_path / "out", 5)
 
 
 def test_heic_is_a_photograph(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from langsplat_core.semantics.encoders import (
     load_text_encoder,
     torch_clip_text,
 )
-from langsplat_core.semantics.relevancy import BUNDLED, LONGEST, bundled_vocabulary, read_vocabulary
+from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary, read_vocabulary
 from langsplat_core.semantics.sam import load_segmenter
 from langsplat_core.semantics.weights import Weights
 from tests.support.tiny_models import (
@@ -466,20 +466,3 @@ def test_vocabularies_of_other_encodings_are_read(tmp_path, encoding, caplog):
     path.write_bytes("cup\r\ncafé table\r\n".encode(encoding))
     assert read_vocabulary(path) == ("cup", "café table")
     assert ["line 2: is not UTF-8" in text for text in caplog.messages] == [True] * (encoding == "cp1252")
-
-
-@pytest.mark.parametrize(
-    ("content", "problem"),
-    [
-        (b"cup\nmug\n\xff\x01\n", "is no text"),
-        (b"cup\n" + b"x" * (LONGEST + 1), "line 2: "),
-        (b"# nothing\n\n", "is empty"),
-    ],
-)
-def test_broken_vocabularies_are_named_by_file_and_line(tmp_path, content, problem):
-    path = tmp_path / "mine.txt"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=re.escape(str(path)) + ".*" + re.escape(problem)):
-        read_vocabulary(path)
-    with pytest.raises(InputError, match="is a folder"):
-        read_vocabulary(tmp_path)

@@ -58,6 +58,7 @@ from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from langsplat_core.semantics.relevancy import read_vocabulary
 from tests.support.file_samples import (
     ascii_ply,
+    bytes_of,
     compressed_ply,
     mixed_ply,
     plain_ply,
@@ -492,13 +493,6 @@ SCENE = random_gaussians(20, sh_degree=1)
 PLAIN = random_gaussians(300, seed=1)
 
 
-def gltf_bytes(gaussians: Gaussians, suffix: str = ".glb") -> bytes:
-    """A scene as our writer makes it: the format's own writer is not in Python."""
-    with TemporaryDirectory() as folder:
-        write_gltf(Path(folder) / f"a{suffix}", gaussians)
-        return (Path(folder) / f"a{suffix}").read_bytes()
-
-
 def scene_share(path: Path) -> float:
     """Also makes what a viewer makes first: the camera that frames the scene, and what it sees."""
     scene = load_scene(path)
@@ -514,15 +508,14 @@ def drawable_share(gaussians: Gaussians) -> float:
     return float(gaussians.valid().mean()) if len(gaussians) else 1.0
 
 
-def sidecars(folder: Path) -> list[bytes]:
+def sidecars(_: Path) -> list[bytes]:
     """Of every codec, with a tree and a taught word; version 2."""
     made = []
     for kind in ("codebook", "autoencoder", "linear"):
         field = random_field(len(SCENE), kind)
         taught = (taught_word("mine", field.codec.vector_dim),)
         field = replace(field, tree=tree_of(Scene(SCENE, field)), taught=taught)
-        write_language(folder / "made", field, SCENE.means)
-        made.append((folder / "made").read_bytes())
+        made.append(bytes_of(write_language, field, SCENE.means))
     return made
 
 
@@ -554,11 +547,10 @@ def searched(path: Path) -> float:
     return 1.0
 
 
-def word_files(folder: Path) -> list[bytes]:
+def word_files(_: Path) -> list[bytes]:
     field = random_field(len(SCENE))
     words = tuple(taught_word(name, field.codec.vector_dim) for name in ("mine", "Tür"))
-    write_words(folder / "made", Words("demo", field.canonical, words))
-    return [(folder / "made").read_bytes()]
+    return [bytes_of(write_words, Words("demo", field.canonical, words))]
 
 
 def asked_words(path: Path) -> float:
@@ -567,11 +559,6 @@ def asked_words(path: Path) -> float:
     for word in words.words:
         assert np.isfinite(engine.run(word.name).relevancy).all()
     return 1.0
-
-
-def camera_files(folder: Path) -> list[bytes]:
-    write_cameras(folder / "made", (random_camera(), random_camera(1)))
-    return [(folder / "made").read_bytes()]
 
 
 def camera_list(path: Path) -> float:
@@ -620,10 +607,9 @@ def beside_scene(path: Path) -> float:
     return scene_share(path.parent / "a.ply")
 
 
-def stages(folder: Path) -> list[bytes]:
+def stages(_: Path) -> list[bytes]:
     arrays = {"values": np.ones((5, 3), np.float32), "rows": np.arange(4)}
-    kept(folder / "made.npz", lambda: arrays)
-    return [(folder / "made.npz").read_bytes()]
+    return [bytes_of(kept, lambda: arrays, name="made.npz")]
 
 
 def kept_stage(path: Path) -> float:
@@ -631,10 +617,9 @@ def kept_stage(path: Path) -> float:
     return 1.0
 
 
-def mapped_arrays(folder: Path) -> list[bytes]:
-    for name, array in (("plain", np.ones((50, 3), np.float32)), ("none", np.zeros(0, np.int32))):
-        np.save(folder / name, array)
-    return [(folder / f"{name}.npy").read_bytes() for name in ("plain", "none")]
+def mapped_arrays(_: Path) -> list[bytes]:
+    arrays = (np.ones((50, 3), np.float32), np.zeros(0, np.int32))
+    return [bytes_of(np.save, array, name="made.npy") for array in arrays]
 
 
 def mapped(path: Path) -> float:
@@ -833,15 +818,20 @@ KINDS = {
         f"SPZ {v}": _scenes("a.spz", spz_bytes(SCENE, v), spz_bytes(PLAIN, v), damage=in_gzip)
         for v in (1, 2, 3, 4)
     },
-    ".glb": _scenes("a.glb", gltf_bytes(SCENE), gltf_bytes(PLAIN), damage=in_glb),
-    ".gltf": _scenes("a.gltf", gltf_bytes(random_gaussians(3), ".gltf"), damage=in_json),
+    ".glb": _scenes("a.glb", *(bytes_of(write_gltf, g, name="a.glb") for g in (SCENE, PLAIN)), damage=in_glb),
+    ".gltf": _scenes("a.gltf", bytes_of(write_gltf, random_gaussians(3), name="a.gltf"), damage=in_json),
     ".splat": _scenes("a.splat", splat_bytes(SCENE), splat_bytes(PLAIN)),
     "sidecar": FileKind("a.langsplat.safetensors", sidecars, searched, in_safetensors),
     "taught words": FileKind("a.safetensors", word_files, asked_words, in_safetensors),
     "vocabulary": FileKind("a.txt", vocabularies, encoded),
     "settings": FileKind("a.toml", settings_files, trained_by),
     "origin.json": FileKind("a.origin.json", origins, beside_scene, in_json),
-    "cameras.json": FileKind("a.cameras.json", camera_files, camera_list, in_json),
+    "cameras.json": FileKind(
+        "a.cameras.json",
+        lambda _: [bytes_of(write_cameras, (random_camera(), random_camera(1)))],
+        camera_list,
+        in_json,
+    ),
     "transforms.json": FileKind("transforms.json", transforms, beside_transforms, in_json),
     "point-cloud PLY": FileKind("cloud.ply", cloud_folder, beside_transforms, in_ply_header),
     **{

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -231,6 +232,13 @@ def sog_files(g: Gaussians, palette_entries: int = 70) -> dict[str, bytes]:
         labels = np.stack([label & 255, label >> 8, label * 0], 1)
         files["shN_labels.webp"] = _webp(_plane(labels, width))
     return {"meta.json": json.dumps(meta).encode(), **files}
+
+
+def bytes_of(write: Callable[..., object], *content: object, name: str = "a") -> bytes:
+    """What a writer of ours makes of something, in a file of that name."""
+    with TemporaryDirectory() as folder:
+        write(Path(folder) / name, *content)
+        return (Path(folder) / name).read_bytes()
 
 
 def zipped(files: dict[str, bytes]) -> bytes:

@@ -521,21 +521,6 @@ def test_transformed_scene_is_saved_as_seen(opened, tmp_path):
     assert opened.state.leaving is not None
 
 
-def test_crop_deletes_outside_the_box_and_is_undone(opened):
-    chosen = selected_mug(opened)
-    editing.fill_box(opened)
-    editing.crop(opened)
-    marks = opened.state.marks
-    assert (marks.kept[chosen]).all()
-    assert 0 < marks.kept.sum() < len(chosen)
-    editing.undo(opened)
-    assert opened.state.marks.kept.all()
-    opened.state.edit_form = EditForm(low=(50.0, 50, 50), high=(51.0, 51, 51))
-    editing.crop(opened)
-    assert "holds nothing" in errors(opened)[-1]
-    assert opened.state.marks.kept.all()
-
-
 def test_cropping_keeps_earlier_deletions(opened):
     chosen = selected_mug(opened)
     editing.delete_selected(opened)

@@ -67,18 +67,6 @@ def test_cancelled_opening_shows_nothing(viewer):
     assert viewer.state.scene is None
 
 
-def test_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
-    path = tmp_path / "a.ply"
-    save_scene(path, replace(blob_scene(), path=None))
-    names = ("a.cameras.json", "a.langsplat.safetensors")
-    for name in names:
-        (tmp_path / name).write_bytes(b"{")
-    viewer.services = replace(viewer.services, load_scene=load_scene)
-    open_scene(viewer, path)
-    assert viewer.state.scene.language is None
-    assert all(name in reason for name, reason in zip(names, errors(viewer), strict=True))
-
-
 @pytest.mark.parametrize(
     ("names", "opened_name", "said"),
     [

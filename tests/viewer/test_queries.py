@@ -10,14 +10,13 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError
-from langsplat_core.semantics.features import ImageFeatures
 from langsplat_viewer.actions import editing, opening, outline, queries, saving, settings
 from langsplat_viewer.actions.editing import take
 from langsplat_viewer.panels.search import BINS, hint, histogram
 from langsplat_viewer.program import answer_line
 from langsplat_viewer.session import Query, Things
 from langsplat_viewer.viewer import Services
-from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
+from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, calibrated_for, language
 from tests.support.scenes import with_tree
 from tests.support.windowless import (
     SCENES,
@@ -141,23 +140,6 @@ def test_calibrated_scene_gives_probabilities(viewer, monkeypatch, logit, verdic
     assert (viewer.state.session.queries[0].slot is None) == (verdict == "not here")
     said = f"'mug': {verdict} ({100 * found.probability:.0f} %), score "
     assert answer_line(found).startswith(said)
-
-
-# Evidence.
-
-
-def test_answer_is_explained_by_kept_photographs(opened, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    ask(opened, "book")
-    (query,) = opened.state.session.queries
-    act(queries.explain, opened, query)
-    assert "--work" in errors(opened)[-1]
-    scene = opened.state.scene
-    seen = ImageFeatures(np.zeros((3, 120, 160), np.int32), axis(1)[None])
-    as_trained(tmp_path / "blobs.ply", scene, [seen] * len(scene.cameras))
-    act(queries.explain, opened, query)
-    assert opened.state.evidence[0] == "book"
-    assert opened.state.evidence[1].ndim == 3
 
 
 # Thresholds of one's own.

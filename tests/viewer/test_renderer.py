@@ -35,7 +35,7 @@ from langsplat_viewer.rendering.request import (
 from tests.support.backends import gl_state
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_answer, random_camera, random_gaussians, random_scene, with_tree
-from tests.support.windowless import marked, render_image
+from tests.support.windowless import marked
 
 COUNT = 150
 SCENE = with_tree(random_scene(COUNT))
@@ -298,28 +298,8 @@ def test_an_empty_scene_is_the_background(renderer):
 SIZE = (160, 120)
 
 
-def scaled(factor: float) -> Scene:
-    """The three blobs without cameras, `factor` times as large."""
-    scene = blob_scene(field=False, with_cameras=False)
-    means, log_scales = factor * scene.gaussians.means, scene.gaussians.log_scales + np.log(factor)
-    return replace(scene, gaussians=replace(scene.gaussians, means=means, log_scales=log_scales))
-
-
 def opening(scene: Scene) -> Camera:
     return default_view(scene, extent_of(scene), SIZE).camera(*SIZE)
-
-
-@pytest.mark.parametrize("factor", [0.02, 1e-3, 300.0])
-def test_the_image_does_not_depend_on_the_unit(factor):
-    """Of radius 0.02 * 1.2 and less: nearer than training's near plane of 0.2."""
-    expected, got = (
-        render_image(plain_request(scene, opening(scene), PictureConfig()), "cpu").astype(int)
-        for scene in (scaled(1.0), scaled(factor))
-    )
-    assert (expected.max(-1) > 40).mean() > 0.02
-    assert np.abs(got - expected).max() <= 2
-    radii = [extent_of(scaled(one)).radius for one in (1.0, factor)]
-    np.testing.assert_allclose(radii[1], factor * radii[0], rtol=1e-4)
 
 
 def test_the_near_plane_comes_nearer_with_the_camera():

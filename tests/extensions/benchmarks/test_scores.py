@@ -103,25 +103,6 @@ def test_a_polygon_of_fractions_and_one_that_leaves_the_picture(tmp_path):
     np.testing.assert_array_equal(mask, block(0, 3, 4, 29))
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda c: c.pop("objects"),
-        lambda c: c["info"].update(height=10**9),
-        lambda c: c["objects"][0].update(segmentation=[[1, 2], [float("nan"), 3], [4, 4]]),
-        lambda c: c.update(objects=[]),
-    ],
-)
-def test_a_broken_label_file_is_named(tmp_path, change):
-    path = lerf_frame(tmp_path / "label" / "a", "b", [("mug", rectangle(1, 1, 4, 4))])
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-    with pytest.raises(FormatError) as error:
-        read_lerf_ovs(tmp_path)
-    assert str(path.parent) in str(error.value)
-
-
 def test_3d_ovs(tmp_path):
     scene = tmp_path / "bench"
     ovs_view(scene, "00", {"red cup": block(1, 1, 8, 8), "wall": block(0, 20, 39, 29)})
@@ -599,15 +580,3 @@ def test_a_tiny_run_writes_three_sane_files(tmp_path):
     text = (tmp_path / "raster.md").read_text()
     assert "# Rasterizers" in text
     assert Image.open(tmp_path / "raster.png").size[0] > 1000
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "eval lerf-ovs s.ply d --json /proc/x.json",
-        "eval 3d-ovs s.ply d --json /proc/x",
-        "bench raster --out /proc/x",
-    ],
-)
-def test_commands_try_the_place_to_write_first(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "system's own" in refusal(capsys, *words.split())

@@ -3,8 +3,6 @@ them."""
 
 import json
 import logging
-import os
-import pickle
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -316,13 +314,6 @@ def test_cameras_of_the_models_folder(tmp_path):
 # Files of other methods that are refused: one line each, which names the file.
 
 
-class Harmful:
-    """Would run a command when unpickled."""
-
-    def __reduce__(self):
-        return (os.system, ("exit 1",))
-
-
 def read_whole(paths: list[Path]) -> None:
     scene = read_foreign(paths)
     for level in range(3):
@@ -335,13 +326,6 @@ def refused(paths: list[Path], message: str) -> None:
         read_whole(paths)
     assert "\n" not in str(caught.value)
     assert any(str(caught.value).startswith(str(path)) for path in paths)
-
-
-def test_classes_are_not_unpickled(tmp_path):
-    path = save_model(tmp_path / "c.pth", G, behind=(Harmful(),))
-    refused([path], r"needs '(posix|nt).system'; only tensors")
-    path.write_bytes(pickle.dumps(Harmful()))
-    refused([path], r"needs 'posix.system'|not a whole file")
 
 
 def wrong(index: int, value: object) -> tuple[object, ...]:

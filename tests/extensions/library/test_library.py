@@ -230,17 +230,6 @@ def test_index_with_a_false_statement_is_refused(folder, name):
         read_library(index, folder)
 
 
-@pytest.mark.parametrize("name", ["canonical", "thumbnails", "codewords", "parents"])
-def test_index_with_arrays_of_other_sizes_is_refused(folder, name):
-    update_library(folder, load_encoder=load)
-    tensors, index = load_file(folder / INDEX), folder / INDEX
-    text = json.dumps(stated(index))
-    for values in (tensors[f"0.{name}"][..., :-1], tensors[f"0.{name}"].astype(np.float64)):
-        save_file(tensors | {f"0.{name}": np.ascontiguousarray(values)}, index, {SCENES: text})
-        with pytest.raises(FormatError, match="made again"):
-            read_library(index, folder)
-
-
 def test_damaged_index_is_made_again_with_a_warning(folder, caplog):
     update_library(folder, load_encoder=load)
     whole = (folder / INDEX).read_bytes()
@@ -261,17 +250,6 @@ def test_kernels_refuse_arrays_of_other_sizes(folder, column):
         fits_in(changed, axis(0))
     with pytest.raises(FormatError, match="does not fit"):
         fits_in(group, np.ones(600, np.float32))
-
-
-def test_an_index_of_infinities_is_refused(folder):
-    update_library(folder, load_encoder=load)
-    tensors, index = load_file(folder / INDEX), folder / INDEX
-    for name in ("shares", "rates"):
-        values = tensors[f"0.{name}"].copy()
-        values[0] = np.inf
-        save_file(tensors | {f"0.{name}": values}, index, {SCENES: json.dumps(stated(index))})
-        with pytest.raises(FormatError, match="not finite"):
-            read_library(index, folder)
 
 
 @pytest.mark.parametrize("column", ["words", "regions", "parents"])

@@ -1,8 +1,6 @@
 """Radiance training on a tiny scene drawn by the reference rasterizer: schedule, whole runs, rehearsals."""
 
 import math
-import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -91,16 +89,6 @@ def test_small_budgets_leave_time_to_recover(steps: int) -> None:
     assert len(rounds) >= (5 if steps >= 600 else 1)
 
 
-def steps_into(steps: list[int]) -> Progress:
-    """Progress of `SHORT` that notes the number of every step."""
-
-    def note(at: Report) -> None:
-        if at.stage != STAGE:
-            steps.append(round(at.fraction * SHORT.steps))
-
-    return Progress(note)
-
-
 def test_gradients_are_those_of_the_reference_picture() -> None:
     """A random direction in every parameter, against central differences of the float64 picture.
 
@@ -146,26 +134,6 @@ def test_training_learns_the_scene() -> None:
     assert all(0 < score.covered <= 1 for score in [*before, *after])
     assert trained.valid().all()
     assert trained.opacity_logits.min() > -5.6  # none below alpha 1/255
-
-
-def test_ctrl_c_ends_training_with_a_checkpoint_to_resume(tmp_path: Path) -> None:
-    path = tmp_path / "run.safetensors"
-    seen: list[int] = []
-
-    def interrupt(at: Report) -> None:
-        steps_into(seen).show(at)
-        if seen and seen[-1] == 7:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    handler = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        train_radiance(capture(), SHORT, [0, 1, 2], path, Progress(interrupt))
-    assert signal.getsignal(signal.SIGINT) is handler
-    resumed = train_radiance(capture(), SHORT, [0, 1, 2], path, steps_into(seen))
-    assert seen == list(range(1, 41))
-    straight = train_radiance(capture(), SHORT, [0, 1, 2])
-    for name in Gaussians.__dataclass_fields__:
-        np.testing.assert_array_equal(getattr(resumed, name), getattr(straight, name))
 
 
 def test_one_view_is_enough_and_none_is_refused() -> None:
