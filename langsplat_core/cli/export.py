@@ -85,8 +85,8 @@ class Convert:
     source: tyro.conf.Positional[Path]
     """Scene to read, of any format; or the first of the files that another method has of one scene."""
     rest: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[MORE...] OUT")]]
-    """The other method's further files, in any order, and last the scene to write: .ply, .spz or .splat; with
-    --to the folder."""
+    """The other method's further files, in any order, and last the scene to write (.ply, .spz, .sog, .glb,
+    .gltf or .splat); with --to the folder."""
     rematch: Path | None = None
     """A language sidecar (*.langsplat.safetensors) made before the Gaussians were edited: its field is
     carried over to the Gaussians of SOURCE by nearest position."""

@@ -425,7 +425,7 @@ class Select:
     texts: tyro.conf.Positional[tuple[str, ...]]
     """Phrases, each in quotes if it has several words; what any of them names is taken."""
     out: OutFile
-    """Scene to write: .ply, .spz or .splat."""
+    """Scene to write: .ply, .spz, .sog, .glb, .gltf or .splat."""
     remove: bool = False
     """Write everything else instead."""
     level: LevelChoice = "auto"

@@ -17,9 +17,9 @@ from PIL import Image, ImageOps
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets.colour import Tell, as_srgb, coded_as
+from langsplat_core.datasets.colour import as_srgb, coded_as
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics, pinhole_for, resample, source_positions
-from langsplat_core.errors import InputError, report_loss, shortened
+from langsplat_core.errors import InputError, Tell, report_loss, shortened
 from langsplat_core.io.hostile import (
     MOST_PIXELS,
     MOST_PIXELS_REDUCED,
@@ -127,10 +127,11 @@ def _stray_masks(photos: Sequence[Photo]) -> list[str]:
     folders = {photo.path.parent for photo in photos}
     beside = {folder / "masks" for folder in folders}
     beside |= {folder.parent / "masks" for folder in folders if folder.name in ("images", "photos")}
-    known = {name for folder in folders for photo in find_photos(folder) for name in (photo.name, photo.stem)}
-    listed = [mask for folder in beside for mask in find_photos(folder)]
     used = {photo.mask for photo in photos} | {photo.path for photo in photos}
-    return [m.name for m in listed if m not in used and (m.suffix != ".png" or m.stem not in known)]
+    unused = [mask for folder in beside for mask in find_photos(folder) if mask not in used]
+    alike = (photo for folder in folders if unused for photo in find_photos(folder))
+    known = {name for photo in alike for name in (photo.name, photo.stem)}
+    return [mask.name for mask in unused if mask.suffix != ".png" or mask.stem not in known]
 
 
 def unique_names(labels: Sequence[str]) -> list[str]:

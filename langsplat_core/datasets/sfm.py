@@ -118,7 +118,8 @@ def _left_out(matches: Matches, contents: Sequence[tuple[str, str]]) -> dict[str
     for row, (name, content) in enumerate(contents):
         twin = first.setdefault(content, name)
         if row not in matches.located:
-            why = matches.why(row) if twin == name else f"the same picture as {twin}"
+            again = twin != name and matches.features[row] >= 0
+            why = f"the same picture as {twin}" if again else matches.why(row)
             groups.setdefault(why, []).append(name)
     return groups
 

@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.colour import HLG, PQ, UNSPECIFIED, Tell, to_srgb
-from langsplat_core.errors import FormatError, InputError, optional_imports, printable_line, report_loss
+from langsplat_core.datasets.colour import HLG, PQ, UNSPECIFIED, to_srgb
+from langsplat_core.errors import FormatError, InputError, Tell, optional_imports, printable_line, report_loss
 from langsplat_core.io.files import shown
 from langsplat_core.io.hostile import MOST_PIXELS, open_for_reading
 from langsplat_core.progress import Progress, silent

@@ -272,7 +272,7 @@ class _File:
             if text[4:8] != b"\2\0\0\0" or text[16:20] != JSON_CHUNK or end - 20 > JSON_LIMIT:
                 raise malformed(path, f"does not begin with a chunk of JSON of at most {JSON_LIMIT} bytes")
             size = int.from_bytes(text[end : end + 4], "little")
-            size += 8 if text[end + 4 : end + 8] == BINARY_CHUNK else -size
+            size = size + 8 if text[end + 4 : end + 8] == BINARY_CHUNK else 0
             self._binary = text[end + 8 : end + size]
             if len(text) - end - size > 3:
                 self.told.append(f"{len(text) - end - size} bytes behind its buffer not read")

@@ -312,7 +312,7 @@ def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[i
     if numbers == [None]:
         chosen, guess = [len(LEVELS) - 1], "one alone is taken for the whole"
     if guess:
-        report_loss("%s: its level is a guess, %s; --levels says which it is", carriers[0].path, guess)
+        report_loss("%s: its level is a guess; --levels says which it is", carriers[0].path)
         return chosen, guess
     paths = ", ".join(str(carrier.path) for carrier in carriers)
     raise InputError(f"{paths}: of which levels? Say them, as --levels {' '.join(LEVELS[: len(carriers)])}")
