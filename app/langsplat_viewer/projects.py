@@ -153,7 +153,7 @@ def _merged(before: Session, own: Session, other: Session, count: int) -> tuple[
         if own.query(query["phrase"]) is None:
             query.pop("slot", None)  # its colour is taken by another
     try:
-        return _checked(_converted(merged, Session, count)), not clashes
+        return checked(_converted(merged, Session, count)), not clashes
     except NONSENSE:  # more of something than a session holds
         return own, False
 
@@ -335,6 +335,7 @@ def write_project(path: Path, project: Project, apart: Path, before: Project | N
     before: what it held when it was last read or written here. What another window has made since then is
     taken over. Of what both changed `project` counts, and the other's file is kept as `apart`.
     """
+    project = msgspec.structs.replace(project, session=checked(project.session))
     folder, scene = Path(os.path.abspath(path)).parent, Path(project.scene)
     named = scene.relative_to(folder).as_posix() if scene.is_relative_to(folder) else str(scene)
     with locked(folder):
@@ -374,7 +375,7 @@ def read_project(path: Path) -> Project:
         _check_pose(project.view.pose)
         if project.intrinsics is not None:
             _check_pose(replace(project.view.pose, fov_degrees=project.intrinsics.fov_degrees))
-        project.session = _checked(project.session)
+        project.session = checked(project.session)
         things = top["session"].get("things", {})
         groups = things.get("groups") or things.get("locked")
         found = {NO_GROUPS: groups, NOT_COMPARED: top["session"].get("canonical")}
@@ -385,8 +386,8 @@ def read_project(path: Path) -> Project:
     return _read(path, "project", decode)
 
 
-def _checked(session: Session) -> Session:
-    """Return a session of a file, its names on one line.
+def checked(session: Session) -> Session:
+    """Return a session as a file has it, names and notes on one line.
 
     ValueError, or InputError, where something is wrong in it that its types do not say.
     """

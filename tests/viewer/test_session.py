@@ -342,14 +342,17 @@ def test_two_windows_save_one_project_and_lose_nothing(saved, opened, again):
     assert len(read_project(saved).session.moves) == 2
 
 
-def test_paths_with_dots_lead_to_the_same_scene(viewer, tmp_path, monkeypatch):
+def test_a_project_of_one_window_is_saved_again(viewer, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     (tmp_path / "blobs.ply").touch()
     monkeypatch.chdir(tmp_path / "here")
     act(opening.open_file, viewer, Path("../blobs.ply"))
     path = saving.save_project(viewer, Path(".."))
+    settings.pin_at(viewer, 0.5, 0.5)
+    settings.write_note(viewer, viewer.state.session.notes[0], " as it  is typed ")
     act(saving.save_project, viewer)  # to the same file, which is of the same scene
     assert errors(viewer) == []
+    assert "another window" not in viewer.state.messages[-1].text
     assert json.loads(path.read_text())["scene"] == "blobs.ply"
 
 

@@ -26,7 +26,16 @@ from langsplat_viewer.actions.viewpoint import path_motion
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import say_compiling
-from langsplat_viewer.projects import MADE, PATHS, PROJECTS, Project, plain, write_flight, write_project
+from langsplat_viewer.projects import (
+    MADE,
+    PATHS,
+    PROJECTS,
+    Project,
+    checked,
+    plain,
+    write_flight,
+    write_project,
+)
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.session import Bookmark, Session
 from langsplat_viewer.state import Leaving, flight_of
@@ -236,7 +245,7 @@ def _take_over(viewer: Viewer, written: Session) -> None:
     """Show what another window has made in the same project."""
     session = viewer.state.session
     made = {name: getattr(written, name) for name in MADE}
-    if plain(written) == plain(session):
+    if plain(written) == plain(checked(session)):
         return
     viewer.remember()  # or what is undone next is the other window's work, too
     try:
