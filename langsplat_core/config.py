@@ -335,9 +335,8 @@ class LiftConfig:
     # median, mean: of the CLIP vectors of the masks a Gaussian belongs to, then encoded;
     # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
     mode: Literal["median", "mean", "one-pass", "gradient"] = "median"
-    backend: Literal["auto", "cpu", "cuda"] = (
-        "auto"  # what lifts; auto: cpu, which is faster but for gradient
-    )
+    # what lifts; auto: cpu, which is faster but for gradient
+    backend: Literal["auto", "cpu", "cuda"] = "auto"
     steps: Count = 30_000  # of mode gradient, as are the following
     lr: Rate = 2.5e-3  # learning rate
     start: Literal["one-pass", "zeros-as-published"] = "one-pass"  # what mode gradient starts from
@@ -362,12 +361,7 @@ class TrainConfig:
 PAPER = TrainConfig(
     dataset=DatasetConfig(hold_out="every"),
     radiance=RadianceConfig(
-        coarse_fraction=0.0,
-        few_views=0,
-        rehearsed_views=0,
-        exposure="off",
-        transients="off",
-        near=INRIA.near,
+        coarse_fraction=0.0, few_views=0, rehearsed_views=0, exposure="off", transients="off", near=INRIA.near
     ),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
     codec=AutoencoderConfig(steps=10_000, batch=64, lr=7e-4),

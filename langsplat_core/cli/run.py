@@ -94,11 +94,7 @@ def parsed(program: str, kind: Any, args: Sequence[str], description: str | None
         namespace={"__doc__": getattr(kind, "__doc__", None)},
     )
     found: Any = tyro.cli(
-        line,
-        prog=program,
-        description=description,
-        args=args,
-        config=(tyro.conf.CascadeSubcommandArgs,),
+        line, prog=program, description=description, args=args, config=(tyro.conf.CascadeSubcommandArgs,)
     )
     log.setLevel(found.verbosity.level)
     STRICTNESS.on = found.verbosity.strict

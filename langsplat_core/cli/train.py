@@ -13,14 +13,7 @@ import tyro
 
 from langsplat_core.cli.arguments import OutFile, OutFolder, codec_settings, named
 from langsplat_core.cli.run import one_line
-from langsplat_core.config import (
-    PAPER,
-    TrainConfig,
-    TrainPreset,
-    TrainProfile,
-    check_settings,
-    with_preset,
-)
+from langsplat_core.config import PAPER, TrainConfig, TrainPreset, TrainProfile, check_settings, with_preset
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.io.hostile import read_text
 from langsplat_core.progress import Progress, TerminalProgress, line_progress, silent

@@ -66,10 +66,7 @@ def _transform(profile: bytes, mode: str) -> Any:
 
 
 def coded_as(stored: Image.Image) -> tuple[float, Any] | None:
-    """Return the transfer function and primaries that the file of an image not yet decoded states by number.
-
-    None for sRGB, for a profile, and where it says nothing.
-    """
+    """Return transfer function and primaries that an undecoded file states; None: sRGB, or a profile."""
     info = stored.info
     if stored.format == "PNG" and (found := _cicp(stored)):
         return found

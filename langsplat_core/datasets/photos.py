@@ -389,10 +389,7 @@ class Developed:
 
 
 def develop(photos: Sequence[Photo], config: DatasetConfig, progress: Progress) -> Developed:
-    """Return the views of `photos`, as ``config.max_side`` and ``config.alpha`` say.
-
-    Files that cannot be read are reported once and left out; InputError when none is left.
-    """
+    """Return the views of `photos` by `config`; unreadable ones are reported, InputError without any."""
     if not photos:
         raise InputError("the dataset lists no photographs")
     names = unique_names([photo.label for photo in photos])

@@ -114,10 +114,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _no_room(error: Exception, temporary: Path) -> OSError | None:
-    """Return the system's own error where `error`, raised while writing `temporary`, comes from a full disk.
-
-    Libraries say so in their own words and classes, or give no cause at all: then the system is asked again.
-    """
+    """Return the system's error where writing `temporary` failed by a full disk, whatever `error` says."""
     if isinstance(error, OSError) and error.errno is not None:
         return error if error.errno in NO_ROOM else None
     said = re.search(r"\(os error (\d+)\)", str(error))  # a library in Rust, such as safetensors

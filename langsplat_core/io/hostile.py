@@ -103,10 +103,7 @@ def read_npz(path: Path, free: int = FREE) -> dict[str, Array]:
 
 
 def _parse(file: BinaryIO, size: int, name: str, whole: bytes | None = None) -> Array:
-    """`numpy.load` that believes the header only as far as `size` bytes of `file` go.
-
-    name: for messages; whole: the content, where it is in memory already and need not be copied.
-    """
+    """`numpy.load` of at most `size` bytes of `file`; name: for messages; whole: its content in memory."""
     form = np.lib.format
     try:
         if form.read_magic(file) != (1, 0):  # as NumPy writes all but records of thousands of columns
@@ -300,11 +297,7 @@ class Archive:
 
 @contextmanager
 def opened_archive(path: Path, kind: str, free: int = FREE) -> Iterator[Archive]:
-    """Open the archive in a file; `kind` is for messages ("SOG archive"), `free` as of `read_npz`.
-
-    Raises InputError where the file cannot be opened, and FormatError for whatever zipfile raises inside the
-    block.
-    """
+    """Open an archive; `kind`: for messages, `free`: as of `read_npz`; InputError, inside FormatError."""
     file, size = open_for_reading(path)
     with file:
         try:

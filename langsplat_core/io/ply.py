@@ -310,10 +310,7 @@ def is_name(word: str) -> bool:
 
 
 def write_table(
-    path: Path | str,
-    columns: Mapping[str, Array],
-    faces: Array | None = None,
-    comments: Sequence[str] = (),
+    path: Path | str, columns: Mapping[str, Array], faces: Array | None = None, comments: Sequence[str] = ()
 ) -> None:
     """Write a binary little-endian PLY, atomically.
 

@@ -250,10 +250,7 @@ def check_writable(path: Path | str) -> SceneFormat:
 
 
 def check_keeps(out: Path, *sources: Path) -> None:
-    """Raise InputError where writing `out` would replace one of the scenes `sources`.
-
-    That goes for what lies beside a source, and for the companions of a scene `out`.
-    """
+    """Raise InputError where writing `out`, or a companion of it, would replace a file of `sources`."""
     read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
     companions = _companions(out) if out.suffix.lower() in writable_suffixes() else ()
     if any(path.resolve() in read for path in (out, *companions)):
@@ -330,10 +327,7 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
 
 
 def scene_files(path: Path | str) -> tuple[Path, ...]:
-    """Return the files that `load_scene` reads, whether they are there or not.
-
-    The scene's own are first (of a SOG folder its meta.json, then images), then language field and cameras.
-    """
+    """Return the files that `load_scene` reads, there or not: the scene's, language field, cameras."""
     path = Path(path)
     own: tuple[Path, ...] = (path,)
     if os.path.isdir(path) or path.name == META_NAME:  # which a name too long is not

@@ -43,10 +43,7 @@ def base_colours(gaussians: Gaussians) -> Array:
 
 
 def write_points(path: Path | str, scene: Scene) -> int:
-    """Write the means of the Gaussians that can be drawn, in the world, as a PLY point cloud, atomically.
-
-    Red, green and blue are bytes. Return the number of points. InputError for another suffix.
-    """
+    """Write the drawable means in the world as a PLY cloud, atomically; return how many; InputError."""
     path = check_suffix(path, POINT_SUFFIXES)
     gaussians, valid = scene.gaussians, scene.gaussians.valid()
     write_table(path, _coloured(scene, gaussians.means[valid], base_colours(gaussians)[valid]))
@@ -54,10 +51,7 @@ def write_points(path: Path | str, scene: Scene) -> int:
 
 
 def write_mesh(path: Path | str, mesh: MeshLike, scene: Scene) -> None:
-    """Write a mesh of a scene, in the world, as .ply or .glb, atomically. InputError for another suffix.
-
-    A .glb is y up, in metres where the scale is known.
-    """
+    """Write a mesh in the world as .ply, or .glb (y up, metres where known), atomically; InputError."""
     path = check_suffix(path, MESH_SUFFIXES)
     if path.suffix.lower() == ".ply":
         write_table(path, _coloured(scene, mesh.vertices, mesh.colour), mesh.triangles)

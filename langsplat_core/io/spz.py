@@ -25,13 +25,7 @@ from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import InputError, Tell, malformed, report_loss, report_losses, unread
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import SMALL_RATIO, Allowance, open_for_reading
-from langsplat_core.io.quantised import (
-    check_steps,
-    mirrored,
-    smallest_three,
-    to_bytes,
-    without_largest,
-)
+from langsplat_core.io.quantised import check_steps, mirrored, smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
 MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
@@ -207,10 +201,7 @@ def read_spz_scene(path: Path | str) -> Scene:
 
 
 def decode_spz(data: bytes, path: Path, room: Allowance, tell: Tell) -> Scene:
-    """Return the scene of an .spz file in memory, along the axes of the PLY.
-
-    path: for messages; room: of the file that it is a part of; tell: is told of losses. Raises FormatError.
-    """
+    """Return the scene of an .spz in memory, in the PLY's axes; room: of the file around it; FormatError."""
     return _scene(_read_packed(io.BytesIO(data), len(data), path, room, tell), tell)
 
 
@@ -321,9 +312,6 @@ def _rotation_codes(quats_wxyz: Array) -> Array:
 
 
 def _signs_to_rdf(axes: int) -> Array:
-    """(3,) 1 or -1: what turns coordinates of a file into right, down, front, those of the PLY.
-
-    `axes` - 1 has a bit each for right, up, front.
-    """
+    """(3,) 1 or -1 from `axes` (less 1: bits of right, up, front) to right, down, front of the PLY."""
     right, up, front = (axes - 1 >> bit & 1 for bit in range(3))
     return np.array([1 if right else -1, -1 if up else 1, 1 if front else -1])

@@ -220,10 +220,7 @@ def _described_views(
 
 
 def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[str, list[float]]]:
-    """Return Gaussians trained within the budget that rehearsals support, and what these found.
-
-    That is the held-out PSNRs (dB) for each budget. One process trains; the others read what it keeps.
-    """
+    """Return Gaussians of the supported budget, and held-out PSNRs (dB) by budget; one process trains."""
     config = run.config.radiance
     budgets = budgets_for(capture, config, len(train))
     found = run.processes.once(lambda: _rehearsals(run, capture, train, budgets))

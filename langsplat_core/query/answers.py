@@ -173,10 +173,7 @@ def place_of(points: Array) -> tuple[Array, Array]:
 def feature_sums(
     field: LanguageField, level: int, of: Array, weights: Array, count: int, read: Callable[[Array], Array]
 ) -> Array:
-    """Return (count, V) weighted sums, over sets of Gaussians, of what `read` makes of their features.
-
-    read: (M, d) latents -> (M, V). of: (N,) set of each Gaussian, -1 for none; weights: (N,).
-    """
+    """Return (count, V) sums, over sets `of` (N,), -1: none, of `read` features (M, V), by `weights` (N,)."""
     rows = np.flatnonzero(field.known[level] & (of >= 0) & (weights > 0))
     latents, kinds = field.codec.unique(field.latents[level, rows])
     shares = csr_matrix((weights[rows], (of[rows], kinds)), shape=(count, len(latents))).tocsc()

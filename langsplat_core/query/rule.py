@@ -56,11 +56,7 @@ class Rule:
 
 
 RULE = Rule(
-    advantage={
-        "thing": (0.0, 0.25, 0.75),
-        "part": (0.0, 0.0, 0.5),
-        "part of a thing": (0.0, 0.1, 0.0),
-    },
+    advantage={"thing": (0.0, 0.25, 0.75), "part": (0.0, 0.0, 0.5), "part of a thing": (0.0, 0.1, 0.0)},
     found={
         "thing": (1.35, 2.6),
         "part": (2.55, 1.3),

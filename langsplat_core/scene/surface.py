@@ -230,10 +230,7 @@ def merge_patches(
 def build_tree(
     surface: Surface, codec: Codec, latents: Array, known: Array, things: Array | None = None
 ) -> Tree:
-    """Return the tree of (3, N, d) latents, `known` (3, N) bool, without votes.
-
-    things: (3, N) int32 number, from 0, of what masks say is one at each level, NO_NODE for none.
-    """
+    """Return the voteless tree of (3, N, d) latents; things: (3, N) int32 by masks, or NO_NODE."""
     above: Array | None = None  # (M,) node of the level above
     of: list[Array] = []
     for level in range(len(LEVELS) - 1, -1, -1):

@@ -198,10 +198,7 @@ def grid_points(per_side: int, size: tuple[int, int]) -> Array:
 
 
 def crop_boxes(shape: tuple[int, int], layers: int) -> Array:
-    """(C, 4) int64 left, top, right, bottom, px, of the whole image and its crops; the last two exclusive.
-
-    shape: (height, width); layer k cuts 2^k x 2^k crops that overlap. The whole image comes first.
-    """
+    """(C, 4) int64 left, top, right, bottom, px, exclusive: the image, then 2^k x 2^k crops a layer."""
     height, width = shape
     boxes = [(0, 0, width, height)]
     for layer in range(1, layers + 1):

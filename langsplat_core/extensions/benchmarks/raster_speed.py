@@ -181,9 +181,7 @@ class RasterReport:
 
 
 def run_plan(
-    plan: BenchRaster,
-    progress: Progress = silent,
-    keep: Callable[[RasterReport], None] = lambda _: None,
+    plan: BenchRaster, progress: Progress = silent, keep: Callable[[RasterReport], None] = lambda _: None
 ) -> RasterReport:
     """Measure, for minutes; `keep` is given what there is after each scene and size."""
     machine = describe_machine()

@@ -83,10 +83,7 @@ class QueryScore:
 
 
 def score_scene(
-    labelled: LabelledScene,
-    source: Source,
-    profile: Profile,
-    progress: Progress = silent,
+    labelled: LabelledScene, source: Source, profile: Profile, progress: Progress = silent
 ) -> tuple[list[QueryScore], list[str]]:
     """Return the scores of every query of a scene, and the labels that cannot be asked, with the reason.
 

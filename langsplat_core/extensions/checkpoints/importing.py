@@ -174,10 +174,7 @@ def _of_clusters(carrier: Carrier | None, clusters: Clusters) -> ForeignScene:
 
 
 def _of_levels(
-    plain: Carrier | None,
-    featured: list[Carrier],
-    asked: Sequence[str],
-    autoencoder: Autoencoder | None,
+    plain: Carrier | None, featured: list[Carrier], asked: Sequence[str], autoencoder: Autoencoder | None
 ) -> ForeignScene:
     method = featured[0].method
     if len(featured) > len(LEVELS):

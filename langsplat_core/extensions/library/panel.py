@@ -10,14 +10,7 @@ import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_core.extensions.library.index import (
-    THUMBNAIL,
-    Answered,
-    Hit,
-    Library,
-    find,
-    update_library,
-)
+from langsplat_core.extensions.library.index import THUMBNAIL, Answered, Hit, Library, find, update_library
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import LoadEncoder
 from langsplat_core.query.rule import Verdict

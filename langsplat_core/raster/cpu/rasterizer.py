@@ -290,12 +290,7 @@ class CpuView(LiftingView):
     """M drawn of N Gaussians, in depth order, with their tiles."""
 
     def __init__(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RasterSettings,
-        workers: Workers,
-        memory: Memory,
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, workers: Workers, memory: Memory
     ) -> None:
         n = self.count = len(gaussians)
         self.camera, self.workers, self._empty = camera, workers, memory.empty

@@ -64,9 +64,8 @@ class Tiles(NamedTuple):
     firsts: Array  # (M + 1,) int64: Gaussian r has intersections slots[firsts[r] : firsts[r + 1]]
     slots: Array  # (I,) int32
     columns: int  # tiles per row of tiles
-    stride: (
-        int  # from a tile to the one that is blended next: threads take pieces, and busy tiles lie together
-    )
+    # from a tile to the one that is blended next: threads take pieces, and busy tiles lie together
+    stride: int
     width: int  # of the image, px
     height: int
     cutoffs: Cutoffs
@@ -175,13 +174,7 @@ def grown(array: Array, used: int) -> Array:
 
 @kernel
 def _touch(
-    first: int,
-    last: int,
-    order: Array,
-    footprints: Array,
-    size: Size,
-    geometry: Array,
-    firsts: Array,
+    first: int, last: int, order: Array, footprints: Array, size: Size, geometry: Array, firsts: Array
 ) -> tuple[Touched, int, Array]:
     """Find the tiles that ranks [first, last) touch, in an image of `size` (width, height).
 

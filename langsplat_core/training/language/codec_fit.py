@@ -269,10 +269,7 @@ STEP = 8  # one in so many centres is added, or given up, at a time
 
 
 def nearest_centres(vectors: Array, centres: Array) -> tuple[Array, Array]:
-    """Return the (M,) int64 nearest centre of each vector, and its (M,) float32 cosine.
-
-    vectors: (M, D), centres: (K, D) float32 unit vectors.
-    """
+    """Return the (M,) int64 nearest of (K, D) unit centres, and (M,) float32 cosines."""
     nearest, cosines, _ = _assigned(vectors, centres)
     return nearest, cosines
 

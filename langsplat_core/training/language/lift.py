@@ -338,10 +338,7 @@ def lift_latents(
     settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
-    """Return (3, N, d) latents ``W^T H / W^T 1`` and (3, N) confidence.
-
-    H holds the encoded vector of each pixel's mask; pixels without a mask count in neither sum.
-    """
+    """Return (3, N, d) latents ``W^T H / W^T 1`` of masks' pixels alone, and (3, N) confidence."""
     count, d = len(gaussians), codec.latent_dim
     total = np.zeros((count, len(LEVELS), d + 1))
     for done, (camera, features) in enumerate(views):

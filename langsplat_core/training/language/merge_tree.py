@@ -160,10 +160,7 @@ def _compare(
 
 
 def link_concavity(surface: Surface, eyes: Array) -> Array:
-    """Return how far the normals at the ends of each link lean towards each other, (E,) in [0, 1].
-
-    0 where the surface is flat or bends away. eyes: (V, 3) of the cameras, which tell outside from inside.
-    """
+    """Return (E,) in [0, 1], how far normals at ends lean together; eyes: (V, 3), which tell the outside."""
     normals = _normals(surface)
     away = surface.positions - eyes[cKDTree(eyes).query(surface.positions)[1]]
     normals[(normals * away).sum(1) > 0] *= -1

@@ -318,10 +318,7 @@ class Transients:
     def observe(
         self, index: int, cameras: Sequence[Camera], rendered: Array, photographed: Array, depths: Array
     ) -> None:
-        """Judge the patches of view `index` anew.
-
-        By its (GRID, GRID, 3) mean colours, NaN where masked, and its rendered (GRID, GRID) depths.
-        """
+        """Judge a view's patches by (GRID, GRID, 3) colours, NaN if masked, and (GRID, GRID) depths."""
         found, before = colour_difference(rendered, photographed), self.differences[index]
         self.differences[index] = np.where(np.isnan(before), found, (before + found) / 2)
         self.depths[index] = depths

@@ -206,11 +206,7 @@ def accumulate(state: TrainingState, means_px_grad: Tensor, visible: Tensor, siz
 
 
 def densify(state: TrainingState, config: RadianceConfig, extent: float, prune_large: bool) -> None:
-    """Clone small and split large Gaussians with large gradients, and remove faint ones.
-
-    `extent` is the cameras' extent in world units. When the cap of `config.max_gaussians` is near, the
-    largest gradients go first.
-    """
+    """Clone small and split large Gaussians of large gradients, the largest first; remove faint ones."""
     values = {name: value.detach() for name, value in state.values.items()}
     opacity_logits, largest_scale = values["opacity_logits"], values["log_scales"].amax(1).exp()
     too_large = (largest_scale > LARGE_SCALE * extent) & prune_large

@@ -138,10 +138,7 @@ def sweep(
 def score_planes(
     first: int, last: int, grey: Array, other: Array, turn: Array, shift: Array, planes: Array, best: Array
 ) -> None:
-    """Correlate windows of `grey` with those of `other` at planes [first, last).
-
-    `best` (BEST, P, H, W) has the highest scores of all neighbours so far, in descending order.
-    """
+    """Correlate windows at planes [first, last); `best`: (BEST, P, H, W) scores, descending."""
     height, width = grey.shape
     warped = np.empty((height, width), np.float32)
     moments = np.empty((5, height, width), np.float32)  # sums of x, y, x^2, y^2, x y along rows of windows
