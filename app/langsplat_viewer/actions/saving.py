@@ -234,7 +234,7 @@ def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
         return None
     state.project, state.project_read = path, written[0]
     if apart.exists():
-        viewer.say_error(f"{path.name} had other content than was read or written here: kept as {apart.name}")
+        viewer.say_error(f"{path.name} held what this window has not: kept as {apart.name}")
     _take_over(viewer, written[0].session)
     state.saved = state.session
     state.preferences = state.preferences.with_recent(path)
