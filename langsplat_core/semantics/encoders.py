@@ -104,8 +104,8 @@ def _kept_folder() -> Path:
 def keep_calibration(encoder: "PhraseEncoder", calibration: Calibration) -> Path:
     """Keep a calibration for scenes of this encoder that have none, and return its file."""
     canonical = encoder.encode_texts(list(CANONICAL_PHRASES))
-    digest = hashlib.sha256(canonical.round(3).tobytes()).hexdigest()[:12]
-    path = _kept_folder() / f"{digest}.json"
+    digest = hashlib.sha256(canonical.tobytes()).hexdigest()[:12]
+    path, _ = _kept(canonical) or (_kept_folder() / f"{digest}.json", None)  # devices round differently
     content = {"encoder": encoder.id, "canonical": canonical.astype(float).round(6).tolist()}
     write_json(path, content | {"calibration": asdict(calibration)})
     return path
@@ -116,11 +116,16 @@ def kept_calibration(encoder: str, canonical: Array) -> Calibration | None:
 
     The demo encoder stays a guess in scenes that are no drawn rooms.
     """
-    for path in sorted(_kept_folder().glob("*.json")) if encoder != DEMO else ():
+    found = None if encoder == DEMO else _kept(canonical)
+    return None if found is None else found[1].calibration
+
+
+def _kept(canonical: Array) -> tuple[Path, _Kept] | None:
+    for path in sorted(_kept_folder().glob("*.json")):
         try:
             kept = decode_json(path.read_bytes(), _Kept, path)
             if same_vectors(np.array(kept.canonical), canonical):
-                return kept.calibration
+                return path, kept
         except (FormatError, OSError, ValueError) as error:
             log.warning("%s; not used: delete it, or run `langsplat doctor` with --calibrate", error)
     return None

@@ -272,6 +272,10 @@ def test_own_calibration_is_used_and_named_as_from_drawn_rooms(tmp_path, monkeyp
     encoder.id = "lab/clip"
     path = keep_calibration(encoder, CALIBRATED)
     assert path.is_relative_to(tmp_path)
+    exact, later = encoder.encode_texts, Calibration(*[PlattScaling(0.0, 9.0, 0.0)] * 3)
+    monkeypatch.setattr(encoder, "encode_texts", lambda texts: exact(texts) * np.float32(0.999))  # a GPU's
+    assert keep_calibration(encoder, later) == path  # in place of the first
+    assert QueryEngine(scene_of("lab/clip")).calibration == later
     for encoder, calibrated in (("elsewhere/clip", True), (DEMO, False)):  # by its vectors, not by its name
         engine = QueryEngine(scene_of(encoder))
         assert (engine.run("mug").probability is not None) == calibrated
