@@ -358,7 +358,7 @@ def mapped(case: Case) -> Found:
     grid = yaml.safe_load((out / "map.yaml").read_text())
     lines = [line.split() for line in (out / "collider.obj").read_text().splitlines()]
     (goal,) = json.loads((out / "goals.json").read_text())
-    flat = np.array([[*grid["origin"][:2], 0], [goal["x"], goal["y"], 0]])
+    flat = np.array([[*grid["origin"][:2], 0]])
     corners = np.array([line[1:] for line in lines if line[0] == "v"], float)
     back = np.linalg.inv(to_map[:3, :3]).T
     world = [(places - to_map[:3, 3]) @ back for places in (middles, corners, flat)]
@@ -368,7 +368,10 @@ def mapped(case: Case) -> Found:
         "words": Same(sorted(set(words.tolist()))),
         "voxels": Surface(world[0], by=cell),
         "collider": Surface(world[1], by=cell),
-        **({} if case.turned else {"grid, goal": Places(world[2], by=2 * cell / room().bounds()[1])}),
+        "goal": Near(
+            goal["distance"], cell
+        ),  # of equally near places, which is seen from follows from single cells
+        **({} if case.turned else {"grid": Places(world[2], by=2 * cell / room().bounds()[1])}),
     }
 
 

@@ -197,7 +197,7 @@ def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None =
 
 
 def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -> Goal | None:
-    """Return the pose of `where` (X, Y) bool nearest to a thing, facing it, with nothing between.
+    """Return the pose of `where` (X, Y) bool nearest to a thing, facing its middle, with nothing between.
 
     None for none.
 
@@ -217,12 +217,15 @@ def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -
     inside = ((thing >= 0) & (thing < own.shape)).all(1)
     own[tuple(thing[inside].T)] = True
     blocked = plan.occupied & ~ndimage.binary_dilation(own, iterations=2)  # its own outline is no obstacle
-    for best in np.argsort(nearest, kind="stable")[:MOST_LOOKS]:
+    middle = np.median(points, axis=0)
+    # Of cells as near to its outline that before its middle: which is first in the map says nothing.
+    aside = ((centres - middle) ** 2).sum(1)
+    for best in np.lexsort((aside, np.round(nearest / plan.resolution)))[:MOST_LOOKS]:
         if nearest[best] >= least and not _between(plan, blocked, centres[best], spots[gaps[best].argmin()]):
             break
     else:
         return None
-    ahead = np.median(points, axis=0) - centres[best]
+    ahead = middle - centres[best]
     x, y = centres[best]
     return Goal(float(x), float(y), float(np.arctan2(ahead[1], ahead[0])), float(nearest[best]))
 
