@@ -291,9 +291,8 @@ class PlyFile:
         for column, code in zip(rows.T, element.numbers.values(), strict=True):
             if code[0] != "f":
                 least, most = np.iinfo(code).min, np.iinfo(code).max
-                self._beyond += int(
-                    (~((column >= least) & (column <= most) & (column == np.rint(column)))).sum()
-                )
+                fits = (column >= least) & (column <= most) & (column == np.rint(column))
+                self._beyond += np.count_nonzero(~fits)
         # float64 holds every type of a PLY exactly
         return np.ascontiguousarray(rows).view([(name, "f8") for name in element.numbers])[:, 0]
 
