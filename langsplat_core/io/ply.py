@@ -292,7 +292,7 @@ class PlyFile:
             if code[0] != "f":
                 least, most = np.iinfo(code).min, np.iinfo(code).max
                 fits = (column >= least) & (column <= most) & (column == np.rint(column))
-                self._beyond += np.count_nonzero(~fits)
+                self._beyond += int(np.count_nonzero(~fits))
         # float64 holds every type of a PLY exactly
         return np.ascontiguousarray(rows).view([(name, "f8") for name in element.numbers])[:, 0]
 
