@@ -201,7 +201,14 @@ class TruthEncoder(ABC):
 
     @property
     @abstractmethod
-    def digest(self) -> str: ...  # of everything that its vectors depend on
+    def stated(self) -> tuple[str, Sequence[Path]]: ...  # settings and files that its vectors depend on
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of everything that its vectors depend on."""
+        settings, paths = self.stated
+        contents = " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
+        return hashlib.sha256(f"{VERSION} {settings} {contents}".encode()).hexdigest()[:12]
 
     @property
     @abstractmethod
@@ -321,10 +328,8 @@ class ClipGeometry(TruthEncoder):
         return f"{PREFIX}{self.own:g},{self.alike:g}"
 
     @property
-    def digest(self) -> str:
-        texts = self.vectors.read_bytes() if self.vectors else b""
-        stated = f"{VERSION} {self.id} {self.prompts} {hashlib.sha256(texts).hexdigest()}"
-        return hashlib.sha256(stated.encode()).hexdigest()[:12]
+    def stated(self) -> tuple[str, Sequence[Path]]:
+        return f"{self.id} {self.prompts}", [self.vectors] if self.vectors else []
 
     @property
     def names(self) -> Mapping[str, int]:
@@ -475,11 +480,9 @@ class RealSpace(TruthEncoder):
     def id(self) -> str:
         return f"{REAL}{self.path}" + (f",{self.rule}" if self.rule else "")
 
-    @cached_property
-    def digest(self) -> str:
-        files = [path.read_bytes() for path in [*self._decoders, self._texts]]
-        stated = f"{VERSION} {self.rule} " + " ".join(hashlib.sha256(file).hexdigest() for file in files)
-        return hashlib.sha256(stated.encode()).hexdigest()[:12]
+    @property
+    def stated(self) -> tuple[str, Sequence[Path]]:
+        return self.rule, [*self._decoders, self._texts]
 
     @property
     def _decoders(self) -> list[Path]:

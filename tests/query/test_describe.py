@@ -111,20 +111,6 @@ def test_pixel_words_follow_the_rows_of_w(codebook, backend):
     assert look_at_pixel(load_lifting_rasterizer(backend), asked, camera, (0, 0)) is None
 
 
-@pytest.mark.parametrize("codebook", [True, False])
-def test_inventory_lists_every_thing_at_its_place(codebook):
-    entries = {entry.phrase: entry for entry in scene_inventory(describer(named_scene(codebook)))}
-    assert set(entries) == set(WORDS)
-    for centre, word in zip(CENTRES, WORDS, strict=True):
-        entry = entries[word]
-        assert (entry.level, entry.share) == (2, pytest.approx(1 / 3, abs=0.02))
-        assert entry.probability > 0.95
-        (spot,) = entry.spots
-        np.testing.assert_allclose(spot.centre, centre, atol=0.1)
-        assert ((spot.box[0] < spot.centre) & (spot.centre < spot.box[1])).all()
-        assert len(spot.rows) > 0.95 * PER_BLOB
-
-
 @pytest.mark.parametrize(
     ("nodes", "step"), [(3000, 1), pytest.param(2_000_000, 5000, marks=pytest.mark.long)]
 )
