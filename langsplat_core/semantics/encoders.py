@@ -25,7 +25,7 @@ from msgspec import Meta, Struct
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, FormatError, InputError, UnknownWordError, optional_imports
 from langsplat_core.io.files import write_json
-from langsplat_core.io.hostile import decode_json
+from langsplat_core.io.hostile import decode_json, read_text
 from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField
 from langsplat_core.semantics.clip_plain import TEMPERATURE, TOKENIZER, check_whole, plain_text_tower
 from langsplat_core.semantics.weights import (
@@ -149,7 +149,7 @@ class PhraseEncoder:
         self.temperature = tower.temperature
         taught, reading = weights.folder / "vocabulary.txt", weights.folder / "reading.json"
         # The only words the encoder was taught; None: open vocabulary.
-        self.words = frozenset(taught.read_text(encoding="utf-8").split()) if taught.is_file() else None
+        self.words = frozenset(read_text(taught).split()) if taught.is_file() else None
         try:
             beside = decode_json(reading.read_bytes(), _Beside, reading) if reading.is_file() else _Beside()
         except FormatError as error:
@@ -280,12 +280,12 @@ def _pixel_statistics(weights: Weights, usual: Array) -> tuple[Array, Array]:
         if not weights.converted and path.is_file():
             settings = json.loads(path.read_text(encoding="utf-8"))
         stated = settings.get("image_mean") or usual[0], settings.get("image_std") or usual[1]
-        found = np.array(stated, np.float32)
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise EncoderError(f"{weights.id}: {name} cannot be read ({error})") from error
-    if found.shape != (2, 3) or not (found[1] > 0).all():
+        found = np.array(stated, np.float64)
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise EncoderError(f"{weights.id}: {name} cannot be read ({str(error)[:200]})") from error
+    if found.shape != (2, 3) or not ((found[1] > 1e-6) & (np.abs(found) < 1e6)).all():
         raise EncoderError(f"{weights.id}: {name} states no mean and deviation of three colours")
-    return found[0], found[1]
+    return found[0].astype(np.float32), found[1].astype(np.float32)
 
 
 UNUSUAL = "\u3042"  # where the token for what is not known is lacking, this cannot be read

@@ -169,6 +169,7 @@ BROKEN_READINGS = (
 )
 
 BROKEN_NORMALISATIONS = ("{", '{"image_mean": [0.5]}', '{"image_std": [0, 0, 0]}')
+BROKEN_NORMALISATIONS += tuple(f'{{"image_std": [1, 1, {number}]}}' for number in ("1e308", f"1{400 * '0'}"))
 
 
 @pytest.mark.parametrize(
