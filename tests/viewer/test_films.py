@@ -392,12 +392,6 @@ def test_a_film_can_be_stopped(opened, tmp_path, frames):
 # Images and views to files.
 
 
-def test_pictures_are_saved_under_new_names(opened, tmp_path):
-    first, second = saving.save_picture(opened, tmp_path), saving.save_picture(opened, tmp_path)
-    assert [first.name, second.name] == ["blobs-001.png", "blobs-002.png"]
-    assert np.asarray(Image.open(second)).tolist() == np.full((6, 8, 3), 77).tolist()
-
-
 def test_a_saved_view_can_be_read_again(opened, tmp_path):
     opened.state.size = (321, 123)
     camera = read_cameras(saving.save_view(opened, tmp_path))[0]
