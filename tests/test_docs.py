@@ -66,9 +66,7 @@ def named(page: Path) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
-def test_commands_parse(
-    page: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commands_parse(page, capsys, tmp_path, monkeypatch):
     targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
     monkeypatch.chdir(tmp_path)
     for settings in TOML.findall(page.read_text()):

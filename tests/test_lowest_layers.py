@@ -184,9 +184,7 @@ def test_pieces_cover_a_range_once() -> None:
         assert (out == 1).all()
 
 
-def test_kernels_run_on_a_full_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_kernels_run_on_a_full_disk(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
 
     def doubled(value: float) -> float:
@@ -302,9 +300,7 @@ def test_broken_part_is_refused_when_it_is_asked_for(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("hidden", OWN)
-def test_help_shows_the_rest_with_an_extension_hidden(
-    hidden: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_shows_the_rest_with_an_extension_hidden(hidden, monkeypatch, capsys):
     every = set(command_names())
     own = set(registry.extensions()[hidden].commands)
     monkeypatch.setenv(registry.HIDDEN, hidden)
@@ -398,9 +394,7 @@ def test_every_number_of_every_command_has_a_range(line: str) -> None:
         ("--codec.steps 7", "unrecognized options: --codec.steps"),  # a codebook has none
     ],
 )
-def test_the_command_line_names_the_option_as_typed(
-    line: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_line_names_the_option_as_typed(line, named, tmp_path, capsys):
     error = refusal(capsys, "train", tmp_path, "--out", tmp_path / "s.ply", *line.split())
     assert error.lower().startswith(f"langsplat: {named}")
     assert list(tmp_path.iterdir()) == []  # nothing was begun
@@ -478,9 +472,7 @@ def test_options_beside_a_file_win(tmp_path: Path) -> None:
         (None, "no such file"),
     ],
 )
-def test_a_file_that_cannot_be_used_is_named_with_its_key(
-    text: str | None, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_cannot_be_used_is_named_with_its_key(text, said, tmp_path, capsys):
     file = tmp_path / "train.toml"
     if text is not None:
         file.write_text(text)

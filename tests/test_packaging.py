@@ -140,9 +140,7 @@ def test_opengl_section_works_on_any_driver(sections: ModuleType, gl_session: ob
 
 @pytest.mark.long
 @pytest.mark.skipif("__import__('torch').cuda.is_available()", reason="needs a machine without CUDA")
-def test_gpu_run_without_a_gpu_writes_nothing(
-    tmp_path: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_gpu_run_without_a_gpu_writes_nothing(tmp_path, runner, monkeypatch, capsys):
     out = tmp_path / "out"
     monkeypatch.setattr(sys, "argv", ["run.py", "--only", "environment,gradients", "--out", str(out)])
     monkeypatch.setenv("PYTHONPATH", "")

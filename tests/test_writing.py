@@ -81,9 +81,7 @@ def test_unusable_names_are_refused(check: Check, name: str, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("check", CHECKS)
-def test_names_beyond_the_locale_are_refused(
-    check: Check, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_names_beyond_the_locale_are_refused(check, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsencode", lambda path: str(path).encode("latin5"))
     assert "language settings" in refusal(check, tmp_path / "日本語.ply")
     check(tmp_path / "é.ply")

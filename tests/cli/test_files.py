@@ -17,7 +17,6 @@ from langsplat_core.io.sidecar import write_language
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene, TaughtWord
 from langsplat_core.scene.language import tree_of_wholes
-from tests.support.backends import Measure
 from tests.support.file_samples import assert_same_extras, random_field, sog_files, write_folder
 from tests.support.processes import refusal, run
 from tests.support.scenes import random_camera, random_extras, random_gaussians
@@ -110,9 +109,7 @@ def psnr(scene: Gaussians, truth: Gaussians, cameras: list[Camera]) -> float:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("suffix", "least", "bytes_each"), [(".spz", 48, 29), (".splat", 55, 32)])
-def test_small_formats_keep_the_demo_scenes_image(
-    suffix: str, least: float, bytes_each: int, tmp_path: Path, measured: Measure
-) -> None:
+def test_small_formats_keep_the_demo_scenes_image(suffix, least, bytes_each, tmp_path, measured):
     """A base colour in .spz is off by at most 0.28 * 0.5 / 255 / 0.15 = 3.7e-3, evenly, thus by 2.1e-3 in the
     mean square: 53 dB for one Gaussian per pixel, and blending averages; scales (3 %) act on edges alone. A
     .splat has no view dependence and clips base colours; the rest is rounding."""

@@ -268,9 +268,7 @@ WRITING = [
 
 @pytest.mark.parametrize("line", WRITING)
 @pytest.mark.parametrize("place", ["/proc/x", "{here}/file/x", "{here}/" + "n" * 300])
-def test_commands_try_the_place_to_write_first(
-    line: str, place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commands_try_the_place_to_write_first(line, place, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     (tmp_path / "s.ply").symlink_to(DEMO)

@@ -147,9 +147,7 @@ def test_the_model_with_most_photographs_is_taken(tmp_path: Path, caplog: pytest
         load_capture(tmp_path, WHOLE, tmp_path / "work")
 
 
-def test_missing_photographs_and_cameras_are_warned_of(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_missing_photographs_and_cameras_are_warned_of(tmp_path, caplog):
     write_dataset(tmp_path)
     photos = tmp_path / "images"
     (photos / "view_1.png").unlink()
@@ -280,9 +278,7 @@ def test_a_frame_may_have_its_own_intrinsics(tmp_path: Path) -> None:
     assert (second.fx, second.fy, second.cx) == (111, 112, 70)
 
 
-def test_paths_are_read_leniently_and_missing_frames_reported_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_paths_are_read_leniently_and_missing_frames_reported_once(tmp_path, caplog):
     data = write_transforms(tmp_path, GLOBAL)
     data["frames"][0]["file_path"] = "images/view_0"  # suffixes may be left away
     data["frames"][1]["file_path"] = "images\\view_1.png"
@@ -445,15 +441,7 @@ def test_odd_names_in_a_model(tmp_path: Path, name: str, found: list[str]) -> No
     ],
 )
 @pytest.mark.parametrize("reader", ["COLMAP", "nerfstudio"])
-def test_text_of_every_maker_is_read(
-    tmp_path: Path,
-    reader: str,
-    encoding: str,
-    name: str,
-    on_disk: str,
-    said: int,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_text_of_every_maker_is_read(tmp_path, reader, encoding, name, on_disk, said, caplog):
     if reader == "COLMAP":
         files, photos = sorted(write_colmap(tmp_path, "txt").iterdir()), tmp_path / "images"
     else:
@@ -520,9 +508,7 @@ def summary(capture: Capture) -> list[Any]:
 
 @pytest.mark.parametrize("seed", range(60))
 @pytest.mark.parametrize("reader", ["cameras.txt", "images.txt", "points3D.txt", "transforms.json"])
-def test_a_changed_dataset_gives_the_same_or_a_line(
-    reader: str, seed: int, whole: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_changed_dataset_gives_the_same_or_a_line(reader, seed, whole, caplog):
     (file,) = whole.glob(f"**/{reader}")
     folder = whole / ("nerfstudio" if reader == "transforms.json" else "colmap")
     want = summary(load_photographs(folder, CONFIG, whole))

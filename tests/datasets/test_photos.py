@@ -9,7 +9,6 @@ import zlib
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal
 
 import av
 import numpy as np
@@ -118,9 +117,7 @@ def test_photographs_are_counted_where_they_lie(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["large.jpg", "large.png"])
-def test_photographs_larger_than_other_images_may_be_are_halved(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photographs_larger_than_other_images_may_be_are_halved(name, tmp_path, monkeypatch):
     shade = np.linspace(0, 255, 160).astype(np.uint8)
     Image.fromarray(np.broadcast_to(shade, (120, 160)).copy()).save(tmp_path / name)
     monkeypatch.setattr("langsplat_core.datasets.photos.MOST_PIXELS", 10_000)
@@ -256,12 +253,7 @@ def write_cut_out(folder: Path, inside: bool) -> None:
 
 @pytest.mark.parametrize("alpha", ["auto", "mask", "background"])
 @pytest.mark.parametrize("inside", [True, False])
-def test_transparency_is_a_mask_or_an_empty_background(
-    tmp_path: Path,
-    inside: bool,
-    alpha: Literal["auto", "mask", "background"],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_transparency_is_a_mask_or_an_empty_background(tmp_path, inside, alpha, caplog):
     write_cut_out(tmp_path, inside)
     config = replace(CONFIG, alpha=alpha)
     capture = load_photographs(tmp_path, config, tmp_path / "work")
@@ -346,9 +338,7 @@ def test_masks_that_are_missing_or_stray_are_said(tmp_path: Path, caplog: pytest
     assert stray.startswith("3 masks are of no photograph: 0001.png, view_1.jpg, view_9.png; ")
 
 
-def test_a_photograph_of_which_nothing_counts_is_left_out(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_photograph_of_which_nothing_counts_is_left_out(tmp_path, caplog):
     names = write_photos(tmp_path, LENS, poses(2))
     mask = mask_file(tmp_path / "masks/view_1.png", np.zeros((90, 120), bool))
     photos = [Photo(tmp_path / name, name, LENS, np.eye(4)) for name in names]
@@ -401,9 +391,7 @@ def on_film(path: Path) -> float | None:
 
 
 @pytest.mark.parametrize(("unit", "millimetres"), [(2, 25.4), (3, 10.0), (4, 1.0), (None, 25.4)])
-def test_focal_length_follows_from_pixels_per_inch(
-    unit: int | None, millimetres: float, tmp_path: Path
-) -> None:
+def test_focal_length_follows_from_pixels_per_inch(unit, millimetres, tmp_path):
     """A sensor 22.3 mm wide, of 4 to 3, 4000 pixels; the file was made smaller since."""
     tags: dict[int, float] = {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * millimetres, PLANE_WIDTH: 4000}
     if unit is not None:
@@ -447,9 +435,7 @@ def scene(step: int, blur: float = 0.0) -> Array:
         ((480, 360), False, (1, 1, 1), Fraction(3, 4)),
     ],
 )
-def test_videos_are_read_as_they_are_shown(
-    size: tuple[int, int], deep: bool, tags: tuple[int, int, int], aspect: Fraction, tmp_path: Path
-) -> None:
+def test_videos_are_read_as_they_are_shown(size, deep, tags, aspect, tmp_path):
     coded = (as_hlg(PATCHES) if deep else PATCHES / 255)[np.arange(size[0]) * len(PATCHES) // size[0]]
     image = np.broadcast_to(coded, (size[1], size[0], 3))
     with av.open(str(tmp_path / "a.mp4"), "w") as container:

@@ -132,11 +132,7 @@ def _never(**_: object) -> None:
     raise AssertionError("computed again")
 
 
-def test_repeated_reconstruction_computes_nothing(
-    photos: Path,
-    located: tuple[Capture, Path, list[str], list[str]],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_repeated_reconstruction_computes_nothing(photos, located, monkeypatch):
     in_this_process(monkeypatch)
     for name in ("extract_features", "incremental_mapping"):
         monkeypatch.setattr(pycolmap, name, _never)
@@ -356,9 +352,7 @@ def test_best_model_has_most_well_held_photographs_then_least_error() -> None:
     (True, 700, False), (True, 210, True), (True, 2000, True),
     (False, 210, False), (False, 60, True), (False, 2000, False), (False, 5000, True),
 ])  # fmt: skip
-def test_models_with_implausible_focal_lengths_are_astray(
-    prior: bool, focal: float, lost: bool, tmp_path: Path
-) -> None:
+def test_models_with_implausible_focal_lengths_are_astray(prior, focal, lost, tmp_path):
     model = synthetic(4, 100)
     ((number, camera),) = model.cameras.items()
     before = pycolmap.Camera.create_from_model_id(

@@ -246,10 +246,8 @@ PACKED = compressed_ply(random_gaussians(600, sh_degree=1))
 REST = b"".join(b"property float f_rest_%d\n" % index for index in range(1, 10))
 CHARS = b"".join(b"property char a%d\n" % index for index in range(900))
 MALFORMED = {  # a good file, and what of it is replaced by what
-    "empty": (PLAIN, PLAIN, b""),
     "a point cloud": (PLAIN, PLAIN[PLAIN.index(b"f_dc_0") : PLAIN.index(b"rot_3")], b"red\nproperty float "),
     "ten coefficients": (LONG, OPACITY, b"property float f_rest_0\n" + REST + OPACITY),
-    "a truncated body": (PLAIN, PLAIN, PLAIN[:-1]),
     "10^12 vertices": (PLAIN, b"vertex 2", b"vertex 1000000000000"),
     "10^12 lines": (ASCII, b"vertex 2", b"vertex 1000000000000"),
     "a name that clears the screen": (PLAIN, b"element", b"element \x1b[2J 0\nelement"),

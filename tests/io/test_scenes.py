@@ -235,9 +235,7 @@ def test_loader_refuses_what_is_no_scene(tmp_path):
             load_scene(tmp_path / name)
 
 
-def test_undrawable_gaussians_are_counted_and_refused_by_strict(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_undrawable_gaussians_are_counted_and_refused_by_strict(tmp_path, caplog, capsys):
     gaussians, path = random_gaussians(N), tmp_path / "a.ply"
     write_ply(path, gaussians)
     assert run("--strict", "inspect", path) == 0

@@ -221,9 +221,7 @@ def assert_same(folder: Path, whole: Path) -> None:
 @pytest.mark.skipif(os.name == "nt", reason="no signal 9")
 @pytest.mark.parametrize("kind", ["photographs", "COLMAP"])
 @pytest.mark.parametrize("how", ["killed", "signals"])
-def test_training_stopped_in_every_stage_ends_with_the_same_bytes(
-    how: str, kind: str, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_training_stopped_in_every_stage_ends_with_the_same_bytes(how, kind, tmp_path, request):
     """One run, stopped once in each stage at a random moment and begun again, against one that was not."""
     data, encoder = photographs(tmp_path / "data", kind), tmp_path / "encoder"
     tiny_clip(encoder)
@@ -279,9 +277,7 @@ def test_training_resumes_after_full_disks(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_damaged_work_folders_give_the_same_scene_or_a_remedy(
-    tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_damaged_work_folders_give_the_same_scene_or_a_remedy(tmp_path, request):
     """Files of a finished training, a few of them, with flipped bits or without their end."""
     data, encoder = photographs(tmp_path / "data", "COLMAP"), tmp_path / "encoder"
     tiny_clip(encoder)

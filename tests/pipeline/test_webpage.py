@@ -111,17 +111,13 @@ def compare(measured: Measure, what: str, ours: Array, theirs: Array) -> None:
 
 
 @pytest.mark.parametrize("view", [0, 11, 30])
-def test_page_draws_the_bundled_scene_as_opengl_does(
-    tab: Tab, demo: Scene, gl: moderngl.Context, measured: Measure, view: int
-) -> None:
+def test_page_draws_the_bundled_scene_as_opengl_does(tab, demo, gl, measured, view):
     camera = demo.cameras[view]
     ours = tab.image(camera, demo.bounds()[0])
     compare(measured, "demo, colours", ours, drawn(gl, demo, camera))
 
 
-def test_page_draws_heat_and_latents_as_opengl_does(
-    tab: Tab, demo: Scene, engine: QueryEngine, gl: moderngl.Context, measured: Measure
-) -> None:
+def test_page_draws_heat_and_latents_as_opengl_does(tab, demo, engine, gl, measured):
     camera, origin = demo.cameras[3], demo.bounds()[0]
     assert demo.language is not None
     answer = engine.run("teddy bear")
@@ -167,9 +163,7 @@ def hard(kind: str) -> Gaussians:
         *("one", "flat and needles", "right angles", "far away", "broken rows"),
     ],
 )
-def test_page_draws_hard_scenes_as_opengl_does(
-    browser: Any, gl: moderngl.Context, measured: Measure, tmp_path: Path, kind: str
-) -> None:
+def test_page_draws_hard_scenes_as_opengl_does(browser, gl, measured, tmp_path, kind):
     scene = Scene(hard(kind), antialiased=kind == "degree 1")
     camera = (
         Scene(random_gaussians(600, 4)).framing_camera((320, 240))
@@ -225,9 +219,7 @@ def without_encoder(demo: Scene, **field: Any) -> tuple[Scene, QueryEngine]:
     return scene, QueryEngine(scene, no_encoder)
 
 
-def test_page_without_encoder_answers_phrasebook_and_taught_words(
-    browser: Any, demo: Scene, engine: QueryEngine, tmp_path: Path
-) -> None:
+def test_page_without_encoder_answers_phrasebook_and_taught_words(browser, demo, engine, tmp_path):
     book = dict(zip(PHRASES[:60], engine.text_vectors(PHRASES[:60]), strict=True))
     pointed = engine.run("teddy bear").members
     word = QueryEngine(demo).teach("bruno", pointed)
@@ -279,9 +271,7 @@ def test_page_without_small_encoder_knows_encoded_phrases(browser: Any, demo: Sc
             same(tab.ask(phrase), expected, int(expected.members[visible].sum()))
 
 
-def test_markup_in_names_is_shown_as_text(
-    browser: Any, demo: Scene, engine: QueryEngine, tmp_path: Path
-) -> None:
+def test_markup_in_names_is_shown_as_text(browser, demo, engine, tmp_path):
     name = MARKUP.replace(",", "")[:80]
     word = replace(QueryEngine(demo).teach("bruno", engine.run("teddy bear").members), name=name)
     vector = engine.text_vectors(["laptop"])[0]

@@ -240,9 +240,7 @@ SETTINGS = [INRIA, GSPLAT, replace(INRIA, antialiased=True), replace(INRIA, far=
 @pytest.mark.parametrize("channels", [1, 3, 6, 35])  # as they are, padded, and in two chunks
 @on_cuda
 @pytest.mark.parametrize("orthographic", [False, True])
-def test_images_of_cuda_equal_the_reference(
-    settings: RasterSettings, channels: int, orthographic: bool
-) -> None:
+def test_images_of_cuda_equal_the_reference(settings, channels, orthographic):
     gaussians, camera = random_gaussians(60, channels), random_camera(channels, 41, 30)
     camera = without_perspective(camera) if orthographic else camera
     values = np.random.default_rng(0).random((60, channels))

@@ -424,9 +424,7 @@ def replace(config: dict[str, Any], name: str, value: object) -> None:
         ("blocks_per_stage", [10**9]),
     ],
 )
-def test_a_configuration_of_other_sizes_is_refused(
-    kind: str, name: str, value: object, tmp_path: Path
-) -> None:
+def test_a_configuration_of_other_sizes_is_refused(kind, name, value, tmp_path):
     """Before a model of these sizes is filled with random numbers."""
     make, load = FOLDERS[kind]
     make(tmp_path)

@@ -272,9 +272,7 @@ class Drawn:
         return ious[self._levels].astype(np.float32), np.stack(logits)
 
 
-def test_the_filters_of_segment_anything_but_for_its_boxes(
-    field: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, measured: Measure
-) -> None:
+def test_the_filters_of_segment_anything_but_for_its_boxes(field, monkeypatch, measured):
     """Its boxes end at the last pixel, ours behind it: with ours in their place every mask is the same, bit
     by bit. What LangSplat adds, `mask_nms`, lets all pass here: test_mask_filters.py has it."""
     config = MaskConfig(points_per_side=16, crop_layers=1, min_region=30, **PASSING)

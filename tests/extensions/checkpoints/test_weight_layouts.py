@@ -267,9 +267,7 @@ def compare(case: Case, tmp_path: Path, **sizes: int) -> None:
 
 
 @pytest.mark.parametrize("write", LAYOUTS)
-def test_each_layout_of_clip_gives_the_vectors_of_open_clip(
-    write: Callable[[Path, Tensors], Case], tmp_path: Path
-) -> None:
+def test_each_layout_of_clip_gives_the_vectors_of_open_clip(write, tmp_path):
     letter_tokenizer(tmp_path)
     compare(write(tmp_path, open_clip_tensors()), tmp_path)
 
