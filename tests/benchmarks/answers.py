@@ -82,8 +82,6 @@ class Rooms(InRooms):
 
 @dataclass(frozen=True)
 class RoomReport:
-    """Figures of one room."""
-
     tier: str
     seed: int
     views: int  # trained on
@@ -114,7 +112,6 @@ def variants(command: Rooms, dim: int) -> list[Variant]:
 
 
 def room_report(room: Room, chosen: Sequence[Variant]) -> RoomReport:
-    """Measure the variants in one room."""
     _, held_out = room.capture.split(HOLD_OUT)
     rows = tuple(room.measure(variant) for variant in chosen)
     views = evaluate_views(room.gaussians, room.capture, held_out)
@@ -228,8 +225,6 @@ class Lifting(InRooms):
 
 @dataclass(frozen=True)
 class MethodRow:
-    """One method in one room."""
-
     seed: int
     measured: Measured
 
@@ -341,8 +336,6 @@ class Verdicts(InRooms):
 
 @dataclass(frozen=True)
 class Verdict:
-    """One phrase in one room."""
-
     tier: str
     seed: int
     text: str
@@ -497,7 +490,6 @@ def curve(rows: Sequence[Verdict], asked: str = "thing") -> list[CurvePoint]:
 
 
 def curve_table(rows: Sequence[Verdict], asked: str = "thing") -> str:
-    """`curve` as Markdown."""
     lines = (
         (f"{p.low:g} to {p.high:g}", p.phrases, f"{100 * p.said:.0f}", f"{100 * p.there:.0f}")
         for p in curve(rows, asked)

@@ -311,8 +311,6 @@ class Found(InRooms):
 
 @dataclass(frozen=True)
 class Compared:
-    """One phrase in one scene, by the index and by the engine."""
-
     seed: int
     masks: str
     text: str
@@ -344,7 +342,6 @@ def compare(room: Room, masks: MaskOrigin) -> Iterator[Compared]:
 
 
 def agreement_table(rows: Sequence[Compared]) -> str:
-    """A row for each kind of masks."""
     lines = []
     for masks, own in grouped(rows, "masks").items():
         there = [row for row in own if row.engine != "not here"]
@@ -366,8 +363,6 @@ ANOTHER = 5_000  # added to a room's seed: cameras and points of its second capt
 
 @dataclass(frozen=True)
 class Done:
-    """What was done to one thing."""
-
     kind: str  # as of `changes.Kind`
     word: str
     centre: tuple[float, float, float]  # metres, of its box, where it is or was
@@ -511,8 +506,6 @@ class Changed(InRooms):
 
 @dataclass(frozen=True)
 class Said:
-    """Two captures of a room compared."""
-
     seed: int
     what: str  # "unchanged" or "changed"
     done: int
@@ -524,7 +517,6 @@ class Said:
 
 
 def measure_changes(room: Room, masks: MaskOrigin) -> Iterator[Said]:
-    """The first capture against an unchanged and a changed second one."""
     captures = {"unchanged": SecondCapture(room, None), "changed": SecondCapture(room, alter)}
     variant, rasterizer = Variant("the method", masks), load_lifting_rasterizer("cpu")
     first = room.engine(variant, room.capture.cameras)
@@ -551,7 +543,6 @@ def matched(seed: int, what: str, done: Sequence[Done], said: Sequence[Change], 
 
 
 def change_table(rows: Sequence[Said]) -> str:
-    """A row for each comparison."""
     names = ["room", "second capture", "done", "found", "missed", "false", "error of moves, cm", "seconds"]
     lines = (
         (row.seed, row.what, row.done, len(row.found), ", ".join(row.missed) or "0")

@@ -241,7 +241,6 @@ class Few:
     def _capture(
         self, folder: Path, work: Path, side: int, progress: Progress
     ) -> tuple[Capture, list[int], list[int]]:
-        """The capture and its training and held-out views."""
         config = DatasetConfig(max_side=side, test_every=self.test_every, allow_few_cameras=True)
         capture = load_capture(folder, config, work, progress)
         if self.views:

@@ -228,15 +228,12 @@ class TruthEncoder(ABC):
     def mask_noise(self, generator: np.random.Generator, count: int) -> Array: ...  # (count, D), in one view
 
     def in_room(self, truth: Truth, seed: int) -> "TruthEncoder":
-        """Return the encoder for one room."""
         return self
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
-        """Return no words, since CLIP reads everything."""
         return ()
 
     def near_words(self, word: str) -> tuple[str, ...]:
-        """Return no words: there is no list of those that are known."""
         return ()
 
     def encode_images(self, crops: Array | Sequence[Array]) -> Array:
@@ -244,7 +241,6 @@ class TruthEncoder(ABC):
         return np.tile(unit(np.ones(DIM, np.float32)), (len(crops), 1))
 
     def encode_texts(self, texts: Sequence[str]) -> Array:
-        """(M, D) float32 unit vectors."""
         return np.array([self.text(phrase_key(text)) for text in texts], np.float32).reshape(-1, DIM)
 
     def describe(self, features: ImageFeatures, ids: Array, truth: Truth, view: int) -> ImageFeatures:
@@ -307,8 +303,6 @@ CLUSTERS, KINSHIP = 120, 0.55  # of words without a file: kinds, and the cosine 
 
 @dataclass(frozen=True, eq=False)
 class ClipGeometry(TruthEncoder):
-    """A simulated image-text encoder."""
-
     own: float  # cosine of an image with the words that are true of it
     alike: float = 0.65  # cosine of images of different things
     # (V, 512) or (512, V) .npy of text vectors; names in a .txt beside it that begins alike
@@ -561,7 +555,6 @@ class RealSpace(TruthEncoder):
         return np.sqrt(LOST * (1 - LASTING)) * noise(generator, count, self._axes)
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
-        """Return the words that took no name."""
         return tuple(piece for piece in self.pieces(phrase_key(text)) if piece not in self.names)
 
     @property

@@ -75,8 +75,6 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Things:
-    """The single things in a room."""
-
     words: Mapping[int, str]  # whole id -> its word
     extents: Mapping[int, Body]
 
@@ -391,15 +389,12 @@ class InventoryScore:
 
 @dataclass(frozen=True)
 class RoomWords:
-    """All figures of one room."""
-
     seed: int
     names: tuple[LevelNames, ...]
     inventory: InventoryScore
 
 
 def name_regions(room: Room) -> RoomWords:
-    """Words for every region of one room, and its inventory."""
     describer = Describer(room.engine(METHOD))
     labels, truth = room.labels, room.truth.regions
     names = [_names(describer, level, _regions(labels[level]), truth) for level in (2, 1, 0)]

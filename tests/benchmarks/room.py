@@ -197,14 +197,12 @@ class Room:
 
     @cached_property
     def capture(self) -> Capture:
-        """The photographs with their cameras."""
         photographs = self.photographs
         with self._timed("photographs"):
             return load_capture(photographs, self.settings.dataset, self.folder, self.progress)
 
     @cached_property
     def truth(self) -> Truth:
-        """Regions of the photographs and the phrases that are right for them."""
         return read_truth(self.photographs)
 
     @cached_property
@@ -315,7 +313,6 @@ class Room:
 
     @cached_property
     def held_out(self) -> list[Camera]:
-        """Cameras of the views that nothing was trained on."""
         return [self.capture.cameras[i] for i in self.capture.split(HOLD_OUT)[1]]
 
     def _frame(self, asked: Asked, variant: Variant) -> None:

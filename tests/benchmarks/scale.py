@@ -101,8 +101,6 @@ def open_scene(path: Path) -> Scene:
 
 @dataclass(frozen=True)
 class Loading:
-    """One reader on one file."""
-
     reader: str
     rows: int
     file_bytes: int

@@ -85,7 +85,6 @@ def ask(engine: QueryEngine, texts: Iterable[str], level: LevelChoice = "auto") 
 
 
 def seconds_of(work: Callable[[], object]) -> float:
-    """How long it takes."""
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
@@ -242,7 +241,6 @@ class Measured:
 def measured(
     asked: Asked, truth: Truth, absent: Sequence[str], scores: Sequence[Score], direct: Sequence[DirectScore]
 ) -> Measured:
-    """Collect what was asked of a scene."""
     present = [phrase.text for phrase in truth.phrases if phrase.kind == "object"]
     accepted, objects = found_rate(asked, present)
     found, count = found_rate(asked, absent)

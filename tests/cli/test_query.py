@@ -56,14 +56,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def lines(capsys, *words: str) -> list[str]:
-    """The lines that a command prints for people."""
     capsys.readouterr()
     assert run(*words) == 0
     return capsys.readouterr().out.splitlines()
 
 
 def answers(capsys, *words: str):
-    """What a command says as JSON."""
     return json.loads("\n".join(lines(capsys, *words, "--json")))
 
 
@@ -216,7 +214,6 @@ def test_query_prints_the_reading_of_structure(folder, capsys):
 
 
 def blob_of(scene: Scene) -> list[int]:
-    """How many Gaussians of each blob."""
     nearest = np.abs(scene.gaussians.means[:, :1] - CENTRES[:, 0]).argmin(1)
     return np.bincount(nearest, minlength=3).tolist()
 

@@ -83,7 +83,6 @@ SPLAT = splat_bytes(WANT)
 
 
 def patched(content: bytes, at: int, code: str, value: int) -> bytes:
-    """`content` with one number of the type `code` changed."""
     changed = bytearray(content)
     struct.pack_into(code, changed, at, value)
     return bytes(changed)
@@ -489,7 +488,6 @@ def test_quantised_and_interleaved_columns_are_read(tmp_path):
 
 
 def splats(content: dict) -> dict:
-    """The one primitive of a file."""
     return content["meshes"][0]["primitives"][0]
 
 

@@ -46,7 +46,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a training that nothing happened to."""
     folder = tmp_path_factory.mktemp("whole")
     train_scene(room, folder / "scene.ply", tiny_settings(room))
     return folder
@@ -217,8 +216,6 @@ def test_unusable_arguments_are_refused_before_work(room, tmp_path):
 
 
 class Blind(MaskSource):
-    """A mask source that finds nothing."""
-
     name = key = "blind"
 
     def __call__(self, image: np.ndarray, progress: Progress) -> LevelMasks:

@@ -92,8 +92,6 @@ def blob_scene(*, field: bool = True, with_cameras: bool = True, phrasebook: boo
 
 
 class FakeEncoder:
-    """Knows `WORDS`."""
-
     words, canonical = WORDS, 3
 
     def encode_texts(self, texts: list[str]) -> Array:
@@ -184,8 +182,6 @@ def meaning(text: str) -> Array:
 
 
 class PlainEncoder(FakeEncoder):
-    """Knows `AXES`."""
-
     words, canonical = AXES, 6
 
     def vector(self, text: str) -> Array:

@@ -17,8 +17,6 @@ AXIS = Camera(21, 21, 30.0, 30.0, 10.5, 10.5, np.eye(4))  # at the origin, looks
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """The input of a rasterizer."""
-
     gaussians: Gaussians
     camera: Camera = AXIS
     settings: RasterSettings = INRIA
@@ -31,8 +29,6 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """The output of a rasterizer."""
-
     backend: Backend
     drawing: Drawing
     view: Any
@@ -53,8 +49,6 @@ Check = Callable[[Seen], None]
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table."""
-
     name: str
     expect: str  # what must happen, as a sentence
     build: Callable[[], Drawing]
@@ -65,13 +59,11 @@ class Case:
 
 
 def draw(backend: Backend, drawing: Drawing) -> Seen:
-    """Render."""
     view = backend.raster.view(drawing.gaussians, drawing.camera, drawing.settings)
     return Seen(backend, drawing, view, *view.splat(drawing.features()))
 
 
 def crowd(seed: int = 0, n: int = 24, sh_degree: int = 0, **options: Any) -> Drawing:
-    """Some ordinary Gaussians before an ordinary camera with everything off centre."""
     return Drawing(random_gaussians(n, seed, sh_degree, **options), random_camera(seed, 40, 27))
 
 
@@ -95,7 +87,6 @@ def balls(z: Any, opacity: Any = 0.8, scale: Any = 0.2, x: Any = 0.0, y: Any = 0
 
 
 def identical(seen: Seen, other: Seen) -> None:
-    """Bit for bit."""
     assert np.array_equal(seen.image, other.image)
     assert np.array_equal(seen.alpha, other.alpha)
 

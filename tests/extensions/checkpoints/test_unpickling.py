@@ -130,7 +130,6 @@ def pickle_of(file: bytes) -> bytes:
 
 
 def with_pickle(file: bytes, stream: bytes) -> bytes:
-    """The archive with another pickle."""
     out = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(file)) as source, zipfile.ZipFile(out, "w") as target:
         for info in source.infolist():
@@ -144,7 +143,6 @@ def by_hand(opcodes: bytes) -> bytes:
 
 
 def ends(files: dict[str, bytes], folder: Path) -> dict[str, Ended]:
-    """What became of each, by its name."""
     for number, content in enumerate(files.values()):
         (folder / f"{number:04}.pth").write_bytes(content)
     ended = convert_each(folder)
