@@ -11,8 +11,8 @@ import tyro
 from langsplat_core import registry
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, Level, WrittenScene
 from langsplat_core.config import CodebookConfig, CodecConfig, Positive, Range
-from langsplat_core.errors import InputError
-from langsplat_core.io.files import check_output_file, check_output_folder
+from langsplat_core.errors import InputError, report_loss
+from langsplat_core.io.files import check_output_file, check_output_folder, shown
 from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import (
     Exporter,
@@ -165,6 +165,15 @@ class Convert:
             if scene.origin.any():
                 where = " ".join(f"{value:.10g}" for value in scene.origin)
                 print(f"{self.out}: checkpoints have no room for an origin: *.origin.json keep {where}")
+            has = {
+                "cameras": scene.cameras,
+                "metres per unit": scene.metres_per_unit,
+                "antialiasing": scene.antialiased,
+                "extra properties": scene.extras,
+                "taught words": scene.language is not None and scene.language.taught,
+            }
+            if lost := [what for what, value in has.items() if value]:
+                report_loss("%s: checkpoints have no room for %s", shown(self.out), ", ".join(lost))
             return scene
 
         with TerminalProgress() as progress:

@@ -66,8 +66,11 @@ def run_apart(function: Callable[..., Any], *arguments: Any, workspace: Path, pr
 def digest_of_model(folder: Path) -> str:
     """Return a digest of the files of a workspace's model, and of its graph of matches."""
     paths = [path for path in (*sorted(folder.iterdir()), folder.with_name(MATCHES)) if path.name != DIGEST]
-    contents = [(path.name, path.read_bytes()) for path in paths if path.is_file()]
-    return hashlib.sha256(repr(contents).encode()).hexdigest()
+    digest = hashlib.sha256()
+    for path in filter(Path.is_file, paths):
+        content = path.read_bytes()
+        digest.update(f"{path.name} {len(content)} ".encode() + content)
+    return digest.hexdigest()
 
 
 def disk_full(folder: Path) -> OSError:
