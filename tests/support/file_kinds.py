@@ -378,7 +378,7 @@ def in_ply_header(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> 
 # else is a fault, and so are memory, time and Python warnings.
 
 MEMORY_FACTOR, MEMORY_SLACK = 4, 300_000_000  # bytes: beyond the file's size times the factor
-LINE = 300  # characters of a message, with the short path of a test
+LINE = 235  # characters of a message beside the folder of the file
 SECONDS = 20.0  # of the processor: what the worst mutants need is hundredths
 
 
@@ -455,11 +455,13 @@ def _verdict(kind: FileKind, path: Path, said: list[str], outcome: Outcome) -> s
                     if "/PIL/" not in one.filename  # which `io.hostile` silences
                 ]
     except LangSplatError as error:
-        return f"warning: {given[0]}" if given else _bad_line(str(error))
+        return f"warning: {given[0]}" if given else _bad_line(str(error), path)
     except Exception as error:  # noqa: BLE001  which is what is looked for
         last = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__} ({str(error)[:80]}) at {Path(last.filename).name}:{last.lineno}"
-    bad = f"warning: {given[0]}" if given else next(filter(None, map(_bad_line, said)), None)
+    bad = (
+        f"warning: {given[0]}" if given else next(filter(None, (_bad_line(one, path) for one in said)), None)
+    )
     if bad is None and sound < 0.5 and not said:
         bad = "mostly unsound, unsaid"
     outcome.loaded += bad is None
@@ -467,7 +469,8 @@ def _verdict(kind: FileKind, path: Path, said: list[str], outcome: Outcome) -> s
     return bad
 
 
-def _bad_line(text: str) -> str | None:
+def _bad_line(text: str, path: Path) -> str | None:
+    text = text.replace(str(path.parent), "")
     if not text or len(text) >= LINE or not text.isprintable():
         return f"message: {len(text)} characters, {text[:60]!r} ... {text[-60:]!r}"
     return None
