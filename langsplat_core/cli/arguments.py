@@ -16,7 +16,7 @@ from langsplat_core.config import (
     check_settings,
     named_values,
 )
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, printable_line
 from langsplat_core.io.files import check_output_file, check_output_folder
 
 Level = Literal["subpart", "part", "whole"]
@@ -80,7 +80,8 @@ def codec_settings(args: Sequence[str], default: CodecConfig) -> CodecConfig:
     """Return settings of the codec that `--codec.kind` in `args` chooses, else `default`; InputError."""
     kind = named(args, "--codec.kind") or default.kind
     if kind not in CODEC_CONFIGS:
-        raise InputError(f"--codec.kind {kind}: choose one of {', '.join(CODEC_CONFIGS)}")
+        said = printable_line(str(kind), 60)
+        raise InputError(f"--codec.kind {said}: choose one of {', '.join(CODEC_CONFIGS)}")
     return default if kind == default.kind else CODEC_CONFIGS[kind]()
 
 
