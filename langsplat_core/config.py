@@ -397,7 +397,7 @@ class PictureConfig:
     display: Display = "rgb"
     heat_opacity: Share = 0.85  # of the heat map over the colours where relevancy is high
     colour_map: ColourMap = "turbo"  # of relevancy and depth; viridis and cividis suit the colour-blind
-    dim: Share = 0.45  # colours are multiplied by this where a query finds nothing
+    dim: Share = 0.6  # colours are multiplied by this where a query finds nothing
     own_colours: bool = False  # heat in the colour of each query instead of the colour map
     threshold: Share = 0.5  # of a pixel's light from an answer's Gaussians from which it is segmented
     alpha_gate: Share = 0.3  # pixels with less alpha carry no relevancy

@@ -1,5 +1,5 @@
 // From channels to an image; composing.py beside it does the same on the CPU and a test compares the two.
-// Channels are premultiplied by alpha, row 0 is the top row. HEAT_FADE, SEGMENT_OPACITY, LEAST_ALPHA,
+// Channels are premultiplied by alpha, row 0 is the top row. HEAT_FADE, HEAT_LIGHTNESS, SEGMENT_OPACITY, LEAST_ALPHA,
 // MAX_QUERIES, MAP_NODES and SHOWN, all drawings as one expression, are defined from displays.py.
 
 uniform sampler2D colours;      // rgb, alpha
@@ -30,6 +30,42 @@ vec3 mapped(float t) {
                texelFetch(colour_maps, ivec2(low + 1, colour_map), 0).rgb, position - float(low));
 }
 
+vec3 oklab(vec3 colour) {  // squares stand for sRGB's curve
+    vec3 c = colour * colour;
+    vec3 cones = vec3(dot(c, vec3(0.4122215, 0.5363325, 0.0514460)), dot(c, vec3(0.2119035, 0.6806995, 0.1073970)),
+                      dot(c, vec3(0.0883025, 0.2817188, 0.6299787)));
+    vec3 roots = pow(max(cones, vec3(0.0)), vec3(1.0 / 3.0));
+    return vec3(dot(roots, vec3(0.2104543, 0.7936178, -0.0040720)), dot(roots, vec3(1.9779985, -2.4285922, 0.4505937)),
+                dot(roots, vec3(0.0259040, 0.7827718, -0.8086758)));
+}
+
+// Hue and chroma of a colour with most of the lightness of another.
+vec3 shaded(vec3 colour, vec3 base) {
+    vec3 lab = oklab(colour);
+    lab.x = mix(oklab(base).x, lab.x, HEAT_LIGHTNESS);
+    vec3 roots = vec3(dot(lab, vec3(1.0, 0.3963378, 0.2158038)), dot(lab, vec3(1.0, -0.1055613, -0.0638542)),
+                      dot(lab, vec3(1.0, -0.0894842, -1.2914855)));
+    vec3 cones = roots * roots * roots;
+    return sqrt(clamp(vec3(dot(cones, vec3(4.0767417, -3.3077116, 0.2309699)),
+                           dot(cones, vec3(-1.2684380, 2.6097574, -0.3413194)),
+                           dot(cones, vec3(-0.0041961, -0.7034186, 1.7076147))), 0.0, 1.0));
+}
+
+bool is_hot(ivec2 pixel) {
+    vec4 sums = texelFetch(extra, clamp(pixel, ivec2(0), textureSize(extra, 0) - 1), 0);
+    bool hot = false;
+    for (int j = 0; j < MAX_QUERIES; ++j)
+        hot = hot || (sums[j] / sums.a - ranges[j].x) / (ranges[j].y - ranges[j].x) >= HEAT_EDGE;
+    return sums.a > alpha_gate && hot;
+}
+
+// A hot pixel near one that is not.
+bool on_edge(vec2 place) {
+    ivec2 pixel = ivec2(place * vec2(textureSize(extra, 0)));
+    return is_hot(pixel) && !(is_hot(pixel + ivec2(0, EDGE_PX)) && is_hot(pixel - ivec2(0, EDGE_PX)) &&
+                              is_hot(pixel + ivec2(EDGE_PX, 0)) && is_hot(pixel - ivec2(EDGE_PX, 0)));
+}
+
 vec3 heat_map(vec3 base, vec3 relevancy) {
     float heat = 0.0;
     float total = 0.0;
@@ -42,7 +78,7 @@ vec3 heat_map(vec3 base, vec3 relevancy) {
         mean += own * query_colours[j];
     }
     vec3 hot = own_colours ? mean / max(total, 1e-9) : mapped(heat);
-    return mix(base * dim, hot, heat_opacity * smoothstep(0.0, own_colours ? 1.0 : HEAT_FADE, heat));
+    return mix(base * dim, shaded(hot, base), heat_opacity * smoothstep(0.0, own_colours ? 1.0 : HEAT_FADE, heat));
 }
 
 vec3 segments(vec3 base, vec3 relevancy) {

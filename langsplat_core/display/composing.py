@@ -13,7 +13,9 @@ from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import (
     COLOUR_MAPS,
+    HEAT_EDGE,
     HEAT_FADE,
+    HEAT_LIGHTNESS,
     LEAST_ALPHA,
     NODES,
     QUERY_COLOURS,
@@ -91,6 +93,35 @@ def _map(shown: Array, t: Any, table: Array) -> None:
 
 
 @helper
+def _oklab(colour: Array) -> tuple[Any, Any, Any]:
+    """Lightness, a and b of a colour in OKLab (B. Ottosson 2020); squares stand for sRGB's curve."""
+    r, g, b = colour[0] * colour[0], colour[1] * colour[1], colour[2] * colour[2]
+    long = np.cbrt(np.float32(0.4122215) * r + np.float32(0.5363325) * g + np.float32(0.0514460) * b)
+    middle = np.cbrt(np.float32(0.2119035) * r + np.float32(0.6806995) * g + np.float32(0.1073970) * b)
+    short = np.cbrt(np.float32(0.0883025) * r + np.float32(0.2817188) * g + np.float32(0.6299787) * b)
+    return (
+        np.float32(0.2104543) * long + np.float32(0.7936178) * middle - np.float32(0.0040720) * short,
+        np.float32(1.9779985) * long - np.float32(2.4285922) * middle + np.float32(0.4505937) * short,
+        np.float32(0.0259040) * long + np.float32(0.7827718) * middle - np.float32(0.8086758) * short,
+    )
+
+
+@helper
+def _shade(shown: Array, base: Array) -> None:
+    """Give the colour `shown` most of the lightness of `base`, and let it keep its hue and chroma."""
+    lightness, a, b = _oklab(shown)
+    lightness += (1 - np.float32(HEAT_LIGHTNESS)) * (_oklab(base)[0] - lightness)
+    long = lightness + np.float32(0.3963378) * a + np.float32(0.2158038) * b
+    middle = lightness - np.float32(0.1055613) * a - np.float32(0.0638542) * b
+    short = lightness - np.float32(0.0894842) * a - np.float32(1.2914855) * b
+    long, middle, short = long * long * long, middle * middle * middle, short * short * short
+    red = np.float32(4.0767417) * long - np.float32(3.3077116) * middle + np.float32(0.2309699) * short
+    green = np.float32(-1.2684380) * long + np.float32(2.6097574) * middle - np.float32(0.3413194) * short
+    blue = np.float32(-0.0041961) * long - np.float32(0.7034186) * middle + np.float32(1.7076147) * short
+    shown[0], shown[1], shown[2] = np.sqrt(_clip(red)), np.sqrt(_clip(green)), np.sqrt(_clip(blue))
+
+
+@helper
 def _heat(shown: Array, base: Array, mean: Array, style: Style) -> None:
     heat = total = red = green = blue = np.float32(0)
     for j in range(len(mean)):
@@ -105,8 +136,34 @@ def _heat(shown: Array, base: Array, mean: Array, style: Style) -> None:
         _map(shown, heat, style.table)
     fade = heat if style.own_colours else _clip(heat / np.float32(HEAT_FADE))
     mix = style.heat_opacity * fade * fade * (3 - 2 * fade)  # smoothstep
+    if mix > 0:
+        _shade(shown, base)
     for k in range(3):
         shown[k] = base[k] * style.dim * (1 - mix) + shown[k] * mix
+
+
+@helper
+def _on_edge(extra: Array, alphas: Array, y: int, x: int, style: Style) -> bool:
+    """Return True for a pixel that is hot, near one that is not."""
+    least, reach = np.float32(HEAT_EDGE[0]), HEAT_EDGE[1]
+    if not _is_hot(extra, alphas, y, x, least, style):
+        return False
+    above, below = max(y - reach, 0), min(y + reach, len(alphas) - 1)
+    left, right = max(x - reach, 0), min(x + reach, alphas.shape[1] - 1)
+    around = _is_hot(extra, alphas, above, x, least, style) and _is_hot(extra, alphas, below, x, least, style)
+    beside = _is_hot(extra, alphas, y, left, least, style) and _is_hot(extra, alphas, y, right, least, style)
+    return not (around and beside)
+
+
+@helper
+def _is_hot(extra: Array, alphas: Array, y: int, x: int, least: Any, style: Style) -> bool:
+    alpha = alphas[y, x]
+    if alpha > style.gate:
+        for j in range(extra.shape[2]):
+            low, high = style.limits[j, 0], style.limits[j, 1]
+            if (extra[y, x, j] / alpha - low) / (high - low) >= least:
+                return True
+    return False
 
 
 @helper
@@ -154,6 +211,8 @@ def _rows(first: int, last: int, image: Array, planes: tuple[Array, Array, Array
             opacity = np.float32(1) if style.drawing == Drawing.ALPHA or not style.transparent else alpha
             if style.drawing == Drawing.HEAT:
                 _heat(shown, base, values, style)
+                if _on_edge(extra, alphas, y, x, style):
+                    shown[:] = 1
             elif style.drawing == Drawing.SEGMENTS:
                 _segment(shown, base, values, style)
             elif style.drawing == Drawing.DEPTH:

@@ -173,6 +173,10 @@ def nodes(subject: Subject) -> Array | None:
 # From channels to an image: `composing` draws it on the CPU, `compose.frag.glsl` on a graphics device.
 
 HEAT_FADE = 0.35  # heat at which the heat map reaches its full opacity
+HEAT_LIGHTNESS = (
+    0.4  # share of the heat map's own lightness; the rest is the image's, whose shading stays visible
+)
+HEAT_EDGE = 0.35, 2  # heat at whose border a line is drawn, and the width of that, pixels
 SEGMENT_OPACITY = 0.6
 LEAST_ALPHA = 1 / 255  # that colours are divided by; what is less is not seen in an image of bytes
 
@@ -203,7 +207,7 @@ _GLSL = {
     Drawing.SUMS: "vec4(sums.rgb / share + uncovered, c.a)",
     Drawing.DEPTH: "depth_map(sums.rg)",
     Drawing.ALPHA: "vec4(vec3(c.a), 1.0)",
-    Drawing.HEAT: "vec4(heat_map(base, mean), c.a)",
+    Drawing.HEAT: "vec4(on_edge(place) ? vec3(1.0) : heat_map(base, mean), c.a)",
     Drawing.SEGMENTS: "vec4(segments(base, mean), c.a)",
 }
 
@@ -268,6 +272,9 @@ def shader_defines() -> dict[str, int | float | str]:
     shown = "".join(f"display == {drawing.value} ? ({glsl}) : " for drawing, glsl in _GLSL.items())
     return {
         "HEAT_FADE": HEAT_FADE,
+        "HEAT_LIGHTNESS": HEAT_LIGHTNESS,
+        "HEAT_EDGE": HEAT_EDGE[0],
+        "EDGE_PX": HEAT_EDGE[1],
         "SEGMENT_OPACITY": SEGMENT_OPACITY,
         "LEAST_ALPHA": LEAST_ALPHA,
         "MAX_QUERIES": MAX_QUERIES,

@@ -182,6 +182,7 @@ LINES = {  # words that work: positions, and options; what would take long ends 
     "compact": "s.ply -- --out o.ply --views 2",
     "eval lerf-ovs": "s.ply . --",
     "eval 3d-ovs": "s.ply . --",
+    "eval gr-lerf": "s.ply . --",
     "bench raster": "-- --scenes absent.ply --out b",
     "serve": "s.ply --",
 }
@@ -262,6 +263,7 @@ WRITING = [
     "demo --out {}",
     "eval lerf-ovs s.ply d --json {}.json",
     "eval 3d-ovs s.ply d --json {}.json",
+    "eval gr-lerf s.ply d --json {}.json",
     "bench raster --out {}",
 ]
 

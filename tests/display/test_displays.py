@@ -12,6 +12,7 @@ from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import (
     COLOUR_MAPS,
     DISPLAYS,
+    HEAT_LIGHTNESS,
     NO_HEAT,
     NODES,
     QUERY_COLOURS,
@@ -75,19 +76,65 @@ def test_heat_shows_relevancy_and_segments_show_members():
         assert_allclose(got[:, 0], FOUND.relevancy[shown])
 
 
-def pixel(values: tuple[float, ...], **picture) -> np.ndarray:
-    """(3,) colour in [0, 1] of one black, opaque pixel."""
-    shown = Channels(np.zeros((1, 1, 3)), np.ones((1, 1)), np.array([[values]]))
+# To the cube roots of cones' answers, and from them to lightness, a and b (Ottosson 2020).
+CONES = np.array(
+    [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ]
+)
+LAB = np.array(
+    [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ]
+)
+
+
+def shaded(colour, base) -> np.ndarray:
+    """Reference in float64: (3,) colours, hue and chroma of one, most of the lightness of the other."""
+    lab, below = (LAB @ np.cbrt(CONES @ np.square(np.asarray(one, float))) for one in (colour, base))
+    lab[0] = HEAT_LIGHTNESS * lab[0] + (1 - HEAT_LIGHTNESS) * below[0]
+    return np.sqrt(np.clip(np.linalg.solve(CONES, np.linalg.solve(LAB, lab) ** 3), 0, 1))
+
+
+BASE = np.array([0.2, 0.5, 0.7])
+
+
+def pixel(values: tuple[float, ...]) -> np.ndarray:
+    """(3,) colour in [0, 1] of one opaque pixel of the colour `BASE`, heat in the queries' own colours."""
+    shown = Channels(np.full((1, 1, 3), BASE), np.ones((1, 1)), np.array([[values]]))
     return compose(shown, replace(HEAT, own_colours=True), ((0.0, 1.0),) * len(values))[0, 0] / 255
 
 
 def test_heats_that_overlap_mix_their_colours_by_heat():
-    assert_allclose(pixel((1.0, 0.0)), QUERY_COLOURS[0], atol=0.003)
-    assert_allclose(pixel((0.0, 1.0, 0.0)), QUERY_COLOURS[1], atol=0.003)
-    assert_allclose(pixel((1.0, 1.0)), QUERY_COLOURS[:2].mean(0), atol=0.003)
-    assert_allclose(pixel((1.0, 0.5)), QUERY_COLOURS[:2].T @ (2 / 3, 1 / 3), atol=0.003)
-    assert_allclose(pixel((0.5, 0.0)), 0.5 * QUERY_COLOURS[0], atol=0.003)  # smoothstep of 1/2
-    assert_allclose(pixel((0.0, 0.0)), 0)
+    one, two, _ = QUERY_COLOURS
+    assert_allclose(pixel((1.0, 0.0)), shaded(one, BASE), atol=0.003)
+    assert_allclose(pixel((0.0, 1.0, 0.0)), shaded(two, BASE), atol=0.003)
+    assert_allclose(pixel((1.0, 1.0)), shaded((one + two) / 2, BASE), atol=0.003)
+    assert_allclose(pixel((1.0, 0.5)), shaded(2 / 3 * one + 1 / 3 * two, BASE), atol=0.003)
+    half = 0.5 * shaded(one, BASE) + 0.5 * PICTURE.dim * BASE  # smoothstep of 1/2
+    assert_allclose(pixel((0.5, 0.0)), half, atol=0.003)
+    assert_allclose(pixel((0.0, 0.0)), PICTURE.dim * BASE, atol=0.003)
+
+
+def test_heat_keeps_the_shading_of_the_image_and_ends_in_a_line():
+    grey = np.tile(np.linspace(0.2, 0.9, 40)[:, None, None], (1, 30, 3))
+    values = np.zeros((40, 30, 1))
+    values[10:30, 8:22] = 1
+    image = compose(Channels(grey, np.ones((40, 30)), values), HEAT, ((0.0, 1.0),)) / 255
+    line = (image == 1).all(2)
+    edge = np.zeros((40, 30), bool)
+    edge[10:30, 8:22] = True
+    edge[12:28, 10:20] = False
+    np.testing.assert_array_equal(line, edge)
+    inside = image[12:28, 15] @ (0.3, 0.6, 0.1)
+    assert (np.diff(inside) > 0).all()
+    hot = mapped(np.array(1.0))
+    assert_allclose(image[20, 15], shaded(hot, grey[20, 15]), atol=0.003)
+    assert_allclose(image[5, 5], PICTURE.dim * grey[5, 5], atol=0.003)
 
 
 def test_a_weak_segment_is_half_as_opaque():
@@ -108,10 +155,9 @@ def test_uncovered_pixels_are_never_relevant():
 
 def test_heat_spans_its_range():
     below = compose(channels("relevancy", 0.49), HEAT, RANGES)
-    assert below[0, 0].tolist() == [round(255 * 0.5 * PICTURE.dim)] * 3
-    assert_allclose(
-        compose(channels("relevancy", 0.9), HEAT, RANGES)[0, 0], COLOUR_MAPS["turbo"][255], atol=1
-    )
+    assert_allclose(below[0, 0], 255 * 0.5 * PICTURE.dim, atol=0.5)
+    hottest = shaded(COLOUR_MAPS["turbo"][255] / 255, [0.5] * 3)
+    assert_allclose(compose(channels("relevancy", 0.9), HEAT, RANGES)[0, 0] / 255, hottest, atol=0.003)
     for value in (0.0, 0.3, 1.0):  # without a range it is hot over all of 0 to 1
         shown = channels("relevancy", value)
         assert (compose(shown, HEAT) == compose(shown, HEAT, ((0.0, 1.0),))).all()

@@ -304,7 +304,7 @@ def test_an_unusable_sidecar_is_left_out(path, capsys, other):
 def test_writing_keeps_unreadable_companions(path, name):
     spoil(path, name)
     before = path.with_name(name).read_bytes()
-    with pytest.raises(InputError, match="mend or remove it first"):
+    with pytest.raises(InputError, match="mend or remove that"):
         save_scene(path, load_scene(path))
     assert path.with_name(name).read_bytes() == before
 

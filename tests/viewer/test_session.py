@@ -184,7 +184,7 @@ def test_slider_gesture_is_one_step(opened):
     editing.undo(opened)
     assert opened.state.session.picture.dim == pytest.approx(0.31)
     editing.undo(opened)
-    assert opened.state.session.picture.dim == 0.45
+    assert opened.state.session.picture.dim == PictureConfig().dim
 
 
 def test_undo_of_a_setting_keeps_the_same_mask_objects(opened):

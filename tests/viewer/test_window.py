@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from langsplat_core.config import PictureConfig
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import companion_path, save_scene
 from langsplat_core.io.sidecar import SUFFIX as SIDECAR
@@ -92,7 +93,7 @@ def test_headless_query_prints_and_paints_answers(run_viewer, folder):
     camera = blob_scene().cameras[1]
     before, heat = picture(folder / "rgb.png"), picture(folder / "a.png")
     assert colour_at(heat, camera, PLANT)[2] < 60 < colour_at(before, camera, PLANT)[2]
-    dimmed = 0.45 * colour_at(before, camera, MUG)  # what is not asked for
+    dimmed = PictureConfig().dim * colour_at(before, camera, MUG)  # what is not asked for
     np.testing.assert_allclose(colour_at(heat, camera, MUG), dimmed, atol=4)
     out = draw(run_viewer, "a.png", "--query", "mug", "--level", "part")
     assert "not here" in out[1]
