@@ -39,16 +39,23 @@ vec3 oklab(vec3 colour) {  // squares stand for sRGB's curve
                 dot(roots, vec3(0.0259040, 0.7827718, -0.8086758)));
 }
 
-// Hue and chroma of a colour with most of the lightness of another.
-vec3 shaded(vec3 colour, vec3 base) {
-    vec3 lab = oklab(colour);
-    lab.x = mix(oklab(base).x, lab.x, HEAT_LIGHTNESS);
+// A colour of OKLab with most of the lightness of another: the cube root of its luminance.
+vec3 shaded(vec3 lab, vec3 base) {
+    float own = pow(dot(base * base, vec3(0.2126, 0.7152, 0.0722)), 1.0 / 3.0);
+    lab.x = mix(own, lab.x, HEAT_LIGHTNESS);
     vec3 roots = vec3(dot(lab, vec3(1.0, 0.3963378, 0.2158038)), dot(lab, vec3(1.0, -0.1055613, -0.0638542)),
                       dot(lab, vec3(1.0, -0.0894842, -1.2914855)));
     vec3 cones = roots * roots * roots;
     return sqrt(clamp(vec3(dot(cones, vec3(4.0767417, -3.3077116, 0.2309699)),
                            dot(cones, vec3(-1.2684380, 2.6097574, -0.3413194)),
                            dot(cones, vec3(-0.0041961, -0.7034186, 1.7076147))), 0.0, 1.0));
+}
+
+vec3 mapped_lab(float t) {
+    float position = clamp(t, 0.0, 1.0) * float(MAP_NODES - 1);
+    int low = min(int(position), MAP_NODES - 2);
+    return mix(oklab(texelFetch(colour_maps, ivec2(low, colour_map), 0).rgb),
+               oklab(texelFetch(colour_maps, ivec2(low + 1, colour_map), 0).rgb), position - float(low));
 }
 
 bool is_hot(ivec2 pixel) {
@@ -75,9 +82,9 @@ vec3 heat_map(vec3 base, vec3 relevancy) {
         float own = clamp((relevancy[j] - range.x) / (range.y - range.x), 0.0, 1.0);
         heat = max(heat, own);
         total += own;
-        mean += own * query_colours[j];
+        mean += own * oklab(query_colours[j]);
     }
-    vec3 hot = own_colours ? mean / max(total, 1e-9) : mapped(heat);
+    vec3 hot = own_colours ? mean / max(total, 1e-9) : mapped_lab(heat);
     return mix(base * dim, shaded(hot, base), heat_opacity * smoothstep(0.0, own_colours ? 1.0 : HEAT_FADE, heat));
 }
 

@@ -25,9 +25,11 @@ from langsplat_core.display.displays import (
     Ranges,
     drawing_of,
     full_ranges,
+    oklab,
 )
 
 _TABLES = {name: np.ascontiguousarray(table / np.float32(255)) for name, table in COLOUR_MAPS.items()}
+_LABS = {name: oklab(table).astype(np.float32) for name, table in _TABLES.items()}
 
 
 class Style(NamedTuple):
@@ -43,7 +45,7 @@ class Style(NamedTuple):
     backdrop: Array  # (3,)
     limits: Array  # (MAX_QUERIES, 2) values drawn as 0 and as 1
     tints: Array  # (MAX_QUERIES, 3)
-    table: Array  # (NODES, 3) the colour map
+    table: Array  # (NODES, 3) the colour map, for heat in OKLab, as are the tints then
 
 
 def compose(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> Array:
@@ -59,8 +61,10 @@ def compose_upwards(channels: Channels, picture: PictureConfig, ranges: Ranges =
     """(H, W, 4) uint8, the image of `compose` as OpenGL has it: row 0 at the bottom, opaque by default."""
     extra = channels.alpha[..., None] if channels.extra is None else channels.extra
     planes = tuple(np.asarray(plane, np.float32) for plane in (channels.rgb, channels.alpha, extra))
+    drawing = drawing_of(picture.display, channels.extra is not None)
+    hot = drawing is Drawing.HEAT
     style = Style(
-        drawing=int(drawing_of(picture.display, channels.extra is not None)),
+        drawing=int(drawing),
         transparent=picture.transparent,
         own_colours=picture.own_colours,
         threshold=np.float32(picture.threshold),
@@ -69,8 +73,8 @@ def compose_upwards(channels: Channels, picture: PictureConfig, ranges: Ranges =
         heat_opacity=np.float32(picture.heat_opacity),
         backdrop=np.asarray((0, 0, 0) if picture.transparent else picture.background, np.float32),
         limits=full_ranges(ranges).astype(np.float32),
-        tints=QUERY_COLOURS.astype(np.float32),
-        table=_TABLES[picture.colour_map],
+        tints=(oklab(QUERY_COLOURS) if hot else QUERY_COLOURS).astype(np.float32),
+        table=(_LABS if hot else _TABLES)[picture.colour_map],
     )
     height, width = channels.alpha.shape
     image = np.empty((height, width, 4), np.uint8)
@@ -93,24 +97,11 @@ def _map(shown: Array, t: Any, table: Array) -> None:
 
 
 @helper
-def _oklab(colour: Array) -> tuple[Any, Any, Any]:
-    """Lightness, a and b of a colour in OKLab (B. Ottosson 2020); squares stand for sRGB's curve."""
-    r, g, b = colour[0] * colour[0], colour[1] * colour[1], colour[2] * colour[2]
-    long = np.cbrt(np.float32(0.4122215) * r + np.float32(0.5363325) * g + np.float32(0.0514460) * b)
-    middle = np.cbrt(np.float32(0.2119035) * r + np.float32(0.6806995) * g + np.float32(0.1073970) * b)
-    short = np.cbrt(np.float32(0.0883025) * r + np.float32(0.2817188) * g + np.float32(0.6299787) * b)
-    return (
-        np.float32(0.2104543) * long + np.float32(0.7936178) * middle - np.float32(0.0040720) * short,
-        np.float32(1.9779985) * long - np.float32(2.4285922) * middle + np.float32(0.4505937) * short,
-        np.float32(0.0259040) * long + np.float32(0.7827718) * middle - np.float32(0.8086758) * short,
-    )
-
-
-@helper
 def _shade(shown: Array, base: Array) -> None:
-    """Give the colour `shown` most of the lightness of `base`, and let it keep its hue and chroma."""
-    lightness, a, b = _oklab(shown)
-    lightness += (1 - np.float32(HEAT_LIGHTNESS)) * (_oklab(base)[0] - lightness)
+    """Turn a colour of OKLab into RGB, with most of the lightness of `base`: its luminance's cube root."""
+    red, green, blue = base[0] * base[0], base[1] * base[1], base[2] * base[2]
+    own = np.cbrt(np.float32(0.2126) * red + np.float32(0.7152) * green + np.float32(0.0722) * blue)
+    lightness, a, b = own + np.float32(HEAT_LIGHTNESS) * (shown[0] - own), shown[1], shown[2]
     long = lightness + np.float32(0.3963378) * a + np.float32(0.2158038) * b
     middle = lightness - np.float32(0.1055613) * a - np.float32(0.0638542) * b
     short = lightness - np.float32(0.0894842) * a - np.float32(1.2914855) * b
@@ -122,7 +113,8 @@ def _shade(shown: Array, base: Array) -> None:
 
 
 @helper
-def _heat(shown: Array, base: Array, mean: Array, style: Style) -> None:
+def _heat(shown: Array, base: Array, mean: Array, style: Style) -> Any:
+    """Draw a pixel; return its heat."""
     heat = total = red = green = blue = np.float32(0)
     for j in range(len(mean)):
         low, high, tint = style.limits[j, 0], style.limits[j, 1], style.tints[j]
@@ -140,14 +132,13 @@ def _heat(shown: Array, base: Array, mean: Array, style: Style) -> None:
         _shade(shown, base)
     for k in range(3):
         shown[k] = base[k] * style.dim * (1 - mix) + shown[k] * mix
+    return heat
 
 
 @helper
-def _on_edge(extra: Array, alphas: Array, y: int, x: int, style: Style) -> bool:
-    """Return True for a pixel that is hot, near one that is not."""
+def _near_cold(extra: Array, alphas: Array, y: int, x: int, style: Style) -> bool:
+    """Return True for a pixel near one that is not hot."""
     least, reach = np.float32(HEAT_EDGE[0]), HEAT_EDGE[1]
-    if not _is_hot(extra, alphas, y, x, least, style):
-        return False
     above, below = max(y - reach, 0), min(y + reach, len(alphas) - 1)
     left, right = max(x - reach, 0), min(x + reach, alphas.shape[1] - 1)
     around = _is_hot(extra, alphas, above, x, least, style) and _is_hot(extra, alphas, below, x, least, style)
@@ -210,8 +201,8 @@ def _rows(first: int, last: int, image: Array, planes: tuple[Array, Array, Array
                 values[k] = extra[y, x, k] * scale
             opacity = np.float32(1) if style.drawing == Drawing.ALPHA or not style.transparent else alpha
             if style.drawing == Drawing.HEAT:
-                _heat(shown, base, values, style)
-                if _on_edge(extra, alphas, y, x, style):
+                heat = _heat(shown, base, values, style)
+                if heat >= np.float32(HEAT_EDGE[0]) and _near_cold(extra, alphas, y, x, style):
                     shown[:] = 1
             elif style.drawing == Drawing.SEGMENTS:
                 _segment(shown, base, values, style)

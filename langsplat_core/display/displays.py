@@ -52,6 +52,27 @@ def mapped(t: Array, name: ColourMap = "turbo") -> Array:
     return table[low] * (1 - fraction) + table[low + 1] * fraction
 
 
+def oklab(colours: Array) -> Array:
+    """(..., 3) colours in [0, 1] -> lightness, a and b in OKLab (B. Ottosson 2020).
+
+    Squares stand for sRGB's curve, which is close and costs nothing.
+    """
+    cones = np.square(colours) @ _CONES.T
+    return np.asarray(np.cbrt(cones) @ _OKLAB.T)
+
+
+_CONES = np.array(
+    [[0.4122215, 0.5363325, 0.0514460], [0.2119035, 0.6806995, 0.1073970], [0.0883025, 0.2817188, 0.6299787]]
+)
+_OKLAB = np.array(
+    [
+        [0.2104543, 0.7936178, -0.0040720],
+        [1.9779985, -2.4285922, 0.4505937],
+        [0.0259040, 0.7827718, -0.8086758],
+    ]
+)
+
+
 # Values per Gaussian that displays show.
 
 Ranges = tuple[tuple[float, float], ...]  # per component of a channel, the values drawn as 0 and as 1

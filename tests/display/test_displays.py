@@ -93,10 +93,14 @@ LAB = np.array(
 )
 
 
-def shaded(colour, base) -> np.ndarray:
-    """Reference in float64: (3,) colours, hue and chroma of one, most of the lightness of the other."""
-    lab, below = (LAB @ np.cbrt(CONES @ np.square(np.asarray(one, float))) for one in (colour, base))
-    lab[0] = HEAT_LIGHTNESS * lab[0] + (1 - HEAT_LIGHTNESS) * below[0]
+def lab_of(colour) -> np.ndarray:
+    return LAB @ np.cbrt(CONES @ np.square(colour))
+
+
+def shaded(lab, base) -> np.ndarray:
+    """Reference in float64: (3,) a colour of OKLab with most of the lightness of `base`."""
+    luminance = np.square(base) @ (0.2126, 0.7152, 0.0722)
+    lab = np.array([HEAT_LIGHTNESS * lab[0] + (1 - HEAT_LIGHTNESS) * np.cbrt(luminance), *lab[1:]])
     return np.sqrt(np.clip(np.linalg.solve(CONES, np.linalg.solve(LAB, lab) ** 3), 0, 1))
 
 
@@ -110,7 +114,7 @@ def pixel(values: tuple[float, ...]) -> np.ndarray:
 
 
 def test_heats_that_overlap_mix_their_colours_by_heat():
-    one, two, _ = QUERY_COLOURS
+    one, two, _ = map(lab_of, QUERY_COLOURS)
     assert_allclose(pixel((1.0, 0.0)), shaded(one, BASE), atol=0.003)
     assert_allclose(pixel((0.0, 1.0, 0.0)), shaded(two, BASE), atol=0.003)
     assert_allclose(pixel((1.0, 1.0)), shaded((one + two) / 2, BASE), atol=0.003)
@@ -132,7 +136,7 @@ def test_heat_keeps_the_shading_of_the_image_and_ends_in_a_line():
     np.testing.assert_array_equal(line, edge)
     inside = image[12:28, 15] @ (0.3, 0.6, 0.1)
     assert (np.diff(inside) > 0).all()
-    hot = mapped(np.array(1.0))
+    hot = lab_of(mapped(np.array(1.0)))
     assert_allclose(image[20, 15], shaded(hot, grey[20, 15]), atol=0.003)
     assert_allclose(image[5, 5], PICTURE.dim * grey[5, 5], atol=0.003)
 
@@ -156,7 +160,7 @@ def test_uncovered_pixels_are_never_relevant():
 def test_heat_spans_its_range():
     below = compose(channels("relevancy", 0.49), HEAT, RANGES)
     assert_allclose(below[0, 0], 255 * 0.5 * PICTURE.dim, atol=0.5)
-    hottest = shaded(COLOUR_MAPS["turbo"][255] / 255, [0.5] * 3)
+    hottest = shaded(lab_of(COLOUR_MAPS["turbo"][255] / 255), [0.5] * 3)
     assert_allclose(compose(channels("relevancy", 0.9), HEAT, RANGES)[0, 0] / 255, hottest, atol=0.003)
     for value in (0.0, 0.3, 1.0):  # without a range it is hot over all of 0 to 1
         shown = channels("relevancy", value)
