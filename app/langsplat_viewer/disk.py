@@ -96,7 +96,7 @@ class Watch:
         self._closed = threading.Event()
 
     def begin(self, read: Stamps) -> None:
-        """Look after these files, the scene's own first, from the moment that they were read."""
+        """Watch these files, the scene's own first, as they were when they were read."""
         with self._lock:
             self._read = self._last = read
             self.changed = False
@@ -109,7 +109,7 @@ class Watch:
             self.look()
 
     def look(self) -> None:
-        """Look once. What still changes is not spoken of, nor a scene whose own file is gone."""
+        """Compare the files with what was read; one still being written, or gone, counts as unchanged."""
         with self._lock:
             watched, last = self._read, self._last
         now = stamps(tuple(file for file, _ in watched))

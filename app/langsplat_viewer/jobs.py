@@ -169,7 +169,7 @@ class Worker:
         return any(not job.future.done() for job in self._jobs)
 
     def close(self, patience: float = 0.0) -> None:
-        """Stop taking work.
+        """Cancel all jobs and accept no further ones.
 
         A job that runs has `patience` seconds to tidy up after itself, else it ends with the process.
         """

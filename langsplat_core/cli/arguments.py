@@ -77,7 +77,10 @@ def named(args: Sequence[str], option: str) -> str:
 
 
 def codec_settings(args: Sequence[str], default: CodecConfig) -> CodecConfig:
-    """Return settings of the codec that `--codec.kind` in `args` chooses, else `default`; InputError."""
+    """Return the default settings of the codec that `args` choose by `--codec.kind`.
+
+    That is `default` itself where it is of that kind or none is chosen. InputError for an unknown kind.
+    """
     kind = named(args, "--codec.kind") or default.kind
     if kind not in CODEC_CONFIGS:
         said = printable_line(str(kind), 60)

@@ -390,7 +390,8 @@ class _Pixels:
         if self._waiting:
             answers, columns = zip(*self._waiting, strict=True)
             images = splatted_relevancy(self._view, np.stack(columns, 1), PictureConfig().alpha_gate)
-            list(map(self._take, answers, np.moveaxis(images, -1, 0)))
+            for answer, image in zip(answers, np.moveaxis(images, -1, 0), strict=True):
+                self._take(answer, image)
             self._waiting.clear()
 
     def _take(self, answer: dict[str, Any], relevancy: Array) -> None:

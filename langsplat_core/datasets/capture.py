@@ -100,7 +100,11 @@ class Capture:
         return self._of(views)
 
     def read_at(self, indices: Sequence[int], longer_side: int) -> "Capture":
-        """Return photographs at `indices`, bit for bit as read at that size, with all points; InputError."""
+        """Return the photographs at `indices` bit for bit as a dataset that is read at that size has them.
+
+        The points are those of all. Without files they are `shrunk`. InputError for a file that can no longer
+        be read.
+        """
         if not self.photos or longer_side >= max(max(self.images[index].shape) for index in indices):
             return self.shrunk(indices, longer_side)
         view_of = developer(longer_side, self.cut_out)

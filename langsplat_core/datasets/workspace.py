@@ -54,7 +54,10 @@ def open_workspace(work: Path, inputs: object) -> Path:
 
 
 def run_apart(function: Callable[..., Any], *arguments: Any, workspace: Path, progress: Progress) -> Any:
-    """Return ``function(*arguments, progress)`` of another process; RuntimeError if it died, OSError."""
+    """Return ``function(*arguments, progress)``, run in a process of its own, which pycolmap may end.
+
+    Raises RuntimeError then, and OSError for whatever fails where the disk is about full.
+    """
     try:
         return apart.run(function, *arguments, progress=progress, environment=ONE_THREAD)
     except (apart.AbortedError, *FAILURES) as error:

@@ -194,9 +194,7 @@ def nodes(subject: Subject) -> Array | None:
 # From channels to an image: `composing` draws it on the CPU, `compose.frag.glsl` on a graphics device.
 
 HEAT_FADE = 0.35  # heat at which the heat map reaches its full opacity
-HEAT_LIGHTNESS = (
-    0.4  # share of the heat map's own lightness; the rest is the image's, whose shading stays visible
-)
+HEAT_LIGHTNESS = 0.4  # share of the heat map's own lightness; the rest is the image's, whose shading stays
 HEAT_EDGE = 0.35, 2  # heat at whose border a line is drawn, and the width of that, pixels
 SEGMENT_OPACITY = 0.6
 LEAST_ALPHA = 1 / 255  # that colours are divided by; what is less is not seen in an image of bytes

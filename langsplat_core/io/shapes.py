@@ -43,7 +43,10 @@ def base_colours(gaussians: Gaussians) -> Array:
 
 
 def write_points(path: Path | str, scene: Scene) -> int:
-    """Write the drawable means in the world as a PLY cloud, atomically; return how many; InputError."""
+    """Write the means of the Gaussians that can be drawn, in the world, as a PLY point cloud, atomically.
+
+    Red, green and blue are bytes. Return the number of points. InputError for another suffix.
+    """
     path = check_suffix(path, POINT_SUFFIXES)
     gaussians, valid = scene.gaussians, scene.gaussians.valid()
     write_table(path, _coloured(scene, gaussians.means[valid], base_colours(gaussians)[valid]))
@@ -51,7 +54,10 @@ def write_points(path: Path | str, scene: Scene) -> int:
 
 
 def write_mesh(path: Path | str, mesh: MeshLike, scene: Scene) -> None:
-    """Write a mesh in the world as .ply, or .glb (y up, metres where known), atomically; InputError."""
+    """Write a mesh of a scene, in the world, as .ply or .glb, atomically. InputError for another suffix.
+
+    A .glb is y up, in metres where the scale is known.
+    """
     path = check_suffix(path, MESH_SUFFIXES)
     if path.suffix.lower() == ".ply":
         write_table(path, _coloured(scene, mesh.vertices, mesh.colour), mesh.triangles)

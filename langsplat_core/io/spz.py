@@ -201,7 +201,10 @@ def read_spz_scene(path: Path | str) -> Scene:
 
 
 def decode_spz(data: bytes, path: Path, room: Allowance, tell: Tell) -> Scene:
-    """Return the scene of an .spz in memory, in the PLY's axes; room: of the file around it; FormatError."""
+    """Return the scene of an .spz file in memory, along the axes of the PLY.
+
+    path: for messages; room: of the file that it is a part of. Raises FormatError.
+    """
     return _scene(_read_packed(io.BytesIO(data), len(data), path, room, tell), tell)
 
 

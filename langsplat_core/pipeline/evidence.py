@@ -180,7 +180,10 @@ def kept_photographs(
     dataset: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Array]:
-    """Return (H, W, 3) uint8 by camera, from `dataset` or where the training's report says; InputError."""
+    """Return photographs by the name of their camera, (H, W, 3) uint8 as training saw them.
+
+    From `dataset`, or from where the report of the training says. Raises InputError where some are missing.
+    """
     from langsplat_core.datasets import load_photographs
 
     work = work or work_folder(path)

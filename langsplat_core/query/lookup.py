@@ -127,7 +127,10 @@ def splatted_relevancy(view: View, relevancy: Array, alpha_gate: float) -> Array
 def decoded_relevancy(
     view: View, field: LanguageField, level: int, phrases: Array, alpha_gate: float
 ) -> Array:
-    """Return (H, W, Q) relevancy of decoded pixels for (Q, D) phrases, as the paper's; InputError."""
+    """Return (H, W, Q) relevancy of the decoded pixel latents for (Q, D) phrase vectors: the paper's order.
+
+    Raises InputError for a codebook, whose numbers cannot be blended.
+    """
     if not field.codec.blends:
         raise InputError(
             f"the paper's order blends latents, and this scene has a {field.codec.kind}; train one with "

@@ -37,7 +37,10 @@ BACKENDS: Mapping[str, _Backend] = MappingProxyType(
 
 
 def load_rasterizer(name: str, **resources: Any) -> Rasterizer:
-    """Return a backend, given its resources (opengl: `ctx`); InputError and BackendError."""
+    """Return the rasterizer called `name`, one of `BACKENDS`, given the resources it needs (opengl: `ctx`).
+
+    Raises InputError for an unknown name and BackendError where its library or device is missing.
+    """
     if name not in BACKENDS:
         raise InputError(f"unknown rasterizer {name!r}; choose one of {', '.join(BACKENDS)}")
     backend = BACKENDS[name]

@@ -50,7 +50,11 @@ Layout = Callable[[str, Path], Converted | None]  # id for messages, file -> Non
 
 
 def open_weights(model: str, path: Path, device: str) -> Weights:
-    """Return the weights at a `weights_path`, of any layout that extensions read too; EncoderError."""
+    """Return the weights at a path that `weights_path` found, for a device as `torch_device` has it.
+
+    Other layouts than Hugging Face's are read by extensions. Raises EncoderError for a file that is damaged,
+    or of no layout known here.
+    """
     device = torch_device(device)
     if path.is_dir() and _is_hugging_face(path):
         return Weights(model, path, device)

@@ -163,7 +163,8 @@ def test_simulated_clip_has_the_requested_cosines(tmp_path, own, alike):
     assert prompts[~same].mean() == pytest.approx(PROMPTS, abs=0.03)
 
 
-LVIS = Path("/work/shared/data/clip_vectors/lvis_v1_clip_a+cname.npy")
+SHARED = Path(__file__).parents[3] / "shared" / "data"  # real data beside the checkout, where it is
+LVIS = SHARED / "clip_vectors" / "lvis_v1_clip_a+cname.npy"
 
 
 @pytest.mark.long
@@ -209,7 +210,7 @@ def test_simulated_images_have_the_statistics_of_photographs(vectors):
         assert value == pytest.approx(real, abs=tolerance)
 
 
-REAL = Path("/work/shared/data/langsplat_autoencoders/teatime.pth")
+REAL = SHARED / "langsplat_autoencoders" / "teatime.pth"
 
 
 @pytest.fixture(scope="module", params=["made", "real"])

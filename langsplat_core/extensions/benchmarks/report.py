@@ -293,7 +293,11 @@ def run_benchmark(
     only: Sequence[str] = (),
     progress: Progress = silent,
 ) -> BenchmarkReport:
-    """Score `subject` on the scenes, or `only` some; InputError where they do not match, EncoderError."""
+    """Score `subject` on the scenes of `benchmark`, or those named by `only`.
+
+    Raises InputError for a scene or maps that do not belong to the labels, EncoderError where the text
+    encoder cannot be loaded.
+    """
     if subject.paper_order and (subject.maps is not None or not isinstance(profile.rule, MapRule)):
         raise InputError(
             "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"
@@ -316,7 +320,11 @@ def run_benchmark(
 
 
 def _chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Evaluated) -> list[str]:
-    """Return the `labelled` scenes to score: `only`, or that of the scene file's name; InputError."""
+    """Return the names of the `labelled` scenes to score.
+
+    These are `only`, or the one that a scene file is named after where several could be meant. Raises
+    InputError for a name that is not labelled.
+    """
     wrong = [name for name in only if name not in labelled]
     if wrong:
         raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(labelled)}")

@@ -328,7 +328,11 @@ def _numbered(path: Path) -> int | None:
 
 
 def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:
-    """Return the Gaussians of the first checkpoint, and what others have beside them; FormatError."""
+    """Return the Gaussians of checkpoints that lack different ones.
+
+    Those of the first come first, then what each further one has beside them. Raises FormatError where they
+    are not of one scene.
+    """
     found = carriers[0].gaussians
     for carrier in carriers[1:]:
         theirs = carrier.gaussians

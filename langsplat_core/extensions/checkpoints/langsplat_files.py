@@ -44,7 +44,10 @@ def is_layer(name: Any) -> bool:
 
 
 def autoencoder_from(content: Mapping[str, Any], path: Path) -> AutoencoderCodec:
-    """Return the codec of these weights, batch normalisation folded into linear layers; FormatError."""
+    """Return the codec of these weights, batch normalisation folded into the linear layers.
+
+    Raises FormatError.
+    """
     try:
         with np.errstate(all="ignore"):  # what is not finite is refused below
             codec = AutoencoderCodec(

@@ -182,7 +182,11 @@ def floor_map(occupancy: Occupancy, step: float, height: float) -> FloorMap:
 
 
 def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None = None) -> Array:
-    """Return (X, Y) bool cells for a robot's middle, clear by `radius`, joined to `start`; InputError."""
+    """Return the cells in which the middle of a robot may be, (X, Y) bool.
+
+    They are as far as its radius, metres, from obstacles, and connected with `start`, or with most others.
+    Raises InputError where there are none.
+    """
     blocked = np.pad(~plan.free, 1, constant_values=True)
     clear = (ndimage.distance_transform_edt(~blocked)[1:-1, 1:-1] - 0.5) * plan.resolution >= radius
     labels, count = ndimage.label(clear)

@@ -566,7 +566,11 @@ def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[Verdict]:
 
 
 def _vector(library: Library, group: EncoderGroup, text: str, load_encoder: LoadEncoder | None) -> Array:
-    """Return a phrase's (D,) unit vector, by the checked encoder or a phrasebook; EncoderError."""
+    """Return the (D,) unit vector of a phrase.
+
+    It is the encoder's, checked against the group's canonical vectors, else that of the first phrasebook that
+    has it. Raises EncoderError and, for no phrase, InputError.
+    """
     dim = group.canonical.shape[1]
     codec = LinearCodec(np.eye(1, dim, dtype=np.float32))
     none = np.zeros((len(LEVELS), 0, 1), np.float32), np.zeros((len(LEVELS), 0), np.float32)

@@ -155,7 +155,10 @@ Backend = Literal["auto", "cpu", "cuda"]
 
 
 def renderer_for(backend: Backend, settings: RasterSettings = INRIA) -> DifferentiableRenderer:
-    """Return the renderer asked for; auto: CUDA where gsplat draws, else the CPU; BackendError."""
+    """Return the renderer a user asked for; `auto` takes CUDA where gsplat really draws there, else the CPU.
+
+    Raises BackendError when `cuda` is asked for and cannot work.
+    """
     if backend == "cpu" or (backend == "auto" and not torch.cuda.is_available()):
         return CpuRenderer(settings)
     try:

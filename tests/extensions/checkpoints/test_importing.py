@@ -276,7 +276,7 @@ def saved(path: Path, content: Any) -> Path:
 
 
 @pytest.mark.parametrize("case", PASSED_OVER)
-def test_what_is_passed_over_is_said(tmp_path, case, caplog, monkeypatch):
+def test_checkpoints_say_what_is_skipped(tmp_path, case, caplog, monkeypatch):
     paths = PASSED_OVER[case](tmp_path)
     read_foreign(paths)
     assert len(caplog.messages) == 1
