@@ -11,18 +11,19 @@ import tyro
 from langsplat_core import registry
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, Level, WrittenScene
 from langsplat_core.config import CodebookConfig, CodecConfig, Positive, Range
-from langsplat_core.errors import InputError, report_loss
-from langsplat_core.io.files import check_output_file, check_output_folder, shown
+from langsplat_core.errors import InputError
+from langsplat_core.io.files import check_output_file, check_output_folder
 from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import (
+    ORIGIN_SUFFIX,
     Exporter,
     ExportRequest,
     Importer,
     ImportRequest,
-    check_keeps,
     check_writable,
     load_scene,
     load_without_language,
+    report_left_out,
     save_scene,
 )
 from langsplat_core.io.sidecar import rematch_language
@@ -120,8 +121,8 @@ class Convert:
         if self.to != "scene":
             self._export()
             return
-        check_writable(self.out)  # before minutes are spent on reading
-        check_keeps(self.out, *self.sources, *([] if self.rematch is None else [self.rematch]))
+        rematched = () if self.rematch is None else (self.rematch,)
+        check_writable(self.out, *self.sources, *rematched)  # before minutes are spent on reading
         scene = self._read()
         save_scene(self.out, replace(scene, path=self.out))
         described = "with a language field" if scene.language else "without a language field"
@@ -162,18 +163,7 @@ class Convert:
 
         def load() -> Scene:
             scene = replace(self._read(), path=self.source)
-            if scene.origin.any():
-                where = " ".join(f"{value:.10g}" for value in scene.origin)
-                print(f"{self.out}: checkpoints have no room for an origin: *.origin.json keep {where}")
-            has = {
-                "cameras": scene.cameras,
-                "metres per unit": scene.metres_per_unit,
-                "antialiasing": scene.antialiased,
-                "extra properties": scene.extras,
-                "taught words": scene.language is not None and scene.language.taught,
-            }
-            if lost := [what for what, value in has.items() if value]:
-                report_loss("%s: checkpoints have no room for %s", shown(self.out), ", ".join(lost))
+            report_left_out(self.out, scene, "checkpoints", exporter.loses, f"*{ORIGIN_SUFFIX}")
             return scene
 
         with TerminalProgress() as progress:
@@ -213,8 +203,7 @@ class Transform:
     """World units."""
 
     def run(self) -> None:
-        check_writable(self.out)
-        check_keeps(self.out, self.scene)
+        check_writable(self.out, self.scene)
         scene = load_scene(self.scene)
         to = self._similarity(scene)
         save_scene(self.out, replace(place_scene(scene, to), path=self.out))
@@ -240,8 +229,7 @@ class Crop:
     """Two opposite corners, world units."""
 
     def run(self) -> None:
-        check_writable(self.out)
-        check_keeps(self.out, self.scene)
+        check_writable(self.out, self.scene)
         scene, corners = load_scene(self.scene), np.array(self.box).reshape(2, 3)
         keep = in_box(scene.gaussians.means, corners.min(0) - scene.origin, corners.max(0) - scene.origin)
         if not keep.any():

@@ -23,7 +23,7 @@ from langsplat_core.cli.run import print_json
 from langsplat_core.config import Count, CountOrZero, LevelChoice, PictureConfig
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.scenes import check_keeps, check_writable, save_scene
+from langsplat_core.io.scenes import check_writable, save_scene
 from langsplat_core.io.sidecar import read_words
 from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import TerminalProgress
@@ -459,8 +459,7 @@ class Select:
         """InputError for what needs no scene to be known: it should not cost the loading of one."""
         if not self.texts:
             raise InputError("no phrase given; say: langsplat select scene.ply 'red cup' --out cup.ply")
-        check_writable(self.out)
-        check_keeps(self.out, self.scene)
+        check_writable(self.out, self.scene)
         folder = self.out.parent
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder for {self.out.name}; make it first")

@@ -348,7 +348,7 @@ class _File:
         return self._buffers[index]
 
 
-def write_gltf(path: Path | str, content: Scene | Gaussians) -> None:
+def write_gltf(path: Path | str, scene: Scene) -> None:
     """Write a .glb, or a .gltf with its buffer inside, atomically; rows keep their order.
 
     The origin of a scene is the translation of its node.
@@ -357,7 +357,6 @@ def write_gltf(path: Path | str, content: Scene | Gaussians) -> None:
     points of the base colour in programs that do not know the extension. A row that cannot be drawn is
     written with opacity 0. Raises InputError for more than a .glb can hold, 4 GiB.
     """
-    scene = Scene(content) if isinstance(content, Gaussians) else content
     file, gaussians = GltfWriter(EXTENSION), scene.gaussians
     if len(gaussians):
         says = {"kernel": "ellipse", "colorSpace": SRGB}

@@ -21,7 +21,7 @@ from langsplat_core.arrays import Array, logit, sigmoid, unit
 from langsplat_core.errors import InputError, Tell, malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
-from langsplat_core.scene import Gaussians
+from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import C0
 
 # Components beside the largest, by its index
@@ -92,8 +92,8 @@ _HUGE = 1e12  # world units that no Gaussian of a real scene has
 _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
 
 
-def read_splat(path: Path | str) -> Gaussians:
-    """Return the Gaussians of a .splat file, of SH degree 0.
+def read_splat_scene(path: Path | str) -> Scene:
+    """Return the Gaussians of a .splat file, of SH degree 0, as a scene.
 
     A file cut off between two Gaussians cannot be told from a whole one. Raises InputError when the file
     cannot be opened and FormatError when it is no such file.
@@ -113,22 +113,23 @@ def read_splat(path: Path | str) -> Gaussians:
     if sound.mean() < 0.9:
         raise malformed(path, f"not a .splat: {(~sound).sum()} of {len(rows)} rows are no Gaussians")
     colours = rows["colour"] / 255
-    return Gaussians(
+    gaussians = Gaussians(
         means=rows["position"],
         log_scales=log_scales,
         quats_wxyz=(rows["rotation"].astype(np.float32) - 128) / 128,
         opacity_logits=logit(colours[:, 3]),
         sh=((colours[:, :3] - 0.5) / C0)[:, None],
     )
+    return Scene(gaussians)
 
 
-def write_splat(path: Path | str, gaussians: Gaussians) -> None:
+def write_splat(path: Path | str, scene: Scene) -> None:
     """Write the Gaussians in their order, atomically, without their view dependence.
 
     Colours and opacities are rounded to 1/255 (colours beyond 0..1 are cut off), rotations to 1/128 per
     component; positions and scales stay exact. A row that cannot be drawn is written with opacity 0.
     """
-    valid = gaussians.valid()
+    gaussians, valid = scene.gaussians, scene.gaussians.valid()
     drawn = gaussians.take(valid)
     largest = np.maximum(np.abs(drawn.means).max(1), np.exp(drawn.log_scales.max(1)))
     if (largest >= _HUGE).any():

@@ -10,10 +10,11 @@ serve a `scene.ply` in the same folder.
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from msgspec import Struct
@@ -28,7 +29,7 @@ from langsplat_core.io.files import atomic_path, check_output_file, locked, show
 from langsplat_core.io.gltf import read_gltf_scene, write_gltf
 from langsplat_core.io.hostile import decode_json, exists, read_file
 from langsplat_core.io.ply import read_ply_scene, write_ply
-from langsplat_core.io.quantised import read_splat, write_splat
+from langsplat_core.io.quantised import read_splat_scene, write_splat
 from langsplat_core.io.sog import META_NAME, read_sog_scene, write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.progress import Progress
@@ -36,7 +37,16 @@ from langsplat_core.scene import Gaussians, Scene, about_origin
 
 log = logging.getLogger("langsplat")
 
-# Parts of a scene that a format may be unable to hold; without "precision" numbers are rounded
+# What a scene may have and a format no room for: it is said. That numbers are rounded is not, and the origin
+# goes into a companion.
+PARTS: Mapping[str, Callable[[Scene], object]] = MappingProxyType({
+    "view dependence": lambda scene: scene.gaussians.sh[:, 1:].any(),
+    "antialiasing": lambda scene: scene.antialiased,
+    "metres per unit": lambda scene: scene.metres_per_unit is not None,
+    "extra properties": lambda scene: scene.extras,
+    "cameras": lambda scene: scene.cameras,
+    "taught words": lambda scene: scene.language is not None and scene.language.taught,
+})  # fmt: skip
 LOSSES = ("precision", "view dependence", "antialiasing", "metres per unit", "extra properties", "origin")
 ORIGIN_SUFFIX = ".origin.json"  # of the companion with the origin of a scene whose format has no room for it
 
@@ -48,49 +58,21 @@ class SceneFormat:
     suffix: str  # of its files, lower case; its name for people too
     read: Callable[[Path], Scene]
     write: Callable[[Path, Scene], None] | None = None  # None: read only
-    loses: tuple[str, ...] = ()  # what a written file cannot hold, in words of `LOSSES`
+    loses: tuple[str, ...] = ()  # what a written file cannot hold, of `LOSSES` or `PARTS`
     own_companions: bool = False  # companions keep the suffix: `a.spz.langsplat.safetensors`
     folder_file: str = ""  # a folder with this file in it is a scene too, and so is the file
     mime: str = "model/x-gaussian-splat"
 
 
-def _gltf(suffix: str, mime: str) -> SceneFormat:
-    return SceneFormat(
-        suffix,
-        read_gltf_scene,
-        write_gltf,
-        loses=("precision", "antialiasing", "metres per unit", "extra properties"),
-        own_companions=True,
-        mime=mime,
-    )
-
-
+SMALL = ("precision", "metres per unit", "extra properties", "origin")
+GLTF = ("precision", "antialiasing", "metres per unit", "extra properties")
 CORE_FORMATS = (
     SceneFormat(".ply", read_ply_scene, write_ply, mime="model/x-ply"),  # plain and compressed
-    SceneFormat(
-        ".spz",
-        read_spz_scene,
-        lambda path, scene: write_spz(path, scene.gaussians, scene.antialiased),
-        loses=("precision", "metres per unit", "extra properties", "origin"),
-        own_companions=True,
-    ),
-    SceneFormat(
-        ".splat",
-        lambda path: Scene(read_splat(path)),
-        lambda path, scene: write_splat(path, scene.gaussians),
-        loses=LOSSES,
-        own_companions=True,
-    ),
-    SceneFormat(
-        ".sog",
-        read_sog_scene,
-        lambda path, scene: write_sog(path, scene.gaussians, scene.antialiased),
-        loses=("precision", "metres per unit", "extra properties", "origin"),
-        own_companions=True,
-        folder_file=META_NAME,
-    ),
-    _gltf(".glb", "model/gltf-binary"),
-    _gltf(".gltf", "model/gltf+json"),
+    SceneFormat(".spz", read_spz_scene, write_spz, SMALL, own_companions=True),
+    SceneFormat(".splat", read_splat_scene, write_splat, LOSSES, own_companions=True),
+    SceneFormat(".sog", read_sog_scene, write_sog, SMALL, own_companions=True, folder_file=META_NAME),
+    SceneFormat(".glb", read_gltf_scene, write_gltf, GLTF, own_companions=True, mime="model/gltf-binary"),
+    SceneFormat(".gltf", read_gltf_scene, write_gltf, GLTF, own_companions=True, mime="model/gltf+json"),
 )
 
 
@@ -238,13 +220,17 @@ def warn_of_undrawable(path: Path, gaussians: Gaussians) -> None:
 # ---- writing ----
 
 
-def check_writable(path: Path | str) -> SceneFormat:
-    """Raise InputError unless `save_scene` can write a scene of this name and its companions there."""
+def check_writable(path: Path | str, *sources: Path) -> SceneFormat:
+    """Raise InputError unless `save_scene` can write a scene of this name and its companions there.
+
+    None of them may be a file of the scenes `sources`.
+    """
     path = Path(path)
     for row in formats():
         if row.suffix == path.suffix.lower() and row.write is not None:
             for file in (path, *_companions(path)):
                 check_output_file(file)
+            check_keeps(path, *sources)
             return row
     raise InputError(f"{path}: scenes are written as {', '.join(writable_suffixes())}; choose such a name")
 
@@ -257,6 +243,15 @@ def check_keeps(out: Path, *sources: Path) -> None:
         raise InputError(f"{shown(out)}: would replace the original scene; choose another name")
 
 
+def report_left_out(path: Path, scene: Scene, kind: str, loses: Sequence[str], keeper: str) -> None:
+    """Report what files of a `kind` have no room for, and warn where the origin lies in the file `keeper`."""
+    if lost := [what for what in loses if what in PARTS and PARTS[what](scene)]:
+        report_loss("%s: %s have no room for %s", shown(path), kind, ", ".join(lost))
+    if "origin" in loses and scene.origin.any():
+        where = " ".join(f"{value:.10g}" for value in scene.origin)
+        log.warning("%s: %s have no room for the origin %s, which %s keeps", shown(path), kind, where, keeper)
+
+
 def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
     """Write `scene` in the format of its name, with its companions; those it lacks are removed.
 
@@ -265,22 +260,16 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
     into place, and last the new companions. Interrupted anywhere, there is the old scene or the new one,
     perhaps without companions, but never a scene beside companions of another. A scene with companions that
     could not be read is not written: that would remove them. Raises InputError then, and as `check_writable`.
-    `tell`: report what the format has no room for, and log a warning where the origin lies in a companion.
+    `tell`: say what the format has no room for, see `report_left_out`.
     """
     path = Path(path)
     if scene.unread:
         raise InputError(f"not written without what lies beside it; mend or remove that: {scene.unread[0]}")
     row = check_writable(path)
     assert row.write is not None
-    has = {
-        "view dependence": bool(scene.gaussians.sh[:, 1:].any()),
-        "antialiasing": scene.antialiased,
-        "metres per unit": scene.metres_per_unit is not None,
-        "extra properties": bool(scene.extras),
-    }
-    if tell and (lost := [what for what in row.loses if has.get(what)]):
-        report_loss("%s: %s files have no room for %s", shown(path), row.suffix, ", ".join(lost))
     sidecar, cameras, origin = _companions(path)
+    if tell:
+        report_left_out(path, scene, f"{row.suffix} files", row.loses, origin.name)
     path.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as lock, ExitStack() as renames:  # made in the reverse order of these lines
         if scene.cameras:
@@ -301,10 +290,6 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
         lock.enter_context(locked(path.parent))
         for companion in (sidecar, cameras, origin):
             companion.unlink(missing_ok=True)
-    if beside and tell:
-        where = " ".join(f"{value:.10g}" for value in scene.origin)
-        log.warning("%s: %s files have no room for the origin %s, which %s keeps",
-                    shown(path), row.suffix, where, origin.name)  # fmt: skip
 
 
 # ---- the files of a scene ----
@@ -388,3 +373,4 @@ class Exporter:
 
     about: str  # what is written, a sentence
     write: Callable[[ExportRequest, Progress], tuple[str, ...]]  # returns lines to print
+    loses: tuple[str, ...] = ()  # as of `SceneFormat`

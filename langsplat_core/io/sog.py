@@ -228,7 +228,7 @@ ROUNDS = 30  # of Lloyd's algorithm for one
 HALVINGS = 16  # that make the palette of higher coefficients, of 65536 entries at most
 
 
-def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False) -> None:
+def write_sog(path: Path | str, scene: Scene) -> None:
     """Write a bundled .sog, atomically; rows keep their order.
 
     Positions are rounded to 1/65535 of the scene's extent in sign(x) log(1 + |x|), quaternions and opacities
@@ -237,6 +237,7 @@ def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
     that cannot be drawn is written with opacity 0. Raises InputError where the steps of positions are larger
     than most Gaussians.
     """
+    gaussians = scene.gaussians
     valid, count = gaussians.valid(), len(gaussians)
     images: dict[str, Array] = {}
 
@@ -277,7 +278,7 @@ def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
         "quats": {"files": [plane("quats.webp", to_bytes((three / np.sqrt(2) + 0.5) * 255), 252 + largest)]},
         "sh0": {"codebook": base_book.tolist(), "files": [plane("sh0.webp", base, opacities)]},
     }
-    if antialiased:
+    if scene.antialiased:
         meta["antialias"] = True
     if gaussians.sh_degree and valid.any():
         entry, palette = _palette(colours[:, 1:].reshape(count, -1), valid)

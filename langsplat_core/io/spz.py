@@ -226,7 +226,7 @@ def _scene(packed: _Packed, tell: Tell) -> Scene:
     return Scene(turned, antialiased=bool(packed.header.flags & ANTIALIASED))
 
 
-def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False) -> None:
+def write_spz(path: Path | str, scene: Scene) -> None:
     """Write .spz version 3, atomically; rows keep their order.
 
     Positions are rounded to 1/4096 world unit, or finer where the Gaussians are smaller than that; scales
@@ -235,7 +235,7 @@ def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
     cannot be drawn is written with opacity 0, and sizes that are cut are warned of. Raises InputError for a
     scene so large that 24 bits cannot tell its positions apart, or whose sizes it cannot say.
     """
-    valid = gaussians.valid()
+    gaussians, valid = scene.gaussians, scene.gaussians.valid()
     drawn = mirrored(gaussians.take(valid), _signs_to_rdf(AXES_RUB))  # half a turn, its own inverse
     bits = _fractional_bits(drawn, Path(path))
     sizes = drawn.log_scales.max(axis=1, initial=-np.inf)
@@ -255,7 +255,7 @@ def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
         "rotations": _rotation_codes(drawn.quats_wxyz),
         "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128),
     }
-    flags = ANTIALIASED if antialiased else 0
+    flags = ANTIALIASED if scene.antialiased else 0
     header = _Header(MAGIC, 3, len(valid), gaussians.sh_degree, bits, flags, 0)
     content = [_HEADER.pack(*astuple(header))]
     for name, width in header.widths.items():

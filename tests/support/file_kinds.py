@@ -807,6 +807,10 @@ def _scenes(file: str, *samples: bytes, damage: Mutation = mutant, told: int = 0
     return FileKind(file, lambda _: [*samples], scene_share, damage, told=told)
 
 
+def as_gltf(gaussians: Gaussians, name: str) -> bytes:
+    return bytes_of(write_gltf, Scene(gaussians), name=name)
+
+
 KINDS = {
     "INRIA PLY": _scenes(
         *("a.ply", plain_ply(SCENE), plain_ply(PLAIN), mixed_ply(SCENE), ascii_ply(random_gaussians(5))),
@@ -821,8 +825,8 @@ KINDS = {
         f"SPZ {v}": _scenes("a.spz", spz_bytes(SCENE, v), spz_bytes(PLAIN, v), damage=in_gzip)
         for v in (1, 2, 3, 4)
     },
-    ".glb": _scenes("a.glb", *(bytes_of(write_gltf, g, name="a.glb") for g in (SCENE, PLAIN)), damage=in_glb),
-    ".gltf": _scenes("a.gltf", bytes_of(write_gltf, random_gaussians(3), name="a.gltf"), damage=in_json),
+    ".glb": _scenes("a.glb", *(as_gltf(one, "a.glb") for one in (SCENE, PLAIN)), damage=in_glb),
+    ".gltf": _scenes("a.gltf", as_gltf(random_gaussians(3), "a.gltf"), damage=in_json),
     ".splat": _scenes("a.splat", splat_bytes(SCENE), splat_bytes(PLAIN)),
     "sidecar": FileKind("a.langsplat.safetensors", sidecars, searched, in_safetensors),
     "taught words": FileKind("a.safetensors", word_files, asked_words, in_safetensors),

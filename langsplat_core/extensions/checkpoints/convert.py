@@ -93,5 +93,8 @@ def _export_occam(request: ExportRequest, progress: Progress) -> tuple[str, ...]
 
 
 IMPORTER = Importer((".pth", ".pt", ".ckpt", ".npz"), _import)
-LANGSPLAT = Exporter("a folder with LangSplat's three checkpoints and its autoencoder", _export_langsplat)
-OCCAM = Exporter("a folder with Occam's LGS's three checkpoints of whole vectors", _export_occam)
+LOSES = ("cameras", "metres per unit", "antialiasing", "extra properties", "taught words", "origin")
+LANGSPLAT = Exporter(
+    "a folder with LangSplat's three checkpoints and its autoencoder", _export_langsplat, LOSES
+)
+OCCAM = Exporter("a folder with Occam's LGS's three checkpoints of whole vectors", _export_occam, LOSES)

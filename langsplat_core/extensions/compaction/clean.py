@@ -36,7 +36,7 @@ from langsplat_core.extensions.compaction.compact import (
     mean_psnr,
     psnr_losses,
 )
-from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import Camera, Gaussians, Scene
@@ -272,8 +272,7 @@ def clean_scene(
     source: Path, out: Path, config: CleanConfig, photos: Path | None = None, progress: Progress = silent
 ) -> CleanReport:
     """Write the scene `source` without its floaters to `out`, with all that belongs to it; see `clean`."""
-    check_writable(out)
-    check_keeps(out, source)
+    check_writable(out, source)
     check_settings(config)
     scene = load_scene(source)
     views = choose_views(scene, photos, config, progress)

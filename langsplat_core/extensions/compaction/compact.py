@@ -45,7 +45,7 @@ from langsplat_core.config import DatasetConfig, Decibels, Range, SeveralCount, 
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import shown
-from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.io.summary import disk_bytes, memory_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import colours_seen, render, view_of
@@ -243,9 +243,8 @@ def compact_scene(
     `photos` is the dataset it was trained on; without, the loss is derived from the change of the images.
     Raises InputError, and leaves `out` as it was, where the budget cannot be kept or nothing can be dropped.
     """
-    check_writable(out)
+    check_writable(out, source)
     check_settings(config)
-    check_keeps(out, source)
     scene = load_scene(source)
     views = choose_views(scene, photos, config, progress)
     measured = views.measured(scene)

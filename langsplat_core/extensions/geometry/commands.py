@@ -154,8 +154,7 @@ class Merge:
 
     @optional_imports()
     def run(self) -> None:
-        check_writable(self.out)
-        check_keeps(self.out, self.first, self.second)
+        check_writable(self.out, self.first, self.second)
         if self.as_is and self.transform is not None:
             raise InputError("--as-is moves nothing, --transform does; give one of them")
         first, second = load_scene(self.first), load_scene(self.second)
