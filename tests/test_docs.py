@@ -119,8 +119,41 @@ def run(start: list[str], more: tuple[str, ...] = ()) -> None:
 def test_readme_query_runs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(["langsplat", "query"])
     answers = json.loads(capsys.readouterr().out)
-    assert [answer["phrase"] for answer in answers] == ["handle of the red mug"]
+    assert [answer["phrase"] for answer in answers] == ["lid of the teapot"]
     assert all(len(answer["pixel"]) == 2 for answer in answers)
+
+
+ROWS = re.compile(r"^\| ([a-z][^|]*) \| [a-z0-9][^|]*  [^|]* \|", re.MULTILINE)  # phrase, reading
+SAID = re.compile(r"(?:such as|, as|, like|example:[\w ]*|look for:) ((?:'[^']+'(?:, | or )?)+)")
+
+
+def example_phrases() -> set[str]:
+    """What the pages' commands ask a scene.ply, the grammar's table and what programs say as an example."""
+    found: list[str] = []
+    for page in PAGES:
+        text = page.read_text()
+        for program, *words in commands(text):
+            named = {"scene.ply", "assets/demo/scene.ply", "scans/"} & {*words}
+            if named and not {"--why", "--at"} & {*words}:
+                parsed = vars(PARSERS[program](words))
+                asked = ("texts", "query", "phrase", "goal", "words")
+                found += (p for name in asked for p in np.atleast_1d(parsed.get(name, ())).tolist() if p)
+    for row in ROWS.findall((ROOT / "docs" / "searching.md").read_text().replace(" (3)", "")):
+        found += re.sub(r" \(.*?\)|, up to.*|; but not.*", "", row).split("; ")
+    sources = [path for room in ("langsplat_core", "app") for path in (ROOT / room).rglob("*.py")]
+    for said in SAID.findall("\n".join(path.read_text() for path in sources)):
+        found += re.findall("'([^']+)'", said)
+    return {p for p in found if not re.search(r"/|\bNora|^grandma", p)}
+
+
+def test_every_example_is_found_in_the_bundled_scene(capsys: pytest.CaptureFixture[str]) -> None:
+    phrases = sorted(example_phrases())
+    assert {"blue gift", "lid of the teapot", "duck on the table", "toy, not teddy bear"} <= {*phrases}
+    scene = str(files("langsplat_assets") / "demo" / "scene.ply")
+    assert main("langsplat", lambda: parse(["query", scene, *phrases, "--json", "-q"])) == 0
+    answers = json.loads(capsys.readouterr().out)
+    assert len(answers) == len(phrases)
+    assert [a["phrase"] for a in answers if not a["found"]] == []
 
 
 @pytest.mark.long

@@ -170,6 +170,7 @@ class TrainingForm:
     out: str = ""
     preset: TrainPreset = "good"
     encoder: str = "demo"
+    gaussians: str = ""  # a scene that gets a language field; empty: its Gaussians are trained, too
 
 
 Gizmo = Literal["off", "move", "rotate", "scale", "box"]
@@ -223,6 +224,7 @@ class SceneState:
     outline: OutlineView | None = None  # once it was wanted
     evidence: tuple[str, Array] | None = None  # a phrase, and what its answer stands on: (H, W, 3) uint8
     suggestions: Suggestions = field(default_factory=Suggestions)
+    offered: tuple[str, tuple[str, tuple[str, ...]]] = ("", ("", ()))  # what was typed, and its offers
     suggestions_of: Scene | None = None  # the scene for which they were looked for
     _edited: EditedScene | None = None  # of the last request
 

@@ -62,6 +62,7 @@ def command(form: TrainingForm) -> list[str]:
         *(*program, "train", form.dataset, "--out", form.out),
         *("--preset", form.preset, "--clip.model", form.encoder, "--progress", "lines"),
         *("--radiance.checkpoint-every", str(PREVIEW_EVERY)),
+        *(("--gaussians", form.gaussians) if form.gaussians else ()),
     ]
 
 

@@ -179,7 +179,7 @@ class QueryScene:
     """Semantic level; auto takes the one that answers best, for a thing rather the whole."""
     mode: Literal["splat", "paper"] = "splat"
     """splat: relevancy per Gaussian, then blended. paper: latents blended, every pixel decoded, and phrases
-    asked whole, without looking for structure such as "handle of the red mug"."""
+    asked whole, without looking for structure such as "lid of the teapot"."""
     camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
     """Training view in which the pixel is reported."""
     encoder: EncoderOption = ""
@@ -199,7 +199,7 @@ class QueryScene:
         """Ask, and print the answers."""
         scene = searchable(self.scene)
         if not self.texts:
-            raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
+            raise InputError("no phrase given; for example: langsplat query scene.ply 'blue gift'")
         explain = _Explainer(self, scene) if self.why is not None else None
         camera = camera_of(scene, self.camera) if scene.cameras else None
         engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
@@ -458,7 +458,7 @@ class Select:
     def _check(self) -> None:
         """InputError for what needs no scene to be known: it should not cost the loading of one."""
         if not self.texts:
-            raise InputError("no phrase given; say: langsplat select scene.ply 'red cup' --out cup.ply")
+            raise InputError("no phrase given; say: langsplat select scene.ply 'blue gift' --out gift.ply")
         check_writable(self.out, self.scene)
         folder = self.out.parent
         if not folder.is_dir():

@@ -111,9 +111,9 @@ def only(words: frozenset[str], tokens: Sequence[str]) -> bool:
 def check_names(words: Sequence[str]) -> None:
     """InputError for no word, and for stop words alone, whose vectors are near anything."""
     if not words:
-        raise InputError("the query is empty; type a word such as 'cup'")
+        raise InputError("the query is empty; type a word such as 'teapot'")
     if only(STOP_WORDS, words):
-        raise InputError(f"'{' '.join(words)[:60]}' names nothing to look for; type a thing, as 'red mug'")
+        raise InputError(f"'{' '.join(words)[:60]}' names nothing to look for; type a thing, as 'blue gift'")
 
 
 Side = Literal["on", "in", "near", "left of", "right of", "above", "below", "behind", "in front of"]
@@ -297,7 +297,7 @@ def parse(text: str, names: Collection[str] = ()) -> Phrase:
     if words and _exclusion_at(tokens, 0):
         raise InputError(
             f"'{' '.join(words)[:60]}' only says what not to look for; "
-            "begin with what to look for: 'mug, not red mug'"
+            "begin with what to look for: 'toy, not teddy bear'"
         )
     check_names(words)
     tree = _query(tokens)

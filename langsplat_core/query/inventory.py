@@ -8,7 +8,7 @@ are candidates for the inventory; those that claim the same features are one thi
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, permutations
 from pathlib import Path
 from typing import Any, get_args
 
@@ -23,6 +23,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import LIKELY, OR, Describer, Word, likely_name
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.grammar import is_part
 from langsplat_core.query.instances import axis_aligned_box, oriented_box
 from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.scene.language import phrase_key
@@ -322,6 +323,15 @@ def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = s
     candidates = tuple(dict.fromkeys((*here, *engine.field.phrasebook)))
     found = (phrase for phrase in candidates[: TRIES * at_most] if _is_found(engine, phrase))
     return Suggestions(tuple(islice(found, at_most)), tuple(dict.fromkeys((*candidates, *taught))))
+
+
+def combined(engine: QueryEngine, suggestions: Suggestions) -> tuple[str, ...]:
+    """Return a part of a thing and a thing near another, as phrases that are asked and found; maybe none."""
+    here = suggestions.phrases[: TRIES * EXAMPLES]
+    parts = (phrase for phrase in here if " " in phrase and is_part(phrase.split()[-1]))
+    pairs = (f"{thing} near the {other}" for thing, other in permutations(suggestions.examples, 2))
+    firsts = (islice((p for p in kind if _is_found(engine, p)), 1) for kind in (parts, islice(pairs, 12)))
+    return tuple(phrase for first in firsts for phrase in first)
 
 
 def _is_found(engine: QueryEngine, phrase: str) -> bool:

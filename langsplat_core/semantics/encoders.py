@@ -189,7 +189,7 @@ class PhraseEncoder:
 
     def _check(self, text: str) -> None:
         if not WORD.search(text):
-            raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'red mug'")
+            raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'blue gift'")
         unknown = self.unknown_words(text)
         if unknown:
             words = sorted(self.words or ())
@@ -251,7 +251,7 @@ def clean_text(text: str) -> str:
 
     plain = " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split())
     if not any(map(str.isalnum, plain)):
-        raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'red mug'")
+        raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'blue gift'")
     return plain
 
 

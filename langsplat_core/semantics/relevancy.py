@@ -138,7 +138,7 @@ def read_vocabulary(path: Path) -> tuple[str, ...]:
             )
         phrases[phrase] = None
     if not phrases:
-        raise InputError(f"{path}: the vocabulary is empty; write one phrase per line, such as 'cup'")
+        raise InputError(f"{path}: the vocabulary is empty; write one phrase per line, such as 'teapot'")
     return tuple(phrases)
 
 

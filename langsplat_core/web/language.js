@@ -28,7 +28,8 @@ class Language {
   ask(text, levelName = "auto") {
     const key = phraseKey(text);
     if (!key) {
-      throw new PhraseError(`Type what to look for, such as “${this.meta.examples[0] || "cup"}”.`);
+      const [example] = this.meta.examples;
+      throw new PhraseError(`Type what to look for${example ? `, such as “${example}”` : ""}.`);
     }
     const level = this.meta.levels.indexOf(levelName); // -1: free
     const word = this.taught.get(key);

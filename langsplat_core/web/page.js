@@ -82,6 +82,9 @@ class Page {
     }
     document.querySelector(".check").hidden = !language;
     if (language) {
+      if (language.examples.length) {
+        byId("phrase").placeholder = `${language.examples.slice(0, 2).join(", ")} …`;
+      }
       byId("examples").append(
         ...language.examples.map((phrase) => {
           const button = element("button", phrase, { type: "button" });

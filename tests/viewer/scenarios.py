@@ -9,6 +9,7 @@ import numpy as np
 
 from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.query.inventory import Suggestions
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_viewer.actions import editing, opening, settings, viewpoint
 from langsplat_viewer.camera.controls import from_side
@@ -92,6 +93,23 @@ def draw_over_the_scene(s: Any) -> None:
     s.draws_nothing()
     s.key("escape", frames=2)
     assert not s.state.session.ruler.measures
+
+
+def offers_keep_still(s: Any) -> None:
+    """Offers that come and go move nothing below them, and change under the pointer only by typing."""
+    s.state.suggestions = Suggestions()
+    s.rest(3)
+    level = s.ctx.item_info("//**/whole").rect_full.min.y
+    s.state.suggestions = Suggestions(("mug", "book"), ("mug", "book", "bookcase"))
+    s.rest(3)
+    assert s.ctx.item_info("//**/whole").rect_full.min.y == level
+    s.ctx.mouse_move("//**/###offer 1")
+    s.state.suggestions = Suggestions(("plant",))
+    s.rest(3)
+    s.click("//**/###offer 1")
+    assert [query.phrase for query in s.state.session.queries] == ["book"]
+    s.click_at((700, 500))
+    assert not s.ctx.item_exists("//**/###offer 1")
 
 
 def turn_the_wheel(s: Any, times: int) -> None:

@@ -141,12 +141,13 @@ def test_folder_without_photographs_is_refused(viewer, tmp_path, monkeypatch, da
 
 
 def test_training_command_is_parsed_by_the_program():
-    words = command(TrainingForm("photos", "s.ply", "quick", "demo"))
+    words = command(TrainingForm("photos", "s.ply", "quick", "demo", "trained.ply"))
     assert words[1:3] == ["-m", "langsplat_core"]
     parsed = parse(words[3:])
     assert (parsed.dataset, parsed.out, parsed.progress) == (Path("photos"), Path("s.ply"), "lines")
     assert (parsed.config.radiance.steps, parsed.config.clip.model) == (500, "demo")
     assert parsed.config.radiance.checkpoint_every == PREVIEW_EVERY
+    assert parsed.gaussians == Path("trained.ply")
 
 
 def test_other_output_is_kept_as_words():

@@ -357,6 +357,12 @@ def save_with_a_key(s: Session) -> None:
 def without_field(s: Session) -> None:
     assert any("langsplat train" in message.text for message in s.state.messages)
     assert not s.ctx.item_exists("//**/##phrase")
+    (s.folder / "images").mkdir()
+    (s.folder / "images" / "1.jpg").touch()
+    s.click("//**/Train a language field ...")
+    form = s.state.training_form
+    assert (form.gaussians, form.dataset) == (str(s.folder / "plain.ply"), str(s.folder))
+    assert s.ctx.item_exists("//**/##Gaussians to train")
     s.key("4", frames=1)  # relevancy: refused with a line, not a crash
     assert s.state.session.picture.display == "rgb"
 

@@ -26,6 +26,7 @@ from langsplat_viewer.camera.controls import Extent, extent_of
 from langsplat_viewer.disk import Stamps, stamps
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import unmarked
+from langsplat_viewer.output import free_name
 from langsplat_viewer.projects import PATHS, PROJECTS, Project, read_project
 from langsplat_viewer.rendering.request import Split, why_undrawable
 from langsplat_viewer.session import Marked, Query, Session, Things
@@ -409,6 +410,25 @@ def choose_photographs(viewer: Viewer, folder: Path) -> None:
     viewer.state.training_form = replace(form, dataset=str(folder), out=out)
 
 
+def train_language(viewer: Viewer) -> None:
+    """Open the panel "Train" for a language field of the scene that is shown, a new file beside it.
+
+    The photographs are named where they lie as COLMAP has them, in "images" beside the scene or one above.
+    """
+    path = viewer.state.path
+    if path is None:
+        return
+    path = path.absolute()
+    near = (place for place in (path.parent, path.parent.parent) if (place / "images").is_dir())
+    viewer.state.training_form = replace(
+        viewer.state.training_form,
+        dataset=next((str(place) for place in near if count_photographs(place)), ""),
+        gaussians=str(path),
+        out=str(free_name(path.parent, f"{path.name.partition('.')[0]}-language", ".ply")),
+    )
+    open_panel(viewer, "Train")
+
+
 def start_training(viewer: Viewer) -> None:
     """Train, or go on with what was interrupted: the same photographs and name continue."""
     form, typed = viewer.state.training_form, viewer.state.training_form.dataset.strip()
@@ -422,6 +442,7 @@ def start_training(viewer: Viewer) -> None:
         viewer.say_error(f"no photographs in '{typed}'; name a folder that has some")
         return
     form = replace(form, dataset=str(dataset), out=str(out), encoder=form.encoder.strip() or "demo")
+    form = replace(form, gaussians=form.gaussians.strip())
     try:
         viewer.training = Training(form, viewer.worker.wake)
     except OSError as error:

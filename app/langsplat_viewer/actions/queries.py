@@ -14,7 +14,7 @@ from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.inventory import Suggestions, completions, corrected, suggest
+from langsplat_core.query.inventory import Suggestions, combined, completions, corrected, suggest
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
@@ -24,6 +24,7 @@ from langsplat_viewer.state import QueryAnswer
 from langsplat_viewer.viewer import Viewer
 
 MOST_THINGS = 20  # instances of one answer
+SIMPLE = 4  # examples without structure
 
 
 def ask(viewer: Viewer, text: str) -> None:
@@ -231,7 +232,9 @@ def prepare_suggestions(viewer: Viewer) -> None:
     here = viewer.has_encoder_here
 
     def work(engine: QueryEngine, progress: Progress) -> Suggestions:
-        return suggest(engine if here else QueryEngine(scene), progress=progress)  # else by the phrasebook
+        asked = engine if here else QueryEngine(scene)  # by the phrasebook
+        found = suggest(asked, progress=progress)
+        return replace(found, examples=(*found.examples[:SIMPLE], *combined(asked, found)))
 
     viewer.ask_engine("finding examples", work, partial(setattr, state, "suggestions"), lambda reason: None)
 
@@ -248,6 +251,16 @@ def offers(viewer: Viewer, typed: str) -> tuple[str, tuple[str, ...]]:
         return "try", state.suggestions.examples
     meant = state.answer(queries[-1]).meant
     return "did you mean", (meant,) if meant else ()
+
+
+def offered(viewer: Viewer, typed: str, is_pointed_at: bool) -> tuple[str, tuple[str, ...]]:
+    """Return `offers`; those of the last call where they are pointed at and nothing else was typed since."""
+    state = viewer.state
+    before, shown = state.offered
+    if not (is_pointed_at and shown[1] and before == typed):
+        shown = offers(viewer, typed)
+    state.offered = typed, shown
+    return shown
 
 
 def ask_offered(viewer: Viewer, phrase: str) -> None:

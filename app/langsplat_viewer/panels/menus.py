@@ -163,13 +163,12 @@ KEYS_EM, DOES_EM = 13.0, 26.0  # widths of the columns
 FIRST_STEPS = (
     ("Look", "Drag turns the view, the right button moves it, the wheel goes nearer; double click what to "
      "turn around. R leads back."),
-    ("Search", "Type into the box and press Enter: 'red mug', 'handle of the mug', 'book on the table', "
-     "'three books', 'toy, not teddy bear'. Tab completes, arrow up recalls."),
+    ("Search", "Type into the box and press Enter{examples}. Tab completes, arrow up recalls."),
     ("Found, weak match, not here", "What the scene says of a phrase. Only what may be there is painted, "
      "and a weak match no hotter than half."),
     ("Relevancy", "From 0 to 1: how much nearer a place is to the phrase than to everyday words; "
      "0.5 is neither. What has less than the threshold is no part of the answer."),
-    ("Subpart, part, whole", "How finely things are divided: the handle, the cup, the cup with its saucer."),
+    ("Subpart, part, whole", "How finely things are divided: the knob, the lid, the teapot."),
     ("Displays, tools", "The strip at the left edge. The panel Outline lists what the scene holds."),
     ("Everything else", "Ctrl + Shift + P finds every command by its words. Without a mouse: Ctrl + Tab goes "
      "to the next panel, Tab and arrows travel in it."),
@@ -192,15 +191,16 @@ def draw_help(viewer: Viewer) -> None:
     imgui.text_disabled(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
     if imgui.begin_tab_bar("pages"):
         keys = [(", ".join(command.keys), command.does) for command in COMMANDS if command.keys]
+        examples = ", ".join(f"'{phrase}'" for phrase in viewer.state.suggestions.examples)
         for title, rows in (("First steps", FIRST_STEPS), ("Keys", (*HELD, *keys))):
             if imgui.begin_tab_item(title)[0]:
-                _table(rows)
+                _table(rows, f": {examples}" if examples else "")
                 imgui.end_tab_item()
         imgui.end_tab_bar()
     imgui.end()
 
 
-def _table(rows: Sequence[tuple[str, str]]) -> None:
+def _table(rows: Sequence[tuple[str, str]], examples: str) -> None:
     if imgui.begin_table("rows", 2):
         imgui.table_setup_column("what", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(KEYS_EM))
         imgui.table_setup_column("does", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(DOES_EM))
@@ -209,5 +209,5 @@ def _table(rows: Sequence[tuple[str, str]]) -> None:
             imgui.table_next_column()
             imgui.text_unformatted(what)
             imgui.table_next_column()
-            ui.small_wrapped(does, ui.muted())
+            ui.small_wrapped(does.replace("{examples}", examples), ui.muted())
         imgui.end_table()

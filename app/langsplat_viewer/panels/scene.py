@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import groupby
+from pathlib import Path
 
 import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui
@@ -177,10 +178,14 @@ def draw_training(viewer: Viewer) -> None:
         _running(viewer, viewer.training)
         return
     state, form = viewer.state, viewer.state.training_form
+    if form.gaussians and not form.dataset:
+        ui.small_wrapped(f"Which photographs was {Path(form.gaussians).name} made of?", ui.good())
     dataset = _text_box("Photographs", "a folder, a COLMAP project, transforms.json", form.dataset)
     form = replace(form, dataset=dataset)
     if imgui.button("Browse ..."):
         opening.ask_for_dataset(viewer)
+    hint = "a trained scene; empty: they are trained, too"
+    form = replace(form, gaussians=_text_box("Gaussians", hint, form.gaussians))
     form = replace(form, out=_text_box("Scene", "scene.ply", form.out))
     form = replace(form, encoder=_text_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
     preset = ui.radio({name: name for name in PRESETS}, form.preset, PRESETS)

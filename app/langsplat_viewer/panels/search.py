@@ -13,7 +13,7 @@ from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, painted
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import queries, settings, viewpoint
+from langsplat_viewer.actions import opening, queries, settings, viewpoint
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
 from langsplat_viewer.session import Query
@@ -50,12 +50,12 @@ def _box(viewer: Viewer) -> None:
         settings.put(viewer.state, focus_input=True, awaits_keyboard=True)  # for the next phrase
         if drafts[label].strip():
             queries.ask(viewer, drafts.pop(label))
-    title, phrases = queries.offers(viewer, drafts.get(label, ""))
-    if not phrases:
-        return
-    height = OFFER_LINES * imgui.get_text_line_height_with_spacing()
+    height = OFFER_LINES * imgui.get_text_line_height_with_spacing()  # with or without offers
     if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.nav_flattened):
-        _offer_buttons(viewer, title, phrases)
+        is_pointed_at = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item)
+        title, phrases = queries.offered(viewer, drafts.get(label, ""), is_pointed_at)
+        if phrases:
+            _offer_buttons(viewer, title, phrases)
     imgui.end_child()
 
 
@@ -236,6 +236,8 @@ def draw(viewer: Viewer) -> None:
     scene = viewer.state.scene
     if scene is not None and scene.language is None:
         ui.small_wrapped(no_field(scene), ui.muted())
+        if ui.button("Train a language field ...", "From the photographs of this scene; it stays as it is"):
+            opening.train_language(viewer)
         return
     imgui.begin_disabled(scene is None)
     _box(viewer)

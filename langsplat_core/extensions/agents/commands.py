@@ -95,7 +95,7 @@ class Door:
         return list(self._scenes)
 
     def find(self, phrase: str, scene: str = "") -> dict[str, Any]:
-        """Where something is: a phrase such as 'red mug', 'handle of the mug' or 'book on the table'.
+        """Where something is: a phrase such as 'blue gift', 'lid of the teapot' or 'duck on the table'.
 
         The verdict is 'found', 'weak match' or 'not here'; place is the middle of the best one, box its
         corners.

@@ -54,7 +54,7 @@ class Find:
 
     def run(self) -> None:
         if len(self.words) < 2:
-            raise InputError("give phrases and a folder; for example: langsplat find 'red mug' scans")
+            raise InputError("give phrases and a folder; for example: langsplat find 'blue gift' scans")
         if self.sheet is not None and self.sheet.suffix.lower() != ".html":
             raise InputError(f"--sheet {self.sheet}: name an .html file")
         phrases = [phrase for text in self.words[:-1] for phrase in split_phrases(text) or [text]]
