@@ -32,7 +32,7 @@ browser: $(STAMP)
 	@$(PYTHON) packaging/system_libraries.py --tests
 
 demo: system  ## install everything and open the bundled scene (without a display: pictures in demo_out/)
-	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] || [ "$$(uname)" != Linux ]; then $(BIN)/langsplat-viewer; \
+	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] || [ "$$(uname)" != Linux ]; then $(BIN)/langsplat-viewer assets/demo/scene.ply; \
 	else echo "No display: rendering the bundled scene to pictures instead of opening a window."; \
 	  $(BIN)/langsplat demo; fi
 

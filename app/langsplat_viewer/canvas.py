@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, Literal, TypeVar
 
 import moderngl
+from PIL import Image, ImageOps
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import BackendError
@@ -30,6 +31,7 @@ from langsplat_viewer.state import FrameStats, ViewerState
 
 REST_SECONDS = 0.07  # without a move, after which the camera rests
 MOVING_BUDGET = 25.0  # milliseconds of an image: with the panels, some thirty a second
+THUMBNAIL = (480, 300)  # pixels
 KEPT_SIZES = 3  # of images: the full one and two coarse ones
 
 
@@ -219,6 +221,16 @@ class Canvas:
         if self._drawn is None or request.projection != self._drawn.projection:
             self._renderer.forget()  # layers of another size, which may be gigabytes
         return image
+
+    def thumbnail(self) -> Image.Image | None:
+        """Return the image on screen, of the first pane, small; None while there is none."""
+        if not self.textures:
+            return None
+        texture = self.textures[0]
+        image = Image.frombytes("RGBA", texture.size, texture.read()).transpose(
+            Image.Transpose.FLIP_TOP_BOTTOM
+        )
+        return ImageOps.fit(image.convert("RGB"), THUMBNAIL)
 
     @property
     def waits(self) -> bool:

@@ -155,11 +155,18 @@ MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list of commands alone
     "File": (
-        Command("open a scene", opening.ask_for_file, ("Ctrl+O",), "Open ..."),
+        Command("open a scene", opening.ask_for_file, ("Ctrl+O",), "Open a scene ..."),
+        Command("start page", settings.toggle_start, is_on=lambda viewer: viewer.state.show_start),
         Command("reload the scene", opening.reload, ("F5",), apart=True),
         Command("next scene of the list", lambda v: opening.step_scene(v, 1), ("Ctrl+PageDown",)),
         Command("previous scene of the list", lambda v: opening.step_scene(v, -1), ("Ctrl+PageUp",)),
-        Command("train a scene", lambda viewer: settings.open_panel(viewer, "Train"), apart=True),
+        Command(
+            "train a scene",
+            lambda v: settings.open_panel(v, "Train"),
+            (),
+            "Train from photographs ...",
+            apart=True,
+        ),
         Command(
             "save a picture", saving.save_picture, ("Ctrl+S", "P"), "Save picture", icon="CAMERA", apart=True
         ),
@@ -282,7 +289,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
     "": tuple(_panel(title) for title in PANEL_TITLES),
     "Help": (
         Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),
-        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "Help"),
+        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "First steps"),
     ),
 }
 COMMANDS: tuple[Command, ...] = (

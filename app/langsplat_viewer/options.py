@@ -3,7 +3,6 @@
 import math
 import re
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,6 +28,7 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_viewer.camera.flight import SPAN_LIMITS
+from langsplat_viewer.projects import BUNDLED
 from langsplat_viewer.rendering.renderer import Backend
 from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.viewer import Services
@@ -47,7 +47,7 @@ class ViewerOptions:
     """Options of `langsplat-viewer`, for the window and for images without one."""
 
     scene: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[SCENE]")] = None
-    """Scene file, *.ply (default: the bundled demo)."""
+    """Scene file, *.ply (default: the start page; with anything to show, the bundled demo)."""
     query: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="TEXT")] = ()
     """Phrase to search for; repeat it for several. The last three are shown."""
     level: LevelChoice = "auto"
@@ -140,10 +140,9 @@ def scene_path(scene: Path | None) -> Path:
     InputError where it is absent or not a file.
     """
     if scene is None:
-        demo = Path(str(files("langsplat_assets") / "demo" / "scene.ply"))
-        if not demo.is_file():
-            raise InputError(f"the bundled demo scene is missing ({demo}); name a scene, or reinstall")
-        return demo
+        if not BUNDLED.is_file():
+            raise InputError(f"the bundled demo scene is missing ({BUNDLED}); name a scene, or reinstall")
+        return BUNDLED
     try:
         if not scene.exists():
             raise InputError(f"{scene}: no such file; check the spelling and the folder")

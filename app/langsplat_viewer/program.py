@@ -83,7 +83,8 @@ class ViewerCommand(ViewerOptions):
             scene_path(self.beside)
         from langsplat_viewer.window import open_window
 
-        open_window(path, self, services(self.encoder))
+        starts = self.scene is None and not (self.query or self.camera or self.path or self.beside)
+        open_window(None if starts else path, self, services(self.encoder))
 
 
 # Images and films without a window.

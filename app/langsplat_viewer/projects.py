@@ -6,6 +6,7 @@ checked here. Nothing in a file becomes a path, an array or a call that was not 
 
 import base64
 import binascii
+import hashlib
 import json
 import math
 import os
@@ -13,6 +14,7 @@ import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -456,6 +458,7 @@ def _from_version_1(top: dict[str, Any]) -> dict[str, Any]:
 
 # Preferences, and where they are kept.
 
+BUNDLED = Path(str(files("langsplat_assets") / "demo" / "scene.ply"))
 FILE_NAME, LAYOUT_NAME = "preferences.json", "layout.ini"
 DESIGNED = 1080  # window units: the height of the screen that a scale of 1 is made for
 
@@ -463,6 +466,14 @@ DESIGNED = 1080  # window units: the height of the screen that a scale of 1 is m
 def preferences_folder() -> Path:
     """Return the folder of the preferences; it need not exist."""
     return Path(platformdirs.user_config_path("langsplat-viewer", appauthor=False))
+
+
+def thumbnail_of(folder: Path | None, path: Path) -> Path | None:
+    """Return the file with the thumbnail of a scene or project; None where nothing is kept."""
+    if path == BUNDLED:
+        return path.with_suffix(".jpg")
+    name = hashlib.sha256(os.fsencode(path.absolute())).hexdigest()[:24]
+    return None if folder is None else folder / "thumbnails" / f"{name}.jpg"
 
 
 def fitting_scale(height: float) -> float:

@@ -282,6 +282,7 @@ class ViewerState(SceneState):
     wanted_panel: str = ""  # the title of one that is opened and brought to the front at the next frame
     show_panel: bool = True  # the panels, as many as are open
     show_help: bool = False
+    show_start: bool = False  # the start page, in place of panels and scene
     show_palette: bool = False
     resets_panels: bool = False  # at the next frame
     shows_panels: tuple[str, ...] = ()  # titles of those that alone are open from now on; (): as they are

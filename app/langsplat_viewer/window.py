@@ -5,6 +5,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,14 @@ import glfw  # isort: skip
 import moderngl
 
 from langsplat_core.errors import BackendError, InputError, LangSplatError
+from langsplat_core.io.files import atomic_path
 from langsplat_viewer import projects
 from langsplat_viewer.actions import opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import spanning
 from langsplat_viewer.canvas import MOVING_BUDGET, Canvas
 from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
 from langsplat_viewer.options import ViewerOptions, chosen_camera, latent_level
-from langsplat_viewer.panels import layout, menus, navigation, outline, overlays, ui
+from langsplat_viewer.panels import dialogs, layout, menus, navigation, outline, overlays, ui
 from langsplat_viewer.panels.navigation import Keyboard
 from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
 from langsplat_viewer.session import Preferences
@@ -134,7 +136,7 @@ AWAKE_FRAMES = 4  # after news from the worker, for the same reason
 RECORDER_PATIENCE = 5.0  # seconds for a film that is being drawn to leave nothing half written
 
 
-def open_window(path: Path, options: ViewerOptions, services: Services) -> None:
+def open_window(path: Path | None, options: ViewerOptions, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
     share_one_heap()
     window = Window(path, options, services, folder=None if options.fresh else projects.preferences_folder())
@@ -153,14 +155,17 @@ class Window:
 
     def __init__(
         self,
-        path: Path,
+        path: Path | None,
         options: ViewerOptions,
         services: Services,
         make_renderer: Callable[[moderngl.Context, Backend], Renderer[Any]] = renderer_for,
         folder: Path | None = None,
         budget: float = MOVING_BUDGET,
     ) -> None:
-        """Keep what is remembered in `folder`, nothing for None; `budget` is that of `Canvas`."""
+        """Keep what is remembered in `folder`, nothing for None; `budget` is that of `Canvas`.
+
+        `path`: what is opened; None: the start page.
+        """
         self.viewer = Viewer(services, shelf=projects.Shelf(folder))
         self.failure: LangSplatError | None = None  # why the window could not work
         self._path, self._options, self._size = path, options, options.wanted_size
@@ -181,6 +186,8 @@ class Window:
         self._last: tuple[object, ...] = ()  # what was there in the last frame
         self._tidied: tuple[int, int] = (0, 0)  # news after which memory was given back
         self._titled: Path | None = None  # the scene that the window's title names
+        self._start_page = dialogs.StartPage(folder)
+        self._folder = folder
 
     def params(self) -> hello_imgui.RunnerParams:
         """Everything hello_imgui wants to know. Raises BackendError where no window can be opened."""
@@ -237,7 +244,9 @@ class Window:
         imgui.get_io().config_flags |= imgui.ConfigFlags_.nav_enable_keyboard
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
         settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
-        if self._path.name.endswith(projects.PROJECTS):  # which says itself how it is looked at
+        if self._path is None:
+            settings.put(self.viewer.state, show_start=True, show_help=False)
+        elif self._path.name.endswith(projects.PROJECTS):  # which says itself how it is looked at
             opening.open_project(self.viewer, self._path, self._ask)
         else:
             opening.open_scene(self.viewer, self._path, self._first_view)
@@ -366,15 +375,28 @@ class Window:
     def _title(self) -> None:
         path = self.viewer.state.path
         if path is not None and path != self._titled:
+            self._keep_thumbnail((self._titled,))
             glfw.set_window_title(glfw_window_hello_imgui(), f"{path.name} - {TITLE}")
             self._titled = path
+
+    def _keep_thumbnail(self, paths: tuple[Path | None, ...]) -> None:
+        """Keep the image on screen as that of the files in `paths`, for the start page."""
+        image = None if self._canvas is None else self._canvas.thumbnail()
+        for path in paths:
+            kept = None if path is None else projects.thumbnail_of(self._folder, path)
+            if image is None or kept is None or path == projects.BUNDLED:
+                continue
+            with suppress(OSError):
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                with atomic_path(kept) as temporary:
+                    image.save(temporary, format="JPEG")
 
     def _draw(self) -> None:
         """Take what the panels left of mouse and keys, bring the image up to date and draw it behind them."""
         if self.failure is not None:
             return
         viewer, area = self.viewer, ui.scene_area()
-        layout.draw_over(viewer)
+        layout.draw_over(viewer, self._start_page)
         self._menu.draw(viewer, area)
         overlays.draw_evidence(viewer, self._evidence)
         navigation.handle(viewer, area)
@@ -403,6 +425,7 @@ class Window:
     def _stop(self) -> None:
         saving.finish_writing(self.viewer)
         self._workspace.update()
+        self._keep_thumbnail((self.viewer.state.path, self.viewer.state.project))
         self.viewer.watch.close()
         for canvas in self._canvases:
             if canvas is not None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import load_scene, save_scene
@@ -18,6 +19,7 @@ from langsplat_viewer.panels import select
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.menus import button_label
 from langsplat_viewer.panels.ui import scene_area
+from langsplat_viewer.projects import thumbnail_of
 from langsplat_viewer.rendering.request import TINT
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
 from tests.support.windowless import answer, marked, result
@@ -93,6 +95,33 @@ def draw_over_the_scene(s: Any) -> None:
     s.draws_nothing()
     s.key("escape", frames=2)
     assert not s.state.session.ruler.measures
+
+
+def begin_at_the_start_page(s: Any) -> None:
+    """Without a scene the page offers what was open lately, with thumbnails; nothing is drawn meanwhile."""
+    blobs = s.folder / "blobs.ply"
+    s.settle()
+    assert s.state.show_start
+    assert not s.ctx.item_exists("//**/##phrase")
+    s.click("//start/Train from photographs ...")
+    assert not s.state.show_start
+    assert s.ctx.item_exists("//**/##Photographs to train")
+    settings.prefer(s.viewer, recent=(str(blobs), str(s.folder / "gone.ply")))
+    s.menu("File", "Start page")
+    assert not s.ctx.item_exists("//start/$$2/##card")  # after the bundled scene and the one that is there
+    assert s.drawn == 0
+    s.click("//start/$$1/##card", frames=5)
+    s.shows("blobs.ply")
+    assert not s.state.show_start
+    assert s.ctx.item_exists("//**/##phrase")
+    s.menu("File", "Start page")
+    assert s.ctx.item_exists("//start/$$1/##card")
+    s.draws_nothing()
+    s.key("escape", frames=3)
+    assert not s.state.show_start
+    s.drop("plain.ply")
+    kept = thumbnail_of(s.folder / "settings", blobs)
+    assert np.asarray(Image.open(kept)).std() > 10
 
 
 def offers_keep_still(s: Any) -> None:

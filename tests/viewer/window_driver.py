@@ -51,7 +51,7 @@ class Session:
     def __init__(
         self,
         folder: Path,
-        scene: str,
+        scene: str | None,
         load=load_scene,
         size: str = "860x620",
         backend: Backend = "opengl",
@@ -59,11 +59,13 @@ class Session:
         **options,
     ) -> None:
         self.folder = folder
-        self.is_slow = load is not load_scene  # the scenario begins while the scene is read
+        # The scenario begins while the scene is read, or before one is.
+        self.is_slow = load is not load_scene or scene is None
         self.drawn = 0  # pictures
         services = Services(load, lambda encoder_id: FakeEncoder())
+        path = None if scene is None else folder / scene
         wanted = ViewerOptions(size=size, backend=backend, **options)
-        self.window = Window(folder / scene, wanted, services, self._make_renderer, remembered)
+        self.window = Window(path, wanted, services, self._make_renderer, remembered)
         self.window.idles = False
         self.state = self.window.viewer.state
 
@@ -374,7 +376,7 @@ def without_field(s: Session) -> None:
     s.shows("blobs.ply")
     assert s.ctx.item_exists("//**/##phrase")
     s.open_panel("Scene", frames=3)
-    s.ctx.item_click("//**/Help")
+    s.ctx.item_click("//**/First steps")
     s.open_panel("Camera", frames=3)
     s.ctx.item_click("//**/##next")
     s.until(lambda: s.state.camera_index == 1)
@@ -479,6 +481,7 @@ OPENED = {  # scene and request of the scenarios that do not just open "blobs.pl
     "without_field": ("plain.ply", {}),
     "from_the_command_line": ("blobs.ply", ASKED),
     "leave_settings": ("blobs.ply", {"remembered": Path("settings")}),
+    "begin_at_the_start_page": (None, {"remembered": Path("settings")}),
     "find_settings": ("blobs.ply", {"remembered": Path("settings")}),
     "close_while_opening": ("blobs.ply", {"load": slow_load}),
     "look_at_nothing": ("nothing.ply", {}),

@@ -124,7 +124,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
         )
     )
     state.view, state.opening, state.leaving = viewpoint.opening_view(viewer), None, None
-    state.tools = replace(state.tools, stroke=None)
+    state.tools, state.show_start = replace(state.tools, stroke=None), False
     add_scenes(viewer, [path])
     state.preferences = state.preferences.with_recent(path.absolute())
     viewer.engine, viewer.describer = viewer.services.engine(scene), None

@@ -191,7 +191,7 @@ def resize(viewer: Viewer, width: int, height: int) -> None:
 
 def open_panel(viewer: Viewer, title: str) -> None:
     """Have a panel opened, in front of those it shares its place with."""
-    viewer.state.show_panel, viewer.state.wanted_panel = True, title
+    viewer.state.show_panel, viewer.state.wanted_panel, viewer.state.show_start = True, title, False
 
 
 def _switch(name: str) -> Callable[[Viewer], None]:
@@ -200,6 +200,7 @@ def _switch(name: str) -> Callable[[Viewer], None]:
 
 
 toggle_panels, toggle_help = _switch("show_panel"), _switch("show_help")
+toggle_start = _switch("show_start")
 
 
 def reset_layout(viewer: Viewer) -> None:
@@ -216,7 +217,8 @@ def toggle_palette(viewer: Viewer) -> None:
 def escape(viewer: Viewer) -> None:
     """Close what lies over the scene; where nothing does leave the stroke, else the tool."""
     state, tools = viewer.state, viewer.state.tools
-    lay_over = state.show_help or state.show_palette or state.browser or state.leaving
+    lay_over = state.show_help or state.show_palette or state.browser or state.leaving or state.show_start
+    state.show_start &= state.scene is None
     state.show_help = state.show_palette = state.pins_notes = state.letters_muted = False
     state.browser = state.leaving = None
     if state.session.ruler.measures:

@@ -1,18 +1,131 @@
-"""What asks over the scene: the file browser, a file that has changed, and what is not saved.
+"""What asks over the scene: the start page, the file browser, a file that has changed, what is not saved.
 
 The browser is the project's own beside ImFileDialog, since it fits small windows and large text, says why a
 folder cannot be read and opens folders that are scenes. Native dialogs need helpers that
 may be missing.
 """
 
+from contextlib import suppress
 from pathlib import Path
 
-from imgui_bundle import ImVec2, hello_imgui, imgui
+import moderngl
+import numpy as np
+from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
+from PIL import Image
 
 from langsplat_viewer.actions import opening, saving, settings
 from langsplat_viewer.disk import FolderEntry, Listing
 from langsplat_viewer.panels import ui
+from langsplat_viewer.projects import BUNDLED, thumbnail_of
 from langsplat_viewer.viewer import Viewer
+
+# The start page.
+
+CARD_EM, PICTURE_EM, DROP_EM = 14.5, 8.5, 4.0  # width of a card; heights
+MOST_WIDE, MOST_COLUMNS, TITLE = 0.95, 4, 1.8  # of the area; cards beside each other; of the letters' size
+
+
+class StartPage:
+    """The page without a scene: what was open lately, and the ways to begin."""
+
+    def __init__(self, folder: Path | None) -> None:
+        """`folder`: of the preferences, with the thumbnails."""
+        self._folder = folder
+        self._cards: list[tuple[Path, ui.Picture, np.ndarray | None]] = []
+
+    def _look_up(self, viewer: Viewer) -> None:
+        """List the bundled scene and the recent files that are there, each with its thumbnail."""
+        recent = [path for path in map(Path, viewer.state.preferences.recent) if path.exists()]
+        self._cards = []
+        for path in dict.fromkeys((BUNDLED, *recent)):
+            kept, image = thumbnail_of(self._folder, path), None
+            if kept is not None and kept.is_file():
+                with suppress(OSError), Image.open(kept) as file:
+                    image = np.asarray(file.convert("RGB"))
+            self._cards.append((path, ui.Picture(), image))
+
+    def draw(self, viewer: Viewer, area: ui.Area) -> None:
+        """Draw it over the scene's area, while it is wanted."""
+        if not viewer.state.show_start:
+            self._cards = []
+            return
+        if not self._cards:
+            self._look_up(viewer)
+        gap, card = imgui.get_style().item_spacing.x, hello_imgui.em_size(CARD_EM)
+        columns = min(max(int((MOST_WIDE * area.width + gap) / (card + gap)), 1), MOST_COLUMNS)
+        width = columns * (card + gap) - gap
+        imgui.set_next_window_pos(ImVec2(area.left, area.top))
+        imgui.set_next_window_size(ImVec2(area.width, area.height))
+        imgui.set_next_window_bg_alpha(1.0)
+        imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(max(area.width - width, 0) / 2, 0))
+        imgui.begin("start", None, (ui.OVER | ui.FIXED) & ~imgui.WindowFlags_.no_scrollbar)
+        imgui.pop_style_var()
+        imgui.dummy(ImVec2(0, 0.04 * area.height))
+        imgui.push_font(imgui.get_font(), TITLE * ui.FONT_SIZE)
+        imgui.text_unformatted("LangSplat viewer")
+        imgui.pop_font()
+        ui.small_wrapped("Look around in 3D Gaussian scenes, and search them with words.", ui.muted())
+        imgui.dummy(ImVec2(0, hello_imgui.em_size(0.4)))
+        imgui.push_style_var(imgui.StyleVar_.frame_padding, hello_imgui.em_to_vec2(0.8, 0.45))
+        ui.verbs(viewer, "Open a scene ...", "Train from photographs ...", "First steps")
+        imgui.pop_style_var()
+        imgui.dummy(ImVec2(0, hello_imgui.em_size(0.8)))
+        for number, (path, picture, image) in enumerate(self._cards):
+            if number % columns:
+                imgui.same_line()
+            imgui.push_id(number)
+            if _card(path, None if image is None else picture.texture(image)):
+                opening.open_file(viewer, path)
+            imgui.pop_id()
+        _drop_target(viewer, width)
+        imgui.end()
+
+
+def _card(path: Path, texture: moderngl.Texture | None) -> bool:
+    """Draw a card of a file, its image over its name; return whether it was clicked."""
+    width, height = hello_imgui.em_size(CARD_EM), hello_imgui.em_size(PICTURE_EM)
+    line, edge, paint = (
+        imgui.get_text_line_height(),
+        imgui.get_style().frame_padding.x,
+        imgui.get_window_draw_list(),
+    )
+    clicked = imgui.button("##card", ImVec2(width, height + 2.4 * line + 2 * edge))
+    ui.tip("The scene that comes with the program" if path == BUNDLED else str(path))
+    corner = imgui.get_item_rect_min()
+    x, y = corner.x + edge, corner.y + edge
+    end, round_ = ImVec2(corner.x + width - edge, y + height), imgui.get_style().frame_rounding
+    if texture is not None:
+        paint.add_image_rounded(
+            imgui.ImTextureRef(texture.glo), ImVec2(x, y), end, ImVec2(0, 0), ImVec2(1, 1), 0xFFFFFFFF, round_
+        )
+    else:
+        paint.add_rect_filled(ImVec2(x, y), end, imgui.get_color_u32(imgui.Col_.frame_bg), round_)
+        middle = ImVec2((x + end.x - line) / 2, (y + end.y - line) / 2)
+        paint.add_text(middle, imgui.get_color_u32(ui.muted()), icons_fontawesome_6.ICON_FA_CUBES)
+    name, where = ("A room to try", "bundled") if path == BUNDLED else (path.name, str(path.parent))
+    y += height + 0.3 * line
+    for text, colour in ((name, imgui.get_style_color_vec4(imgui.Col_.text)), (where, ui.muted())):
+        paint.add_text(ImVec2(x, y), imgui.get_color_u32(colour), ui.elided(text, width - 2 * edge))
+        y += line
+    return bool(clicked)
+
+
+def _drop_target(viewer: Viewer, width: float) -> None:
+    """Draw where files are dropped, which is everywhere, or what is being opened."""
+    imgui.dummy(ImVec2(0, hello_imgui.em_size(0.5)))
+    corner, size = imgui.get_cursor_screen_pos(), ImVec2(width, hello_imgui.em_size(DROP_EM))
+    imgui.dummy(size)
+    end, paint = ImVec2(corner.x + size.x, corner.y + size.y), imgui.get_window_draw_list()
+    paint.add_rect(corner, end, imgui.get_color_u32(imgui.Col_.text_disabled), 8.0, 1.5)
+    opened = viewer.state.opening
+    text = "Drop a scene, a project or a folder of photographs here"
+    text = f"Opening {opened.name} ..." if opened else text
+    text = ui.elided(text, width)
+    middle = ImVec2(
+        corner.x + (size.x - ui.width_of(text)) / 2, corner.y + (size.y - imgui.get_text_line_height()) / 2
+    )
+    paint.add_text(middle, imgui.get_color_u32(ui.muted()), text)
+
 
 # The file browser.
 

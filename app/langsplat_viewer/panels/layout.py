@@ -96,15 +96,16 @@ class Docks:
         if self._scale not in (0.0, scale):
             _widen(COLUMN * scale)
         self._scale = scale
-        if not state.show_panel and not self._hidden:
+        shown = state.show_panel and not state.show_start
+        if not shown and not self._hidden:
             self._hidden = [window.label for window in windows if window.is_visible]
             for window in windows:
                 window.is_visible = False
-        elif state.show_panel and self._hidden:
+        elif shown and self._hidden:
             for title in self._hidden:
                 docking.dockable_window_of_name(title).is_visible = True
             self._hidden = []
-        if state.show_panel:
+        if shown:
             visible = (window.label for window in windows if window.is_visible)
             settings.prefer(viewer, panels=tuple(visible))
         alone = settings.take(state, "shows_panels")
@@ -112,7 +113,7 @@ class Docks:
             for window in windows:
                 window.is_visible = window.label in alone
         docking.layout_reset |= settings.take(state, "resets_panels")
-        title = settings.take(state, "wanted_panel")
+        title = settings.take(state, "wanted_panel") if shown else ""
         if title:  # in front of those that it shares its place with
             docking.dockable_window_of_name(title).is_visible = True
             docking.focus_dockable_window(title)
@@ -131,9 +132,10 @@ def _widen(width: float) -> None:
         imgui.internal.dock_builder_set_node_size(node.id_, ImVec2(width, node.size.y))
 
 
-def draw_over(viewer: Viewer) -> None:
+def draw_over(viewer: Viewer, start: dialogs.StartPage) -> None:
     """Draw what lies over the scene: legends, tools, questions, the file browser, help and palette."""
     area = ui.scene_area()
+    start.draw(viewer, area)
     said = _said(viewer)
     if said:
         overlays.say(said, area)
@@ -157,5 +159,11 @@ def _said(viewer: Viewer) -> str:
     """Return the words in place of an image; empty while there is one."""
     state = viewer.state
     if state.scene is None:
-        return f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or press Ctrl+O"
+        return (
+            ""
+            if state.show_start
+            else f"opening {state.opening.name} ..."
+            if state.opening
+            else "Drop a scene here, or press Ctrl+O"
+        )
     return state.nothing

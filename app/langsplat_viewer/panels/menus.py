@@ -68,7 +68,7 @@ def draw_toolbar(viewer: Viewer, area: ui.Area) -> None:
 
     It lies between the titles of images and what is written at their foot.
     """
-    if viewer.state.scene is None or not viewer.state.show_panel:
+    if viewer.state.scene is None or not viewer.state.show_panel or viewer.state.show_start:
         return
     top, gap, margin = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GAP_EM, MARGIN_EM))
     gaps = len(GROUPS) * gap

@@ -31,7 +31,7 @@ def draw_scene(viewer: Viewer) -> None:
         for warning in state.warnings:
             ui.small_wrapped(warning.partition(":")[0], ui.bad())
             ui.tip(warning)
-    ui.verbs(viewer, "Open ...", "Save picture", "Save view", "Help")
+    ui.verbs(viewer, "Open a scene ...", "Save picture", "Save view", "First steps")
     if len(state.scenes) > 1:
         _list(viewer)
 
