@@ -111,3 +111,8 @@ def rotation_matrices(quats_wxyz: Array) -> Array:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def linear_light(display: Array) -> Array:
+    """Return what display values of sRGB, in [0, 1], are in linear light (IEC 61966-2-1)."""
+    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)

@@ -13,7 +13,7 @@ from typing import Literal, TypeVar, get_args
 
 import numpy as np
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, linear_light
 
 Point = tuple[float, float, float]
 
@@ -342,8 +342,7 @@ COLOURS = tuple(_BOXES)
 
 def to_linear(display: Array) -> Array:
     """Return linear light of sRGB display values in [0, 1]."""
-    display = np.asarray(display, np.float64)
-    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+    return linear_light(np.asarray(display, np.float64))
 
 
 def to_display(linear: Array) -> Array:

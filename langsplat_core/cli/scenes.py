@@ -11,13 +11,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from langsplat_core import __version__
 from langsplat_core.cli.arguments import AnyScene, OutFolder
 from langsplat_core.cli.run import print_json
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, printable_line, remedy
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.io.summary import SceneSummary, disk_bytes, summarise
+from langsplat_core.io.summary import disk_bytes, summarise
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics.encoders import (
@@ -47,7 +48,7 @@ class Inspect:
         summary = summarise(scene)
         size = disk_bytes(self.scene)
         if self.json:
-            said = {"scene": str(self.scene), "disk_bytes": size, "unread": scene.unread, **asdict(summary)}
+            said = {"scene": str(self.scene), "disk_bytes": size, "unread": scene.unread, **summary}
             print_json(said)
             return
         lines = [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(summary)]
@@ -56,34 +57,35 @@ class Inspect:
         _print_rows([*lines, *(("not read", reason) for reason in scene.unread)])
 
 
-def _lines(a: SceneSummary) -> list[tuple[str, str]]:
+def _lines(a: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Rows of the report: a name, and a value for people."""
-    reasons = "".join(f"; {count} {reason}" for reason, count in a.invalid.items())
-    digits = 10 if any(a.origin) else 3
-    low, high = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in a.bounds)
+    reasons = "".join(f"; {count} {reason}" for reason, count in a["invalid"].items())
+    digits, metres = 10 if any(a["origin"]) else 3, a["metres_per_unit"]
+    low, high = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in a["bounds"])
     lines = [
-        ("in memory", f"{a.memory_bytes / 1e6:.2f} MB"),
-        ("Gaussians", f"{a.gaussians:,}"),
-        ("invalid rows", f"{a.invalid_rows}{reasons}"),
+        ("in memory", f"{a['memory_bytes'] / 1e6:.2f} MB"),
+        ("Gaussians", f"{a['gaussians']:,}"),
+        ("invalid rows", f"{a['invalid_rows']}{reasons}"),
         ("bounds (1-99 %)", f"{low}  to  {high}"),
-        ("origin", " ".join(f"{value:.10g}" for value in a.origin)),
-        ("SH degree", f"{a.sh_degree}"),
-        ("antialiased", "yes (Mip-Splatting)" if a.antialiased else "no"),
-        ("scale", f"{a.metres_per_unit:g} m per unit" if a.metres_per_unit else "unknown: `langsplat scale`"),
-        ("extra properties", ", ".join(a.extras) or "none"),
-        ("cameras", f"{a.cameras}" if a.cameras else "none"),
+        ("origin", " ".join(f"{value:.10g}" for value in a["origin"])),
+        ("SH degree", f"{a['sh_degree']}"),
+        ("antialiased", "yes (Mip-Splatting)" if a["antialiased"] else "no"),
+        ("scale", f"{metres:g} m per unit" if metres else "unknown: `langsplat scale`"),
+        ("extra properties", ", ".join(a["extras"]) or "none"),
+        ("cameras", f"{a['cameras']}" if a["cameras"] else "none"),
     ]
-    field = a.language
+    field = a["language"]
     if field is None:
         return [*lines, ("language field", "none")]
-    observed = ", ".join(f"{name} {100 * share:.1f} %" for name, share in field.observed.items())
-    nodes = "none" if field.nodes is None else f"{', '.join(map(str, field.nodes))} nodes at the levels"
+    observed = ", ".join(f"{name} {100 * share:.1f} %" for name, share in field["observed"].items())
+    megabytes = field["bytes"] / 1e6
+    nodes = "none" if field["nodes"] is None else f"{', '.join(map(str, field['nodes']))} nodes at the levels"
     return [
         *lines,
-        ("language field", f"codec {field.codec} of {field.size}; {field.bytes / 1e6:.2f} MB in memory"),
-        ("text encoder", f"{field.encoder}, {field.vector_dim} numbers"),
-        ("phrasebook", f"{field.phrases} phrases"),
-        ("taught words", ", ".join(field.taught) or "none"),
+        ("language field", f"codec {field['codec']} of {field['size']}; {megabytes:.2f} MB in memory"),
+        ("text encoder", f"{field['encoder']}, {field['vector_dim']} numbers"),
+        ("phrasebook", f"{field['phrases']} phrases"),
+        ("taught words", ", ".join(field["taught"]) or "none"),
         ("observed", observed),
         ("tree", nodes),
     ]

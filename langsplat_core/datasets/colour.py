@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageCms
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, linear_light
 from langsplat_core.errors import Tell
 
 UNSPECIFIED, LINEAR, PQ, HLG = 2, 8, 16, 18
@@ -133,7 +133,7 @@ def _light(signal: Array, transfer: float) -> Array:
         ratio = np.maximum(root - 0.8359375, 0) / (18.8515625 - 18.6875 * root)
         return np.asarray(ratio ** (1 / 0.1593017578125) / PQ_WHITE)
     if transfer in AS_DISPLAYED:
-        return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+        return linear_light(signal)
     return np.asarray(signal ** (1.0 if transfer == LINEAR else GAMMAS.get(int(transfer), -transfer)))
 
 

@@ -371,6 +371,5 @@ class ExportRequest:
 class Exporter:
     """A writer of files for another program: a word of `langsplat convert --to`."""
 
-    about: str  # what is written, a sentence
     write: Callable[[ExportRequest, Progress], tuple[str, ...]]  # returns lines to print
     loses: tuple[str, ...] = ()  # as of `SceneFormat`

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, linear_light
 from langsplat_core.errors import InputError
 from langsplat_core.io.gltf import GltfWriter
 from langsplat_core.io.ply import CHANNELS, POSITION, write_table
@@ -64,9 +64,7 @@ def write_mesh(path: Path | str, mesh: MeshLike, scene: Scene) -> None:
         return
     # Colours are light as it was photographed, so the material is unlit, and linear.
     file = GltfWriter("KHR_materials_unlit")
-    display = mesh.colour
-    linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
-    light = np.column_stack([linear, np.ones(len(linear))])
+    light = np.column_stack([linear_light(mesh.colour), np.ones(len(mesh.vertices))])
     attributes = {
         "POSITION": file.add(mesh.vertices.astype("<f4"), bounded=True),
         "COLOR_0": file.add(np.rint(65_535 * light).astype("<u2")),

@@ -310,17 +310,11 @@ def principal_colours(vectors: Array, weights: Array) -> Array:
         axes = centred @ principal[:, ::-1][:, :3]
     occurs = np.flatnonzero(weights > 0)
     for axis, values in enumerate(axes.T if len(occurs) else ()):
-        low, high = _quantiles(values[occurs], weights[occurs])
+        ends = np.quantile(values[occurs], (0.02, 0.98), weights=weights[occurs], method="inverted_cdf")
+        low, high = ends.tolist()
         if high - low > 1e-6:
             colours[:, axis] = np.clip((values - low) / (high - low), 0, 1)
     return colours
-
-
-def _quantiles(values: Array, weights: Array) -> tuple[float, float]:
-    order = np.argsort(values, kind="stable")
-    below = np.cumsum(weights[order], dtype=np.float64)
-    low, high = np.searchsorted(below, np.array([0.02, 0.98]) * below[-1]).clip(max=len(order) - 1)
-    return float(values[order[low]]), float(values[order[high]])
 
 
 KINDS: Mapping[str, type[Codec]] = MappingProxyType(

@@ -103,39 +103,26 @@ def test_files_of_another_writer_are_read(tmp_path, byte_order, text, code, degr
 
 # ---- comments: antialiasing, and how long a unit is ----
 
-MARKS = [
-    ((), False),
-    (("Exported from Brush", "  SPLATRENDERMODE:   MIP "), True),
-    (("SplatRenderMode: default",), False),
-    (("antialiased 1",), True),
-    (("antialiased 0",), False),
-    (("the antialiased 1 of them",), False),
-    (("train_flags exposure antialiasing",), True),
-    (("antialiased 1", "SplatRenderMode: default"), False),
-    (("SplatRenderMode: default", "antialiased 1"), True),
+COMMENTS = [  # of other programs and our own, whether the scene is antialiased, and its metres per unit
+    ((), False, None),
+    (("Exported from Brush", "  SPLATRENDERMODE:   MIP "), True, None),
+    (("SplatRenderMode: default",), False, None),
+    (("antialiased 1",), True, None),
+    (("antialiased 0",), False, None),
+    (("the antialiased 1 of them",), False, None),
+    (("train_flags exposure antialiasing",), True, None),
+    (("antialiased 1", "SplatRenderMode: default"), False, None),
+    (("SplatRenderMode: default", "antialiased 1", "metres_per_unit: 2.5e-1"), True, 0.25),
+    (("metres_per_unit 2", "metres_per_unit 3"), False, 3.0),
+    *(((f"metres_per_unit {text}",), False, None) for text in ("0", "-1", "nan", "inf", "none", "2 3")),
 ]
 
 
-@pytest.mark.parametrize(("comments", "antialiased"), MARKS)
-def test_comments_of_other_programs_say_antialiased(put, comments, antialiased):
+@pytest.mark.parametrize(("comments", "antialiased", "metres"), COMMENTS)
+def test_comments_say_antialiased_and_metres(put, comments, antialiased, metres):
     marks = "\ncomment ".join(comments).encode()
-    path = put(compressed_ply(random_gaussians(3)).replace(b"made by a test", marks))
-    assert read_ply_scene(path).antialiased is antialiased
-
-
-@pytest.mark.parametrize(
-    ("comments", "want"),
-    [
-        ((), None),
-        (("made by hand", "metres_per_unit: 2.5e-1"), 0.25),
-        (("metres_per_unit 2", "metres_per_unit 3"), 3.0),
-        *(((f"metres_per_unit {text}",), None) for text in ("0", "-1", "nan", "inf", "none", "2 3")),
-    ],
-)
-def test_a_comment_says_metres_per_unit(put, comments, want):
-    marks = "\ncomment ".join(comments).encode()
-    path = put(compressed_ply(random_gaussians(3)).replace(b"made by a test", marks))
-    assert read_ply_scene(path).metres_per_unit == want
+    scene = read_ply_scene(put(compressed_ply(random_gaussians(3)).replace(b"made by a test", marks)))
+    assert (scene.antialiased, scene.metres_per_unit) == (antialiased, metres)
 
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 from unicodedata import normalize
 
 import msgspec
@@ -14,6 +14,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, opened, picture_size, read_json_file, read_text
 
+T = TypeVar("T")
 Size = tuple[int, int]  # width and height, pixels
 SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be of one image
 
@@ -200,12 +201,17 @@ def _read_scene(name: str, labels: Path, dataset: Path) -> LabelledScene:
     return LabelledScene(name, tuple(frames), dataset, tuple(left_out))
 
 
+def _stated(path: Path, kind: type[T], benchmark: str) -> T:
+    """Return the content of a label file."""
+    try:
+        return msgspec.convert(read_json_file(path, LIMIT), kind)
+    except msgspec.ValidationError as error:
+        raise FormatError(f"{path}: no label file of {benchmark}: {error}") from None
+
+
 def _read_frame(path: Path) -> tuple[Frame, list[str]]:
     """Return the frame, and the categories of it that have no polygon with an inside."""
-    try:
-        content = msgspec.convert(read_json_file(path, LIMIT), _LabelFile)
-    except msgspec.ValidationError as error:
-        raise FormatError(f"{path}: no label file of LERF-OVS: {error}") from None
+    content = _stated(path, _LabelFile, "LERF-OVS")
     size = content.info.width, content.info.height
     polygons: dict[str, list[Array]] = {}
     boxes: dict[str, list[Array]] = {}
@@ -330,10 +336,7 @@ def read_gr_lerf(folder: Path) -> Benchmark:
 
 
 def _referred_frame(path: Path, scene: Path) -> Frame:
-    try:
-        content = msgspec.convert(read_json_file(path, LIMIT), _ReferredFile)
-    except msgspec.ValidationError as error:
-        raise FormatError(f"{path}: no label file of GR-LERF: {error}") from None
+    content = _stated(path, _ReferredFile, "GR-LERF")
     photograph = photograph_of(scene / "images", path.stem)
     if content.info is not None:
         size = content.info.width, content.info.height

@@ -189,13 +189,6 @@ def voted(mask: Array, vote: Vote, window: int) -> Array:
     return np.asarray(2 * votes > of + TINY)
 
 
-def read_silhouette(colours: Array, alpha: Array, rule: SilhouetteRule) -> Array:
-    """(H, W, 3) colours over black and (H, W) alpha of the selected Gaussians alone -> (H, W) mask."""
-    grey = np.clip(colours, 0, 1) @ np.array([0.299, 0.587, 0.114])
-    drawn = np.where(alpha > rule.alpha, np.rint(255 * grey), 0)
-    return np.asarray(drawn > rule.grey)
-
-
 # How this program's own answer becomes a mask and a place in a view: the one place to change it.
 
 
@@ -221,11 +214,6 @@ def own_prediction(view: View, result: QueryResult, rule: OwnRule) -> Prediction
 #
 # A PNG of 8 or 16 bits holds relevancy from 0 to 1. A "/" in a phrase is "_" in its file's name. Maps of one
 # phrase have one size; it need not be the labels', whose masks are then brought to it.
-
-
-def file_name(phrase: str) -> str:
-    """Return the stem of the names of a phrase's files."""
-    return phrase.replace("/", "_")
 
 
 def _read_relevancy(path: Path) -> Array:
@@ -305,8 +293,9 @@ class SceneSource:
         """Return the mask of the answer's Gaussians drawn alone, as if nothing stood before them."""
         if not result.members.any():
             return np.zeros((camera.height, camera.width), bool)
-        drawn = render(self.engine.scene.take(result.members), camera)
-        return read_silhouette(drawn.colours, drawn.alpha, rule)
+        drawn = render(self.engine.scene.take(result.members), camera)  # over black
+        grey = np.clip(drawn.colours, 0, 1) @ np.array([0.299, 0.587, 0.114])
+        return np.asarray(np.where(drawn.alpha > rule.alpha, np.rint(255 * grey), 0) > rule.grey)
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,7 +314,7 @@ class MapSource:
 
     def _answer(self, folder: Path, phrase: str) -> Prediction | str:
         drawn = isinstance(self.rule, SilhouetteRule)
-        files = (folder / f"{file_name(phrase)}{suffix}" for suffix in (".npy", ".png")[drawn:])
+        files = (folder / f"{phrase.replace('/', '_')}{suffix}" for suffix in (".npy", ".png")[drawn:])
         path = next((path for path in files if path.is_file()), None)
         if path is None:
             return "no map"

@@ -15,7 +15,8 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -188,8 +189,7 @@ def run_plan(
     backends = _backends(machine)
     progress("bench: compiling", 0.0)
     warm_up(backends, plan.channels)
-    foresight = Foresight(plan.limit)
-    rows: list[Measurement] = []
+    rows, rates = list[Measurement](), Rates()
     pairs = sweep(plan.counts, plan.sizes, plan.pivot)
     total = len(plan.scenes) + len(pairs)
     for n, case in enumerate(_cases(plan, pairs)):
@@ -199,7 +199,7 @@ def run_plan(
         steps = [(channels, backend) for channels in plan.channels for backend in backends]
         for step, (channels, backend) in enumerate(steps):
             progress(f"{name}, {backend.name}", (n + step / len(steps)) / total)
-            rows += measure(backend, case, channels, exact, foresight)
+            rows += measure(backend, case, channels, exact, plan.limit, rates)
         keep(RasterReport(machine | {"unfinished": f"{n + 1} of {total} scenes and sizes"}, list(rows)))
     progress("bench: done", 1.0)
     return RasterReport(machine, rows)
@@ -281,12 +281,7 @@ def _processor() -> str:
 # One backend on one case.
 
 
-@dataclass(frozen=True, eq=False)
-class Foresight:
-    """Expected seconds of operations: time grows with the overlaps of footprints and tiles."""
-
-    limit_s: float
-    rates: dict[tuple[str, str, int], float] = field(default_factory=dict)  # seconds per overlap
+Rates = dict[tuple[str, str, int], float]  # seconds per overlap of a footprint and a tile, of each operation
 
 
 def warm_up(backends: Sequence[Rasterizer], channels: Sequence[int]) -> None:
@@ -299,9 +294,9 @@ def warm_up(backends: Sequence[Rasterizer], channels: Sequence[int]) -> None:
 
 
 def measure(
-    backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindows", foresight: Foresight
+    backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindows", limit: float, rates: Rates
 ) -> Iterator[Measurement]:
-    """Time every operation of `backend` on one case."""
+    """Time every operation of `backend` on one case that `rates` foretell less than `limit` seconds of."""
     drawn = exact.footprints.opacities > 0
     overlaps = int(np.prod(2 * exact.footprints.extents_px / 16 + 1, axis=1)[drawn].sum())
     shape = case.scene, len(case.gaussians), case.camera.width, case.camera.height, channels
@@ -309,12 +304,12 @@ def measure(
     for operation, call, error_of in _operations(backend, case, channels):
         row = Measurement(*shape, operation, name)
         key = name, operation, channels
-        expected = foresight.rates.get(key, 0.0) * overlaps
-        if expected > foresight.limit_s:
+        expected = rates.get(key, 0.0) * overlaps
+        if expected > limit:
             yield replace(row, note=f"not run: about {expected:.0f} s expected")
             continue
         seconds, peak = _timed(call)
-        foresight.rates[key] = seconds / max(overlaps, 1)
+        rates[key] = seconds / max(overlaps, 1)
         row = replace(row, milliseconds=1e3 * seconds, peak_mib=peak)
         if error_of is not None:
             error = error_of(exact)
@@ -339,35 +334,22 @@ def _operations(backend: Rasterizer, case: Case, channels: int) -> Iterator[_Ope
         # The camera moves: a backend that keeps the last order must sort again.
         return backend.view(case.gaussians, cameras[next(turn) % 2]).splat(values)[0]
 
-    def by_values(exact: "ReferenceWindows") -> Error:
-        masked = exact.masked(image)
-        return exact.gather_error(view.backward(values, masked).values, masked)
-
     if backend.name != "opengl":  # projects in its first draw
         yield "project", lambda: backend.view(case.gaussians, camera), None
     yield "frame", frame, None
     view: Any = backend.view(case.gaussians, camera)
-    yield from _linear(view, values, image)
+    yield "splat", lambda: view.splat(values), lambda exact: exact.splat_error(view.splat(values)[0], values)
+    if hasattr(view, "gather"):
+        yield "gather", lambda: view.gather(image), lambda exact: exact.gather_error(view.gather, image)
     if hasattr(view, "backward"):
-        yield "backward", lambda: view.backward(values, image), by_values
+        backward = partial(view.backward, values)
+        yield (
+            "backward",
+            lambda: backward(image),
+            lambda exact: exact.gather_error(lambda y: backward(y).values, image),
+        )
     if isinstance(view, LiftingView):
         yield _labels(view, camera)
-
-
-def _linear(view: Any, values: Array, image: Array) -> Iterator[_Operation]:
-    """Yield the operation `splat` and, where the view has it, `gather`."""
-
-    def gathered(exact: "ReferenceWindows") -> Error:
-        masked = exact.masked(image)
-        return exact.gather_error(view.gather(masked), masked)
-
-    yield (
-        "splat",
-        lambda: view.splat(values),
-        lambda exact: exact.splat_error(view.splat(values)[0], values),
-    )
-    if hasattr(view, "gather"):
-        yield "gather", lambda: view.gather(image), gathered
 
 
 def _labels(view: LiftingView, camera: Camera) -> _Operation:
@@ -378,7 +360,7 @@ def _labels(view: LiftingView, camera: Camera) -> _Operation:
         compared = exact.masked(np.ones((camera.height, camera.width, 1), np.float32))[..., 0] > 0
         kept = np.where(compared, maps, -1)
         image = np.stack([(kept == label).any(0) for label in range(count)], -1).astype(np.float32)
-        return exact.gather_error(view.gather_labels(kept, count).toarray(), image)
+        return exact.gather_error(lambda _: view.gather_labels(kept, count).toarray(), image)
 
     return "labels", lambda: view.gather_labels(maps, count), error
 
@@ -482,8 +464,10 @@ class ReferenceWindows:
             left[window.at] = 0
         return total
 
-    def gather_error(self, values: Array, masked: Array) -> Error:
-        """Error of the (N, C) `values` that a backend gathered from `masked`; off the cut-offs alone."""
+    def gather_error(self, gather: Callable[[Array], Array], image: Array) -> Error:
+        """Error of a backend's (H, W, C) -> (N, C), `masked` to what is off the cut-offs."""
+        masked = self.masked(image)
+        values = gather(masked)
         want = np.zeros(values.shape)
         want[self.rows] = self.gather(masked)
         off = float(np.abs(values - want).max(initial=0))

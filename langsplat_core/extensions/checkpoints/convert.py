@@ -1,7 +1,5 @@
 """What `langsplat convert` reads and writes of other methods."""
 
-from pathlib import Path
-
 import numpy as np
 
 from langsplat_core.errors import InputError
@@ -36,11 +34,12 @@ def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[st
     return scene, tuple(lines)
 
 
-def export_langsplat(scene: Scene, folder: Path, name: str) -> list[Path]:
-    """`NAME_{1,2,3}/chkpnt30000.pth` with latents and `best_ckpt.pth` in `folder`; returns what was written.
+def export_langsplat(request: ExportRequest, progress: Progress = silent) -> tuple[str, ...]:
+    """Write `NAME_{1,2,3}/chkpnt30000.pth` with latents and `best_ckpt.pth`; return what was written.
 
     Raises InputError for a scene whose codec is not an autoencoder of 3 numbers.
     """
+    scene, folder, name = request.load(), request.out, request.sources[0].stem
     language = _language(scene)
     codec = language.codec
     if not isinstance(codec, AutoencoderCodec) or codec.latent_dim != LANGSPLAT_LATENT:
@@ -54,18 +53,19 @@ def export_langsplat(scene: Scene, folder: Path, name: str) -> list[Path]:
     for level, path in enumerate(written):
         write_checkpoint(path, scene.gaussians, latents[level], scene.origin)
     write_autoencoder(folder / "best_ckpt.pth", codec.encoder, codec.decoder)
-    return [*written, folder / "best_ckpt.pth"]
+    return (*map(str, written), str(folder / "best_ckpt.pth"))
 
 
-def export_occam(scene: Scene, folder: Path, progress: Progress = silent) -> list[Path]:
-    """`chkpnt30000_langfeat_{1,2,3}.pth` with (N, D) unit vectors, zero for no meaning, in `folder`.
+def export_occam(request: ExportRequest, progress: Progress = silent) -> tuple[str, ...]:
+    """Write `chkpnt30000_langfeat_{1,2,3}.pth` with (N, D) unit vectors, zero for no meaning.
 
-    Returns what was written. One level is held in memory at a time: 5 GB for 2.5 million Gaussians.
+    Return what was written. One level is held in memory at a time: 5 GB for 2.5 million Gaussians.
     """
+    scene = request.load()
     language = _language(scene)
     written = []
     for level in range(len(LEVELS)):
-        path = folder / f"chkpnt30000_langfeat_{level + 1}.pth"
+        path = request.out / f"chkpnt30000_langfeat_{level + 1}.pth"
         progress("decoding", level / len(LEVELS))
         vectors = np.zeros((len(language), language.codec.vector_dim), np.float32)
         known = np.flatnonzero(language.known[level])
@@ -73,9 +73,9 @@ def export_occam(scene: Scene, folder: Path, progress: Progress = silent) -> lis
             rows = known[start : start + BLOCK]
             vectors[rows] = language.codec.decode(language.latents[level, rows])
         write_checkpoint(path, scene.gaussians, vectors, scene.origin)
-        written.append(path)
+        written.append(str(path))
     progress("decoding", 1.0)
-    return written
+    return tuple(written)
 
 
 def _language(scene: Scene) -> LanguageField:
@@ -84,17 +84,6 @@ def _language(scene: Scene) -> LanguageField:
     return scene.language
 
 
-def _export_langsplat(request: ExportRequest, progress: Progress) -> tuple[str, ...]:
-    return tuple(map(str, export_langsplat(request.load(), request.out, request.sources[0].stem)))
-
-
-def _export_occam(request: ExportRequest, progress: Progress) -> tuple[str, ...]:
-    return tuple(map(str, export_occam(request.load(), request.out, progress)))
-
-
 IMPORTER = Importer((".pth", ".pt", ".ckpt", ".npz"), _import)
 LOSES = ("cameras", "metres per unit", "antialiasing", "extra properties", "taught words", "origin")
-LANGSPLAT = Exporter(
-    "a folder with LangSplat's three checkpoints and its autoencoder", _export_langsplat, LOSES
-)
-OCCAM = Exporter("a folder with Occam's LGS's three checkpoints of whole vectors", _export_occam, LOSES)
+LANGSPLAT, OCCAM = Exporter(export_langsplat, LOSES), Exporter(export_occam, LOSES)

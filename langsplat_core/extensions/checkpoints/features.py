@@ -5,8 +5,8 @@ is made here.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from langsplat_core.extensions.checkpoints.unpickling import (
 from langsplat_core.io.hostile import open_for_reading, opened_archive, read_npz
 from langsplat_core.io.ply import read_ply_scene
 from langsplat_core.io.scenes import read_origin
-from langsplat_core.scene import LEVELS, NO_ORIGIN, AutoencoderCodec, Gaussians
+from langsplat_core.scene import LEVELS, NO_ORIGIN, AutoencoderCodec, Gaussians, Scene
 from langsplat_core.scene.gaussians import join_gaussians
 
 TOPK = 4  # codewords of a Gaussian in LangSplatV2
@@ -51,14 +51,20 @@ def whole_vectors(values: Array) -> Features:
     return Features(int(values.shape[1]), lambda indices: np.asarray(values[indices], np.float32))
 
 
-def sparse_codes(logits: Array, codewords: Array) -> Features:
+def sparse_codes(logits: Array, codewords: Array, path: Path) -> Features:
     """Return LangSplatV2's mixtures of the few codewords that a Gaussian's logits name.
 
-    logits: (N, L K) floats, for L layers of codewords one after the other; codewords: (L, K, D) float32, the
+    logits: (N, L K) floats, for L layers of codewords one after the other; codewords: (L, K, D) floats, the
     layers' mixtures are added. The weights are the largest `TOPK` of a softmax, scaled to the sum 1. Logits
-    that are all equal were never trained, and stand for nothing.
+    that are all equal were never trained, and stand for nothing. FormatError, which names `path`, for others.
     """
-    size, dim = codewords.shape[1:]
+    layers, size, dim = codewords.shape
+    if logits.ndim != 2 or logits.shape[1] != layers * size or not np.isfinite(codewords).all():
+        raise FormatError(
+            f"{path}: logits {logits.shape} for codewords {codewords.shape}; expected (N, L K) and finite "
+            "(L, K, D)"
+        )
+    codewords = np.asarray(codewords, np.float32)
 
     def rows(indices: Array) -> Array:
         chosen = np.asarray(logits[indices], np.float32)
@@ -111,19 +117,20 @@ class Carrier:
 
     path: Path
     method: str
-    gaussians: Gaussians
+    scene: Scene  # without cameras and language field
     features: Features | None = None
-    extras: Mapping[str, Array] = field(default_factory=dict)  # of a PLY, as `Scene.extras`
-    antialiased: bool = False
-    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) that positions are relative to
-    metres_per_unit: float | None = None
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The Gaussians of the scene."""
+        return self.scene.gaussians
 
     def about(self, origin: Array) -> "Carrier":
         """Return the same Gaussians relative to another `origin` (3,)."""
-        if np.array_equal(self.origin, origin):
+        if np.array_equal(self.scene.origin, origin):
             return self
-        means = self.gaussians.means + (self.origin - origin)
-        return replace(self, gaussians=replace(self.gaussians, means=means), origin=origin)
+        gaussians = replace(self.gaussians, means=self.gaussians.means + (self.scene.origin - origin))
+        return replace(self, scene=replace(self.scene, gaussians=gaussians, origin=origin))
 
     @property
     def has_features(self) -> bool:
@@ -181,15 +188,14 @@ def _is_npz(path: Path) -> bool:
 def _from_ply(path: Path) -> Carrier:
     scene = read_ply_scene(path)
     names = [name for name in scene.extras if SEMANTIC.fullmatch(name)]
-    rest = {name: values for name, values in scene.extras.items() if name not in names}
-    about = rest, scene.antialiased, scene.origin, scene.metres_per_unit
     if not names:
-        return Carrier(path, PLAIN, scene.gaussians, None, *about)
+        return Carrier(path, PLAIN, scene)
     ordered = [f"semantic_{index}" for index in range(len(names))]
     if set(ordered) != set(names):
         raise FormatError(f"{path}: {len(names)} properties semantic_*, not counted from 0 without gaps")
     vectors = np.stack([scene.extras[name].astype(np.float32) for name in ordered], axis=1)
-    return Carrier(path, FEATURE_3DGS, scene.gaussians, whole_vectors(vectors), *about)
+    rest = {name: values for name, values in scene.extras.items() if name not in names}
+    return Carrier(path, FEATURE_3DGS, replace(scene, extras=rest), whole_vectors(vectors))
 
 
 def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
@@ -227,7 +233,8 @@ def _from_torch(content: Any, path: Path) -> Part:
         told.append(unread("arrays of NumPy, elements", ignored))
         report_losses(path, told)
         origin = read_origin(path)
-        return Carrier(path, method, gaussians, features, origin=NO_ORIGIN if origin is None else origin)
+        scene = Scene(gaussians, origin=NO_ORIGIN if origin is None else origin)
+        return Carrier(path, method, scene, features)
     mapping = plain_mapping(content)
     named = {"": content} if mapping is None else mapping
     if is_autoencoder(named):
@@ -258,7 +265,7 @@ def _language(elements: tuple[Any, ...], count: int, path: Path, tell: Tell) -> 
     if first.dtype.kind != "f":
         raise FormatError(f"{path}: features of the type {first.dtype}; expected floats")
     if second is not None and second.ndim == 3:
-        return V2, _sparse(first, second, path)
+        return V2, sparse_codes(first, second, path)
     if second is not None and first.shape == second.shape == (count, INSTANCE):
         return OPEN_GAUSSIAN, None
     return UNNAMED, whole_vectors(first)
@@ -270,16 +277,6 @@ def _wide(array: Array | None, count: int) -> Array | None:
         return None
     flat = array.reshape(count, -1) if 1 in array.shape[1:] or array.ndim == 2 else array
     return flat if flat.ndim == 2 and flat.shape[1] > 1 else None
-
-
-def _sparse(logits: Array, codewords: Array, path: Path) -> Features:
-    layers, size, _ = codewords.shape
-    if logits.ndim != 2 or logits.shape[1] != layers * size or not np.isfinite(codewords).all():
-        raise FormatError(
-            f"{path}: logits {logits.shape} for codewords {codewords.shape}; expected (N, L K) and finite "
-            "(L, K, D)"
-        )
-    return sparse_codes(logits, np.asarray(codewords, np.float32))
 
 
 # Which of the three levels a checkpoint is of, and how its Gaussians go with those of the others.

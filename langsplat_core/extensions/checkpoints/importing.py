@@ -115,7 +115,11 @@ def read_foreign(paths: Sequence[Path], levels: Sequence[str] = ()) -> ForeignSc
     if clusters is not None and methods <= {OPEN_GAUSSIAN}:
         return _of_clusters(_only([*featured, *([plain] if plain else [])], "scenes"), clusters)
     if not featured:
-        return _without_language(plain, [part for part in parts if part is not plain])
+        if lone := [part for part in parts if part is not plain]:
+            what = "belongs to checkpoints with features, and none is given; name them too"
+            raise InputError(f"{lone[0].path}: {what}")
+        assert plain is not None
+        return ForeignScene(PLAIN, _scene(plain), notes=("no language field in it",))
     return _of_levels(plain, featured, levels, autoencoder)
 
 
@@ -143,13 +147,6 @@ def _named(carrier: Carrier, autoencoder: Autoencoder | None) -> Carrier:
             f"{autoencoder.codec.latent_dim}; give the autoencoder of this scene"
         )
     return replace(carrier, method=LANGSPLAT)
-
-
-def _without_language(plain: Carrier | None, others: list[Part]) -> ForeignScene:
-    if others or plain is None:
-        lone = others[0].path if others else None
-        raise InputError(f"{lone}: belongs to checkpoints with features, and none is given; name them too")
-    return ForeignScene(PLAIN, _scene(plain), notes=("no language field in it",))
 
 
 def _of_clusters(carrier: Carrier | None, clusters: Clusters) -> ForeignScene:
@@ -186,11 +183,11 @@ def _of_levels(
         numbers, how = [len(LEVELS) - 1], f"{method} knows none, whole is filled"
     else:
         numbers, how = levels_of(featured, asked)
-    featured = [carrier.about((plain or featured[0]).origin) for carrier in featured]
+    featured = [carrier.about((plain or featured[0]).scene.origin) for carrier in featured]
     carriers = [plain] if plain else featured  # the scene's Gaussians: those without features, or the first's
     base = carriers[0]
     if base.method == OCCAM:  # which removes what no view saw, so that levels keep different Gaussians
-        base = replace(base, gaussians=all_gaussians(carriers))
+        base = replace(base, scene=replace(base.scene, gaussians=all_gaussians(carriers)))
     levels: list[Features | None] = [None] * len(LEVELS)
     paths: list[Path | None] = [None] * len(LEVELS)
     pruned = 0
@@ -218,17 +215,12 @@ def _scene(carrier: Carrier) -> Scene:
     folder = carrier.path.resolve().parent
     model = folder.parent.parent if carrier.path.name == "point_cloud.ply" else folder
     cameras = [path for path in (carrier.path.with_suffix(CAMERAS), model / "cameras.json") if exists(path)]
-    means, origin = carrier.gaussians.means, carrier.origin
-    if not origin.any():
-        means, origin = about_origin(means)
-    return Scene(
-        replace(carrier.gaussians, means=means),
-        cameras=tuple(camera.moved(-origin) for camera in (read_cameras(cameras[0]) if cameras else ())),
-        origin=origin,
-        antialiased=carrier.antialiased,
-        metres_per_unit=carrier.metres_per_unit,
-        extras=carrier.extras,
-    )
+    scene = carrier.scene
+    if not scene.origin.any():
+        means, origin = about_origin(scene.gaussians.means)
+        scene = replace(scene, gaussians=replace(scene.gaussians, means=means), origin=origin)
+    read = read_cameras(cameras[0]) if cameras else ()
+    return replace(scene, cameras=tuple(camera.moved(-scene.origin) for camera in read))
 
 
 # Its features as a language field.

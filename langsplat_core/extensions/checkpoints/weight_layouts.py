@@ -37,7 +37,7 @@ from langsplat_core.semantics.weights import (
 
 Tensors = Mapping[str, Any]  # name -> torch.Tensor
 Settings = dict[str, Any]
-Names = tuple[tuple[re.Pattern[str], str], ...]  # of transformers, for patterns of another layout's
+Names = tuple[tuple[str, str], ...]  # patterns of another layout's names, and what transformers has there
 
 MOBILE_SAM = (
     "a MobileSAM, whose encoder TinyViT transformers does not have; pass sam_vit_b_01ec64.pth in its place, "
@@ -78,42 +78,36 @@ STATED = {  # settings of open_clip_config.json that are read or follow from the
 # What other settings may be without any effect.
 USUAL: tuple[object, ...] = (None, False, 0, "", {}, "tok", "argmax", "linear")
 
-SAM_NAMES = tuple(
-    (re.compile(pattern), name)
-    for pattern, name in (
-        (r"^image_encoder\.", "vision_encoder."),
-        (r"^vision_encoder\.blocks\.", "vision_encoder.layers."),
-        (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
-        (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
-        (r"\.neck\.0\.", ".neck.conv1."),
-        (r"\.neck\.1\.", ".neck.layer_norm1."),
-        (r"\.neck\.2\.", ".neck.conv2."),
-        (r"\.neck\.3\.", ".neck.layer_norm2."),
-        (r"\.pe_layer\.positional_encoding_gaussian_matrix$", ".shared_embedding.positional_embedding"),
-        (r"\.point_embeddings\.", ".point_embed."),
-        (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
-        (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
-        (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
-        (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
-        (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
-        (r"\.output_upscaling\.0\.", ".upscale_conv1."),
-        (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
-        (r"\.output_upscaling\.3\.", ".upscale_conv2."),
-        (r"(_head|_mlps\.\d)\.layers\.0\.", r"\1.proj_in."),
-        (r"(_head|_mlps\.\d)\.layers\.1\.", r"\1.layers.0."),
-        (r"(_head|_mlps\.\d)\.layers\.2\.", r"\1.proj_out."),
-    )
+SAM_NAMES: Names = (
+    (r"^image_encoder\.", "vision_encoder."),
+    (r"^vision_encoder\.blocks\.", "vision_encoder.layers."),
+    (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
+    (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
+    (r"\.neck\.0\.", ".neck.conv1."),
+    (r"\.neck\.1\.", ".neck.layer_norm1."),
+    (r"\.neck\.2\.", ".neck.conv2."),
+    (r"\.neck\.3\.", ".neck.layer_norm2."),
+    (r"\.pe_layer\.positional_encoding_gaussian_matrix$", ".shared_embedding.positional_embedding"),
+    (r"\.point_embeddings\.", ".point_embed."),
+    (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
+    (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
+    (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
+    (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
+    (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
+    (r"\.output_upscaling\.0\.", ".upscale_conv1."),
+    (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
+    (r"\.output_upscaling\.3\.", ".upscale_conv2."),
+    (r"(_head|_mlps\.\d)\.layers\.0\.", r"\1.proj_in."),
+    (r"(_head|_mlps\.\d)\.layers\.1\.", r"\1.layers.0."),
+    (r"(_head|_mlps\.\d)\.layers\.2\.", r"\1.proj_out."),
 )
-SAM2_NAMES = tuple(  # what is named otherwise than in SAM
-    (re.compile(pattern), name)
-    for pattern, name in (
-        (r"^vision_encoder\.trunk\.", "vision_encoder.backbone."),
-        (r"(\.neck\.convs\.\d)\.conv\.", r"\1."),
-        (r"\.mlp\.layers\.0\.", ".mlp.proj_in."),
-        (r"\.mlp\.layers\.1\.", ".mlp.proj_out."),
-        (r"\.out_proj\.", ".o_proj."),
-        (r"^no_mem_embed$", "no_memory_embedding"),
-    )
+SAM2_NAMES: Names = (  # what is named otherwise than in SAM
+    (r"^vision_encoder\.trunk\.", "vision_encoder.backbone."),
+    (r"(\.neck\.convs\.\d)\.conv\.", r"\1."),
+    (r"\.mlp\.layers\.0\.", ".mlp.proj_in."),
+    (r"\.mlp\.layers\.1\.", ".mlp.proj_out."),
+    (r"\.out_proj\.", ".o_proj."),
+    (r"^no_mem_embed$", "no_memory_embedding"),
 )
 SAM_GRID = "prompt_encoder.shared_embedding.positional_embedding"
 SAM2_POINTS = [f"prompt_encoder.point_embeddings.{n}.weight" for n in range(4)]  # outside, inside, corners
@@ -297,7 +291,7 @@ def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
     for old, tensor in tensors.items():
         name = old
         for pattern, by in names:
-            name = pattern.sub(by, name)
+            name = re.sub(pattern, by, name)
         renamed[name] = tensor
     renamed["shared_image_embedding.positional_embedding"] = renamed[SAM_GRID]
     return renamed

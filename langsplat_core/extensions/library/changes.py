@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from langsplat_core.arrays import Array, unit
+from langsplat_core.arrays import Array, linear_light, unit
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.describe import Describer, likely_name
@@ -188,9 +188,8 @@ def _some(cameras: Sequence[Camera]) -> list[Camera]:
 
 def to_lab(colours: Array) -> Array:
     """(..., 3) sRGB in [0, 1] -> CIE L*a*b* of D65."""
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     mixed = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    x, y, z = np.moveaxis(linear @ mixed.T / (0.9505, 1.0, 1.089), -1, 0)
+    x, y, z = np.moveaxis(linear_light(colours) @ mixed.T / (0.9505, 1.0, 1.089), -1, 0)
     x, y, z = (np.where(v > 216 / 24389, np.cbrt(v), (24389 / 27 * v + 16) / 116) for v in (x, y, z))
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
 

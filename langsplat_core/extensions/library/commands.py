@@ -153,6 +153,9 @@ def _html(listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> str
     return "\n".join(parts) + "\n"
 
 
+STATED = ("kind", "name", "centre", "box", "moved", "distance", "colours", "share")  # of a change, in JSON
+
+
 @dataclass(frozen=True)
 class Changes:
     """Say what changed between two scenes of one place: what appeared, is gone, moved, or has another colour.
@@ -193,7 +196,7 @@ class Changes:
                 placed = registered(scenes[1], scenes[0], scaled=unsure, progress=progress).transform
             found = changes(first, second, load_lifting_rasterizer("cpu"), placed, describers, progress)
         if self.json:
-            listed = [_change_fields(change) for change in found]
+            listed = [{name: getattr(change, name) for name in STATED} for change in found]
             print_json({"metres_per_unit": unit.metres, "changes": in_world(listed, origin)})
             return
         print("\n".join(_in_words(change, unit) for change in found) or "nothing changed")
@@ -211,8 +214,3 @@ def _in_words(change: Change, unit: Unit) -> str:
         said = f"{before} to {now}" if before != now else f"another {now}"
         return f"changed colour: {name} at {at}, {said}"
     return f"{change.kind}: {name} at {at}"
-
-
-def _change_fields(change: Change) -> dict[str, Any]:
-    names = ("kind", "name", "centre", "box", "moved", "distance", "colours", "share")
-    return {name: getattr(change, name) for name in names}

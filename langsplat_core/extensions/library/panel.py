@@ -92,13 +92,6 @@ def _show_hits(viewer: Viewer, view: LibraryView, hits: Sequence[Hit]) -> None:
     viewer.state.extension_panels[TITLE] = replace(view, hits=listed, thumbnails=image)
 
 
-def open_hit(viewer: Viewer, hit: Hit) -> None:
-    """Open a scene of the library, and search it for what was looked for in all of them."""
-    view = library_view(viewer)
-    phrase = "" if view is None else view.phrase
-    open_scene(viewer, hit.path, lambda viewer: ask(viewer, phrase))
-
-
 _thumbnails = ui.Picture(shrinks=False)  # all of the list, one below the other
 
 
@@ -136,7 +129,7 @@ def _hit(viewer: Viewer, view: LibraryView, row: int, hit: Hit) -> None:
     width, count = height * THUMBNAIL[0] / THUMBNAIL[1], len(view.hits)
     start = imgui.get_cursor_pos()
     if imgui.selectable("##scene", hit.path == viewer.state.path, size=ImVec2(0, height))[0]:
-        open_hit(viewer, hit)
+        open_scene(viewer, hit.path, lambda viewer: ask(viewer, view.phrase))
     ui.tip(str(hit.path))
     imgui.set_cursor_pos(start)
     if view.thumbnails is not None and view.thumbnails.size:

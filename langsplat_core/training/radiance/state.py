@@ -5,6 +5,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -324,14 +325,12 @@ def load_checkpoint(path: Path, made_from: str, device: torch.device) -> Trainin
             )
         rng = np.random.default_rng()
         rng.bit_generator.state = header["rng"]
-        values, first, second = ({name: tensors[f"{rows}.{name}"] for name in PARAMETERS} for rows in ROWS)
+        rows: Any = {part: {name: tensors[f"{part}.{name}"] for name in PARAMETERS} for part in ROWS}
+        for value in rows["values"].values():
+            value.requires_grad_()
         return TrainingState(
-            values={name: value.requires_grad_() for name, value in values.items()},
-            first=first,
-            second=second,
-            grad_sum=tensors["grad_sum"],
-            seen=tensors["seen"],
-            exposures=tensors["exposures"],
+            **rows,
+            **{name: tensors[name] for name in TENSORS},
             transients=Transients(*(tensors[f"watched.{name}"].cpu().numpy() for name in WATCHED)),
             rng=rng,
             updates={name: int(header["updates"][name]) for name in PARAMETERS},

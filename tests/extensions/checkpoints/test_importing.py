@@ -20,7 +20,7 @@ from langsplat_core.extensions.checkpoints.convert import export_langsplat, expo
 from langsplat_core.extensions.checkpoints.importing import ForeignScene, import_scene, read_foreign
 from langsplat_core.extensions.checkpoints.langsplat_files import write_checkpoint
 from langsplat_core.io.ply import write_ply
-from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.io.scenes import ExportRequest, load_scene, save_scene
 from langsplat_core.scene import CANONICAL_PHRASES, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.language.codec_fit import everyday_vocabulary
@@ -446,6 +446,10 @@ def test_many_vectors_keep_the_stated_error(tmp_path, clip):
     np.testing.assert_allclose(decoded(linear.language, 2), vectors, atol=1e-5)
 
 
+def asked(scene: Scene, out: Path) -> ExportRequest:
+    return ExportRequest((Path("case.ply"),), lambda: scene, out)
+
+
 def langsplat_levels(folder: Path) -> tuple[list[Path], Array, torch.nn.Module]:
     network = autoencoder(D)
     with torch.no_grad():
@@ -461,7 +465,7 @@ def langsplat_levels(folder: Path) -> tuple[list[Path], Array, torch.nn.Module]:
 @pytest.mark.long
 def test_langsplat_there_and_back(tmp_path, clip):
     scene, _ = import_scene(read_foreign(langsplat_levels(tmp_path / "a")[0]), clip)
-    written = export_langsplat(scene, tmp_path / "b", "case")
+    written = [Path(name) for name in export_langsplat(asked(scene, tmp_path / "b"))]
     assert [str(path.relative_to(tmp_path / "b")) for path in written] == [
         *(f"case_{level}/chkpnt30000.pth" for level in (1, 2, 3)),
         "best_ckpt.pth",
@@ -490,7 +494,7 @@ def test_langsplat_there_and_back(tmp_path, clip):
 def test_occam_there_and_back(tmp_path, clip):
     scene, _ = import_scene(read_foreign(occam_levels(tmp_path)), clip)
     assert scene.language is not None
-    written = export_occam(scene, tmp_path / "out")
+    written = [Path(name) for name in export_occam(asked(scene, tmp_path / "out"))]
     (elements, _) = torch.load(written[2], weights_only=True)
     assert elements[7].shape == (COUNT, D)
     np.testing.assert_array_equal(elements[7][0].numpy(), 0)  # never seen
@@ -507,7 +511,7 @@ def test_occam_there_and_back(tmp_path, clip):
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
 def test_every_codec_is_written_as_vectors(tmp_path, kind):
     field = random_field(COUNT, kind)
-    export_occam(Scene(GAUSSIANS, field), tmp_path)
+    export_occam(asked(Scene(GAUSSIANS, field), tmp_path))
     for level in range(3):
         (elements, _) = torch.load(tmp_path / f"chkpnt30000_langfeat_{level + 1}.pth", weights_only=True)
         want = np.where(field.known[level][:, None], decoded(field, level), 0)
