@@ -6,7 +6,7 @@ for what they need (`cosines`, `distances`, `unique`) and never which kind it is
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, Self
@@ -200,6 +200,29 @@ class AutoencoderCodec(Codec):
     @classmethod
     def from_tensors(cls, tensors: dict[str, Array]) -> "AutoencoderCodec":
         return cls(_layers(tensors, "encoder"), _layers(tensors, "decoder"))
+
+
+EPSILON = 1e-5  # that batch normalisation adds to the variance, in torch and in LangSplat
+
+
+def folded(network: Iterable[Mapping[str, Array]]) -> Layers:
+    """Return the linear layers of a network, float32, batch normalisations made part of those before them.
+
+    network: the weights of each layer by their names in torch; without any, it is of no concern here.
+    ValueError or KeyError for other kinds of layers.
+    """
+    layers: list[tuple[Array, Array]] = []
+    for named in network:
+        if "running_var" in named:
+            scale = named["weight"] / np.sqrt(named["running_var"] + EPSILON)
+            weight, bias = layers[-1]
+            shifted = (bias - named["running_mean"]) * scale + named["bias"]
+            layers[-1] = (weight * scale[:, None], shifted)
+        elif named:
+            if named["weight"].ndim != 2:
+                raise ValueError(f"a layer with weights {named['weight'].shape}")
+            layers.append((named["weight"], named["bias"]))
+    return tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers)
 
 
 def _largest(layers: Layers) -> float:

@@ -14,7 +14,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.ply import REST_COUNTS
 from langsplat_core.io.scenes import ORIGIN_SUFFIX, companion_path, write_origin
 from langsplat_core.scene import NO_ORIGIN, AutoencoderCodec, Gaussians
-from langsplat_core.scene.codec import Layers
+from langsplat_core.scene.codec import EPSILON, Layers, folded
 
 # ---- LangSplat's autoencoder, `best_ckpt.pth`: weights by the number of a layer in its network ----
 #
@@ -27,7 +27,6 @@ from langsplat_core.scene.codec import Layers
 # Both results are scaled to length 1. Other widths and depths are read too: a layer's weights tell what it
 # is.
 
-EPSILON = 1e-5  # that batch normalisation adds to the variance
 _NAME = re.compile(r"(encoder|decoder)\.([0-9]{1,3})\.(\w+)")
 Layer = dict[str, Array]
 
@@ -51,7 +50,7 @@ def autoencoder_from(content: Mapping[str, Any], path: Path) -> AutoencoderCodec
     try:
         with np.errstate(all="ignore"):  # what is not finite is refused below
             codec = AutoencoderCodec(
-                *(_folded(_layers(content, part, path)) for part in ("encoder", "decoder"))
+                *(folded(_layers(content, part, path)) for part in ("encoder", "decoder"))
             )
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise FormatError(f"{path}: not an autoencoder of LangSplat's kind ({error})") from None
@@ -69,22 +68,6 @@ def _layers(content: Mapping[str, Any], part: str, path: Path) -> list[Layer]:
         if found and array is not None:
             layers.setdefault(int(found[2]), {})[found[3]] = array.astype(np.float64)
     return [layers[number] for number in sorted(layers)]
-
-
-def _folded(layers: list[Layer]) -> tuple[tuple[Array, Array], ...]:
-    """Linear layers as (out, in) float32 weights and (out,) biases; what follows one is made part of it."""
-    folded: list[tuple[Array, Array]] = []
-    for layer in layers:
-        weight, bias = layer["weight"], layer["bias"]
-        if "running_var" in layer:
-            scale = weight / np.sqrt(layer["running_var"] + EPSILON)
-            before, offset = folded[-1]
-            folded[-1] = (before * scale[:, None], (offset - layer["running_mean"]) * scale + bias)
-        elif weight.ndim == 2:
-            folded.append((weight, bias))
-        else:
-            raise ValueError(f"a layer with weights {weight.shape}")
-    return tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in folded)
 
 
 def autoencoder_weights(encoder: Layers, decoder: Layers) -> dict[str, Array]:

@@ -22,7 +22,7 @@ from langsplat_core.scene import (
     LinearCodec,
     Tree,
 )
-from langsplat_core.scene.codec import KINDS, principal_colours
+from langsplat_core.scene.codec import KINDS, Layers, folded, principal_colours
 from langsplat_core.scene.surface import Surface
 from langsplat_core.semantics.encoders import PhraseEncoder
 from langsplat_core.semantics.relevancy import Scale, everyday_phrases, everyday_vectors, relevancy_of
@@ -168,22 +168,9 @@ def _settle_statistics(encoder: Any, data: Any) -> None:
                 encoder(chunk)
 
 
-def folded_layers(network: Any) -> tuple[tuple[Array, Array], ...]:
+def folded_layers(network: Any) -> Layers:
     """Return (out, in) weights and biases of a torch `Sequential`, batch normalisations folded in."""
-    from torch import nn
-
-    layers: list[tuple[Array, Array]] = []
-    for module in network:
-        if isinstance(module, nn.Linear):
-            layers.append((module.weight.detach().double().numpy(), module.bias.detach().double().numpy()))
-        elif isinstance(module, nn.BatchNorm1d):
-            assert module.running_mean is not None
-            assert module.running_var is not None
-            scale = (module.weight / (module.running_var + module.eps).sqrt()).detach().double().numpy()
-            shift = module.bias.detach().double().numpy() - module.running_mean.double().numpy() * scale
-            weight, bias = layers[-1]
-            layers[-1] = (weight * scale[:, None], bias * scale + shift)
-    return tuple((w.astype(np.float32), b.astype(np.float32)) for w, b in layers)
+    return folded({name: t.double().numpy() for name, t in m.state_dict().items()} for m in network)
 
 
 # A scene's own codebook: as many codewords as its language features need, and not more.
