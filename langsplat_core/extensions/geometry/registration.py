@@ -16,7 +16,7 @@ from langsplat_core.scene import Camera, LanguageField, Scene, Tree
 from langsplat_core.scene.codec import LARGEST, CodebookCodec, Codec, principal_colours
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.language import NO_NODE
-from langsplat_core.scene.transform import place_scene, similarity
+from langsplat_core.scene.transform import place_scene, rotating, similarity
 
 SAMPLES = 40_000  # points of each surface
 ROUGH, FINE = 0.06, 0.03  # of the fixed scene's radius: spacing of points for features, and for ICP
@@ -85,15 +85,7 @@ def register(
 def quarter_turns(scene: Scene) -> list[Array]:
     """Four (4, 4) rotations about up through the middle of a scene: rooms are nearly alike from all sides."""
     centre, up = scene.bounds()[0], scene.up()
-    cross = np.cross(np.eye(3), up).T  # cross @ x = up x x
-    made = []
-    for quarter in range(4):
-        sine, cosine = np.sin(np.pi / 2 * quarter), np.cos(np.pi / 2 * quarter)
-        turn = np.eye(4)
-        turn[:3, :3] += sine * cross + (1 - cosine) * cross @ cross
-        turn[:3, 3] = centre - turn[:3, :3] @ centre
-        made.append(turn)
-    return made
+    return [rotating(up, -90.0 * quarter).about(centre).matrix for quarter in range(4)]
 
 
 def _aligned(
