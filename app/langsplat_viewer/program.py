@@ -188,11 +188,8 @@ def answer_line(result: QueryResult, origin: Array = NO_ORIGIN) -> str:
     """Return the answer as a line for people and for scripts, its place in the world."""
     shown = None if result.verdict == "not here" else result.place
     place = "none" if shown is None else f"({length_text(shown, ', ', origin=origin)})"
-    verdict: str = result.verdict
-    if result.probability is not None:
-        verdict += f" ({100 * result.probability:.0f} %)"
     level = LEVELS[result.level]
-    return f"'{result.phrase}': {verdict}, score {result.peak:.3f}, level {level}, place {place}"
+    return f"'{result.phrase}': {result.said}, score {result.peak:.3f}, level {level}, place {place}"
 
 
 # The command line.

@@ -352,7 +352,9 @@ def _answer(result: QueryResult, camera: Camera | None) -> dict[str, Any]:
         "phrase": result.phrase,
         "found": result.found,
         "verdict": result.verdict,
+        "said": result.said,
         "probability": result.probability,
+        "by_chance": result.by_chance,
         "score": result.peak,
         "level": LEVELS[result.level],
         "scores": dict(zip(LEVELS, result.scores, strict=True)),
@@ -401,10 +403,8 @@ class _Pixels:
 
 def _lines(answer: dict[str, Any], unit: Unit) -> list[str]:
     """Return an answer as text: its verdict and where it is, then how the phrase was read."""
-    verdict, reading, count = answer["verdict"], answer["reading"], answer["count"]
+    verdict, reading, count = answer["said"], answer["reading"], answer["count"]
     best, least, most = count["best"], count["least"], count["most"]
-    if answer["probability"] is not None:
-        verdict += f" ({100 * answer['probability']:.0f} %)"
     if most > 1 or (most and not answer["found"]):
         verdict += f", {best} of them" + ("" if least == most else f" ({least} to {most})")
     place = "-" if answer["place"] is None else f"{unit.place(answer['place'])} {unit.name}"

@@ -27,6 +27,9 @@ OTHERS = 0.9  # share of pairs of wholes
 # bundled encoder and with CLIP's geometry.
 FOUND = ((0.0, 2.8), (0.0, 2.8), (0.1, 1.9))
 HIGHEST = 0.95  # similarity from which anything is what was shown
+# Where everything is alike, as in real scenes, what is shown tells more than the scene: a rival counts up to
+# `LIKEST`, and where a whole is shown up to half of the way from the `NEXT` others that are most like it.
+LIKEST, NEXT = 0.42, 3
 # Of the similarity from which it is found: half of it below, 80 % of what is absent is less. What is exactly
 # as shown has a fit of 1 / UNIT, a relevancy of 0.97.
 UNIT = 0.3
@@ -64,7 +67,7 @@ def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> Wo
         every.append(np.where(known[:, None], unit(means - centres[-1]), 0))
     alike = every[-1][solid] @ every[-1][solid].T
     pairs = alike[np.triu_indices(len(alike), 1)].clip(0, 1)
-    rival = float(np.quantile(pairs, OTHERS)) if len(pairs) else 0.0
+    rival = min(float(np.quantile(pairs, OTHERS)), LIKEST) if len(pairs) else 0.0
     return WordSpace(basis, np.stack(centres), tuple(every), rival)
 
 
@@ -87,9 +90,17 @@ def shown(
     vector = unit(mean - space.centres[level]) @ space.basis
     if not known or not np.linalg.norm(vector) > 0.5:
         raise InputError(f"what was shown means nothing at level {LEVELS[level]}; point at something else")
+    rival, whole = space.rival, len(LEVELS) - 1
+    if level == whole:
+        of, sizes = regions.everywhere[whole], regions.sizes[whole]
+        others = np.setdiff1d(np.flatnonzero(sizes >= SMALLEST), of[members])
+        alike = np.sort(space.regions[whole][others] @ (space.basis @ unit(vector)))[-NEXT:]
+        base, times = FOUND[whole]
+        if len(alike) == NEXT:
+            rival = float(np.clip(((1 + alike.mean()) / 2 - base) / times, 0, rival))
     # Of the precision of files: what is taught answers the same after it was saved.
     vector = unit(vector).astype(np.float16).astype(np.float32)
-    return TaughtWord(name, level, vector[None], np.array([space.rival], np.float16).astype(np.float32))
+    return TaughtWord(name, level, vector[None], np.array([rival], np.float16).astype(np.float32))
 
 
 def compared(word: TaughtWord, space: WordSpace, vectors: Array, level: int) -> tuple[Array, Array]:

@@ -302,10 +302,12 @@ class Page {
 
   // The verdict in the panel, and the ends of the legend.
   say(answer, said) {
-    const { outcome, probability } = answer.verdict;
+    const { outcome, probability, byChance } = answer.verdict;
     const { levels, guess } = this.meta.language;
     const [style, word] = OUTCOMES[outcome];
-    const sure = probability === null ? "" : `, ${Math.round(100 * probability)} %`;
+    const share = 100 * Math.max(byChance ?? 0, 0.001); // never none
+    const chance = byChance === null ? "" : `, by chance ${share.toFixed(share >= 1 ? 0 : 1)} %`;
+    const sure = probability === null ? chance : `, ${Math.round(100 * probability)} %`;
     const unit = this.meta.metres_per_unit === 1 ? " m" : "";
     const digits = Math.min(Math.max(2 - Math.floor(Math.log10(this.meta.radius)), 2), 20);
     const place = answer.place?.map((length) => length.toFixed(digits)).join(" ");

@@ -72,11 +72,14 @@ function excess(rule, fits, named, level, bars) {
   return Math.max(above(bars[2], fits[2], whole), above(bars[3], Math.max(fits[0], fits[1]), finer));
 }
 
-// A verdict: `outcome` in words, how it was `reached`, `margin` above what counts as found, `probability`.
+// A verdict: `outcome` in words, how it was `reached`, `margin` above what counts as found, `probability`, and the
+// share of phrases for nothing here that fit as well `byChance`.
 function verdict(rule, found, reached, margin, probability = null) {
   const weak = probability === null ? margin >= rule.weak_excess : probability >= rule.weak_probability;
   const outcome = found ? "found" : weak ? "weak match" : "not here";
-  return { outcome, found, reached, margin, probability };
+  const [atBar, slope] = rule.by_chance;
+  const byChance = reached === "chance" ? sigmoid(logit(atBar) - slope * margin) : null;
+  return { outcome, found, reached, margin, probability, byChance };
 }
 
 // The verdict that the best fits of the levels stand for. level: number, or -1 where it is free. common: the

@@ -186,13 +186,13 @@ def test_query_prints_the_probability(folder, capsys, logit, verdict, probabilit
     assert (answer["instances"] == []) == (verdict != "found")
 
 
-def test_query_prints_no_probability_without_calibration(folder, capsys):
+def test_query_prints_chance_without_calibration(folder, capsys):
     save_fake()
     (answer,) = answers(capsys, "query", "b.ply", "book")
     assert (answer["probability"], answer["encoder"], answer["calibration"]) == (None, "fake", None)
     said = lines(capsys, "query", "b.ply", "book")
-    assert said[0].startswith("book: found, score ")
-    assert not any("%)" in line for line in said)
+    assert said[0].startswith("book: found (by chance ")
+    assert said[0].startswith(f"book: {answer['said']}, score ")
     save_fake(encoder_id="demo")
     *said, last = lines(capsys, "query", "b.ply", "book", "book")
     assert f"--clip.model {OPEN_MODEL}" in last

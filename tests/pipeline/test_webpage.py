@@ -43,7 +43,7 @@ MIXED = [f"{colour} {thing}" for colour in ("red", "blue", "yellow") for thing i
 OWNED = ["duck beak", "teapot lid", "laptop screen", "the Red Mug!", "  blue, gift ", "penguin’s beak"]
 PHRASES = [*NAMES, *MIXED, *OWNED, "rocket fins", "wooden table", "green car"]
 MARKUP = '<img src=x onerror="window.escaped=1"></script><script>window.escaped=2</script>'
-FIELDS = ("level", "scores", "fits", "peak", "probability", "found", "verdict", "place", "box")
+FIELDS = ("level", "scores", "fits", "peak", "probability", "by_chance", "found", "verdict", "place", "box")
 
 
 @pytest.fixture(scope="module")

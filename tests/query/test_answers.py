@@ -17,12 +17,14 @@ from langsplat_core.query.rule import (
     RULE,
     Bar,
     RegionTable,
+    Verdict,
     bars_of,
     common_fits,
     excess,
     judge,
     region_fits,
 )
+from langsplat_core.query.taught import FOUND, LIKEST, NEXT, shown
 from langsplat_core.scene import (
     LEVELS,
     NO_NODE,
@@ -235,6 +237,20 @@ def test_verdicts_by_chance_leave_out_what_lies_near_everything():
     assert told[0] == told[1]
 
 
+@pytest.mark.parametrize(("margin", "said"), [(0.0, "5 %"), (1.0, "0.7 %"), (-1.0, "28 %"), (9.0, "0.1 %")])
+def test_verdicts_by_chance_say_how_often_chance_fits_as_well(margin, said):
+    verdict = Verdict(margin >= 0, "chance", margin)
+    assert verdict.by_chance == pytest.approx(1 / (1 + 19 * np.exp(2 * margin)))
+    answer = replace(calibrated(None).run("book"), judgement=verdict)
+    assert answer.said == f"{verdict.outcome} (by chance {said})"
+    assert verdict.absent.by_chance == 1
+    for other, told in (
+        (Verdict(True, "calibration", 1.0, 0.83), "found (83 %)"),
+        (Verdict(True, "example", 1.0), "found"),
+    ):
+        assert (other.by_chance, replace(answer, judgement=other).said) == (None, told)
+
+
 @pytest.mark.parametrize("named", RULE.found)
 @pytest.mark.parametrize("level", ["auto", *LEVELS])
 def test_excess_is_counted_from_the_bars(named, level):
@@ -398,6 +414,19 @@ def test_taught_words_find_their_things_in_other_scenes():
         assert answer.box is not None
         assert 0 <= answer.relevancy.min() <= answer.relevancy.max() <= 1
         assert (answer.peak >= 0.5) == answer.found
+
+
+def test_rival_of_a_shown_whole_follows_from_the_next_ones():
+    engine, number = QueryEngine(SHOWN), len(ROOM)
+    space, there = engine.word_space, members(3, number)
+    given = space, engine.field, engine.regions
+    own = engine.regions.everywhere[2][there][0]
+    alike = np.sort(np.delete(space.regions[2] @ space.regions[2][own], own))[-NEXT:].mean()
+    base, times = FOUND[2]
+    assert space.rival <= LIKEST
+    for rival in (0.0, 0.9):
+        (said,) = shown(replace(space, rival=rival), *given[1:], "vase", there, 2).rivals
+        assert said == pytest.approx(min(rival, ((1 + alike) / 2 - base) / times), abs=1e-3)
 
 
 def test_taught_word_finds_every_thing_and_places_the_best():

@@ -203,7 +203,8 @@ class Tab:
               const { page, ask } = await langsplat, answer = ask(phrase, level);
               const { values, members } = page.language.spread(answer, answer.level);
               const sum = (numbers) => numbers.reduce((a, b) => a + b, 0);
-              return { ...answer, ...answer.verdict, verdict: answer.verdict.outcome, regionFits: null,
+              return { ...answer, ...answer.verdict, verdict: answer.verdict.outcome,
+                       by_chance: answer.verdict.byChance, regionFits: null,
                        codes: null, members: sum(members), mean: sum(values) / values.length };
             }""",
             [phrase, level],

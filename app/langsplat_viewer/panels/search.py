@@ -189,8 +189,7 @@ def _verdict(viewer: Viewer, query: Query) -> None:
         imgui.text_colored(ui.bad(), "unknown")
     elif result is not None:
         imgui.text_colored(ui.good() if result.found else ui.muted(), result.verdict)
-        if result.probability is not None:
-            ui.tip(f"{100 * result.probability:.0f} % likely to be there")
+        ui.tip(result.said)
 
 
 def _details(viewer: Viewer, query: Query) -> None:

@@ -84,12 +84,11 @@ class Find:
 
 
 def _said(hit: Hit) -> str:
-    sure = "" if hit.probability is None else f" ({100 * hit.probability:.0f} %)"
     place = "place not looked for" if hit.answer is None else "place -"
     if hit.answer is not None and hit.answer.place is not None:
         unit = unit_of(hit.metres_per_unit, hit.origin)
         place = f"place {unit.place(hit.answer.place)} {unit.name}"
-    return f"{hit.verdict}{sure}, {place}"
+    return f"{hit.said}, {place}"
 
 
 def _name(hit: Hit, library: Library) -> str:
@@ -118,7 +117,7 @@ def _fields(answered: Answered, hits: Sequence[Hit], library: Library) -> dict[s
 
 
 def _hit_fields(hit: Hit, library: Library) -> dict[str, Any]:
-    own = ("verdict", "probability", "margin", "metres_per_unit")
+    own = ("verdict", "probability", "by_chance", "margin", "metres_per_unit")
     answer = hit.answer
     fields = {
         "scene": _name(hit, library),

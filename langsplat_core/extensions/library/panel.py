@@ -141,8 +141,7 @@ def _hit(viewer: Viewer, view: LibraryView, row: int, hit: Hit) -> None:
     room = imgui.get_content_region_avail().x
     imgui.text(ui.elided(hit.path.relative_to(view.library.folder).as_posix(), room))
     if view.phrase:
-        sure = "" if hit.probability is None else f" ({100 * hit.probability:.0f} %)"
-        imgui.text_colored(ui.good() if hit.verdict == "found" else ui.muted(), hit.verdict + sure)
+        imgui.text_colored(ui.good() if hit.verdict == "found" else ui.muted(), hit.said)
     imgui.end_group()
 
 
