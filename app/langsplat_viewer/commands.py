@@ -171,6 +171,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             "save a picture", saving.save_picture, ("Ctrl+S", "P"), "Save picture", icon="CAMERA", apart=True
         ),
         Command("save the view", saving.save_view, (), "Save view"),
+        Command("export a web page that can be searched", saving.save_page),
         Command("save the project", saving.save_project, ("Ctrl+Shift+S",)),
         Command("save a picture of the film's size", saving.save_sized_picture, (), "Picture of this size"),
         Command("save a film of the path", saving.save_film, (), "Save film"),
@@ -322,10 +323,60 @@ def with_key(text: str, act: Callable[[Viewer], object]) -> str:
     return f"{text} ({keys[0]})" if keys else text
 
 
+# Other words that people look for, by what a command does.
+SYNONYMS = {
+    "open a scene": "load import file browse ply splat project",
+    "start page": "home welcome recent close demo example bundled",
+    "train a scene": "photographs photos images video reconstruct create make new colmap",
+    "save a picture": "screenshot image png export capture snapshot render photo",
+    "export a web page that can be searched": "save html browser share website offline",
+    "save a film of the path": "video movie mp4 gif webp animation export record render",
+    "quit": "exit close leave end",
+    "search": "find query ask phrase text words language where",
+    "remove all queries": "clear reset delete search results answers",
+    "undo": "back revert",
+    "gizmo: move, rotate, scale, off": "transform translate turn resize handles crop box",
+    "delete the selection": "remove erase clean cut crop",
+    "save the selection": "export extract cut out ply",
+    "save the scene without what was deleted": "export clean cleaned ply write",
+    "compare two displays": "split side by side beside wipe divide",
+    "compare with another scene": "split side by side beside difference",
+    "show or hide the boxes of what was found": "bounding box outline 3d",
+    "say what is under the cursor": "inspect pick hover identify info",
+    "show or hide the axes": "compass orientation xyz cube",
+    "measure a distance": "ruler length size metre",
+    "pin a note to what is clicked": "annotate annotation label comment text mark",
+    "return to the opening view": "reset camera home start",
+    "frame everything": "fit all zoom extents whole center centre",
+    "level the horizon": "straighten roll upright",
+    "orthographic view, and back": "perspective parallel projection 2d",
+    "bookmark this view": "save camera remember favourite favorite",
+    "hide or show the panels": "full screen fullscreen clean interface sidebar ui",
+    "reset the layout": "default panels windows docking restore",
+    "light theme, or dark again": "appearance colours colors mode settings night day",
+    "larger text": "font size zoom interface bigger scale settings",
+    "panel: Display": "background backdrop settings options preferences brightness colours color map heat",
+    "panel: Outline": "tree hierarchy objects things list contents inventory",
+    "panel: Transform": "crop clean move rotate scale box",
+    "panel: Messages": "log errors history console",
+    "first steps, and list of keys": "help shortcuts keyboard manual tutorial documentation about",
+}
+
+
 def matching(text: str, recent: Sequence[str] = ()) -> list[Command]:
-    """Return the commands whose words hold every word of `text`; all of them for none.
+    """Return the commands with every word of `text`, those that find it among synonyms last; all for none.
 
     `recent` scenes are some.
     """
     words, commands = text.lower().split(), (*COMMANDS, *map(_recent, map(Path, recent)))
-    return [command for command in commands if all(word in command.does.lower() for word in words)]
+
+    def missed(command: Command) -> int:
+        """Return how many words are none of its own; one more than there are where one is unknown."""
+        own = command.does.lower()
+        known = f"{own} {SYNONYMS.get(command.does, '')}"
+        return (
+            sum(word not in own for word in words) if all(word in known for word in words) else len(words) + 1
+        )
+
+    found = [command for command in commands if missed(command) <= len(words)]
+    return sorted(found, key=missed)

@@ -124,10 +124,12 @@ class OutlineView:
 
 @dataclass(frozen=True)
 class Message:
-    """One line of the messages area."""
+    """One line of the messages area, said over the scene first."""
 
     text: str
     is_error: bool = False
+    file: Path | None = None  # that was written
+    undoes: Session | None = field(default=None, compare=False)  # that an undo right now returns to
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,11 +298,13 @@ class ViewerState(SceneState):
         for part in fields(SceneState):
             setattr(self, part.name, getattr(fresh, part.name))
 
-    def say(self, text: str, is_error: bool = False) -> None:
-        """Add one line to the messages area."""
-        message = Message(" ".join(text.split()), is_error)
-        if not self.messages or self.messages[-1] != message:
-            self.messages = [*self.messages[1 - MAX_MESSAGES :], message]
+    def say(
+        self, text: str, is_error: bool = False, file: Path | None = None, undoes: Session | None = None
+    ) -> None:
+        """Add one line to the messages area; in place of the last one where that says the same."""
+        message = Message(" ".join(text.split()), is_error, file, undoes)
+        kept = self.messages[:-1] if self.messages[-1:] == [message] else self.messages
+        self.messages = [*kept[1 - MAX_MESSAGES :], message]
 
     def answer(self, query: Query) -> QueryAnswer:
         """Return the answer to a query of the list."""

@@ -287,7 +287,7 @@ class Viewer:
         except (OSError, ValueError, LangSplatError) as error:
             self.say_error(f"{path}: not saved ({one_line(error)})")
             return None
-        self.state.say(f"saved {path}{more}")
+        self.state.say(f"saved {path}{more}", file=path)
         return path
 
     def take_results(self) -> None:

@@ -186,7 +186,7 @@ class Window:
         self._last: tuple[object, ...] = ()  # what was there in the last frame
         self._tidied: tuple[int, int] = (0, 0)  # news after which memory was given back
         self._titled: Path | None = None  # the scene that the window's title names
-        self._start_page = dialogs.StartPage(folder)
+        self._start_page, self.toasts = dialogs.StartPage(folder), dialogs.Toasts()
         self._folder = folder
 
     def params(self) -> hello_imgui.RunnerParams:
@@ -396,7 +396,7 @@ class Window:
         if self.failure is not None:
             return
         viewer, area = self.viewer, ui.scene_area()
-        layout.draw_over(viewer, self._start_page)
+        layout.draw_over(viewer, self._start_page, self.toasts)
         self._menu.draw(viewer, area)
         overlays.draw_evidence(viewer, self._evidence)
         navigation.handle(viewer, area)

@@ -97,6 +97,27 @@ def draw_over_the_scene(s: Any) -> None:
     assert not s.state.session.ruler.measures
 
 
+def toasts_offer_what_follows(s: Any) -> None:
+    """What was done is said over the scene, hidden panels or not, and undone from there."""
+    s.window.toasts.seconds = 60.0
+    s.search("mug")
+    s.menu("Select", "Select what the search found")
+    s.key("f11")
+    plain = s.shot("plain")
+    s.key("delete")
+    assert marked(s.viewer) == ("", "", "mug")
+    said = np.abs(s.shot("deleted") - plain)[500:600, 300:560]
+    assert said.max() > 100
+    s.click("//toasts/**/Undo")
+    assert marked(s.viewer)[2] == ""
+    s.key("P", frames=3)
+    assert s.ctx.item_exists("//toasts/**/Show in folder")
+    s.draws_nothing()
+    s.window.toasts.seconds = 0.0
+    s.rest(2)
+    assert not s.ctx.item_exists("//toasts/**/Show in folder")
+
+
 def begin_at_the_start_page(s: Any) -> None:
     """Without a scene the page offers what was open lately, with thumbnails; nothing is drawn meanwhile."""
     blobs = s.folder / "blobs.ply"

@@ -30,6 +30,7 @@ from tests.support.windowless import (
     marks_of,
     open_scene,
     phrases,
+    recorded,
     result,
     settle,
 )
@@ -309,6 +310,15 @@ def pruned(opened):
 def kept_in(folder: Path) -> int:
     """Gaussians of what was saved as "edited"."""
     return len(load_scene(folder / "blobs-edited-001.ply").gaussians)
+
+
+def test_web_page_is_written_by_the_window(pruned, tmp_path):
+    saving.save_page(pruned, tmp_path)
+    recorded(pruned)
+    said = pruned.state.messages[-1]
+    assert said.file == tmp_path / "blobs-001.html"
+    assert "opens in any browser" in said.text
+    assert said.file.read_text().startswith("<!doctype html>")
 
 
 def test_export_writes_parts_with_their_field(pruned, tmp_path):

@@ -33,7 +33,10 @@ def mark(viewer: Viewer, marks: Marks) -> None:
     """Take other marks, unless they mark the same."""
     if not marks.same(viewer.state.marks):
         viewer.remember()
+        gone = int(marks.deleted.sum() - viewer.state.marks.deleted.sum())
         put_marks(viewer, marks)
+        if gone > 0:
+            viewer.state.say(f"deleted {gone:,} Gaussians", undoes=viewer.history.past[-1])
 
 
 def put_marks(viewer: Viewer, marks: Marks) -> None:

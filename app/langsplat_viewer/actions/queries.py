@@ -24,7 +24,7 @@ from langsplat_viewer.state import QueryAnswer
 from langsplat_viewer.viewer import Viewer
 
 MOST_THINGS = 20  # instances of one answer
-SIMPLE = 4  # examples without structure
+SIMPLE = 3  # examples without structure
 
 
 def ask(viewer: Viewer, text: str) -> None:
@@ -168,6 +168,7 @@ def remove_all(viewer: Viewer) -> None:
     """Take all queries off the list; one undo brings them back."""
     viewer.change(queries=(), chosen="")
     forget_unlisted(viewer)
+    viewer.state.say("removed all queries", undoes=next(reversed(viewer.history.past), None))
 
 
 def set_level(viewer: Viewer, level: LevelChoice) -> None:

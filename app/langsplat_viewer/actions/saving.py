@@ -4,6 +4,8 @@ Everything goes to new files, never over old ones, but a project to the file tha
 """
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from concurrent.futures import wait
 from dataclasses import replace
@@ -18,6 +20,7 @@ from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.io.shapes import write_points
+from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
@@ -78,14 +81,37 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
         return
     request = state.request((width, height), state.session.picture.transparent)
 
-    def work(progress: Progress) -> str:
+    def work(progress: Progress) -> Path:
         path = _new_file(viewer, folder, ".png", f"-{width}x{height}")
         progress("drawing", 0.0, path.name)
         with output.in_one_line(path, f"{width}x{height}"), open_renderer("cpu") as renderer:
             output.save_png(path, output.draw_something(request, renderer))
-        return f"saved {path}"
+        return path
 
-    viewer.recorder.submit(f"picture of {width} x {height}", work, state.say, viewer.say_error)
+    def done(path: Path) -> None:
+        state.say(f"saved {path}", file=path)
+
+    viewer.recorder.submit(f"picture of {width} x {height}", work, done, viewer.say_error)
+
+
+def save_page(viewer: Viewer, folder: Path = Path()) -> None:
+    """Have the scene, without what was deleted, written as a web page that can be searched, a new file."""
+    state = viewer.state
+    if not has_scene(viewer) or state.scene is None:
+        return
+    scene, kept = replace(state.scene, language=viewer.language), state.marks.kept
+    path = _new_file(viewer, folder, ".html")
+
+    def work(progress: Progress) -> str:
+        left = scene if kept.all() else scene.take(np.flatnonzero(kept))
+        engine = viewer.services.engine(left) if left.language is not None else None
+        report = write_page(path, left, engine, path.stem, progress)
+        return f"saved {path}: {report.bytes / 1e6:.1f} MB, opens in any browser"
+
+    def done(text: str) -> None:
+        state.say(text, file=path)
+
+    viewer.recorder.submit(f"web page {path.name}", work, done, viewer.say_error)
 
 
 def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
@@ -140,7 +166,10 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
         say_compiling(progress)
         return "; ".join(output.make_film(shot, out, progress))
 
-    viewer.recorder.submit(f"film {out.name}", work, state.say, viewer.say_error)
+    def done(text: str) -> None:
+        state.say(text, file=out)
+
+    viewer.recorder.submit(f"film {out.name}", work, done, viewer.say_error)
 
 
 def cancel_film(viewer: Viewer) -> None:
@@ -178,7 +207,7 @@ def export(
 
     def done(written: tuple[Path, int]) -> None:
         path, count = written
-        state.say(f"saved {path}: {count:,} {'points' if as_points else 'Gaussians'}")
+        state.say(f"saved {path}: {count:,} {'points' if as_points else 'Gaussians'}", file=path)
         if part == "edited" and not as_points and state.scene is shown:
             state.saved = replace(state.saved, marks=session.marks, moves=session.moves)
         then(viewer)
@@ -253,6 +282,15 @@ def _take_over(viewer: Viewer, written: Session) -> None:
         viewer.state.say("with what another window has saved in it meanwhile")
     except LangSplatError as error:
         viewer.say_error(f"not shown, although saved: {one_line(error)}")
+
+
+def show_in_folder(viewer: Viewer, path: Path) -> None:
+    """Have the system's file manager show where a file lies."""
+    program = {"darwin": "open", "win32": "explorer"}.get(sys.platform, "xdg-open")
+    try:
+        subprocess.Popen([program, str(path.parent)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    except OSError as error:
+        viewer.say_error(f"{path.parent}: cannot be shown ({one_line(error)}); open it in a file manager")
 
 
 # Another scene, or none: what was deleted and not saved is asked about first.

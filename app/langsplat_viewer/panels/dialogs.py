@@ -6,6 +6,7 @@ may be missing.
 """
 
 from contextlib import suppress
+from itertools import takewhile
 from pathlib import Path
 
 import moderngl
@@ -13,10 +14,11 @@ import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
 from PIL import Image
 
-from langsplat_viewer.actions import opening, saving, settings
+from langsplat_viewer.actions import editing, opening, saving, settings
 from langsplat_viewer.disk import FolderEntry, Listing
 from langsplat_viewer.panels import ui
 from langsplat_viewer.projects import BUNDLED, thumbnail_of
+from langsplat_viewer.state import Message
 from langsplat_viewer.viewer import Viewer
 
 # The start page.
@@ -125,6 +127,56 @@ def _drop_target(viewer: Viewer, width: float) -> None:
         corner.x + (size.x - ui.width_of(text)) / 2, corner.y + (size.y - imgui.get_text_line_height()) / 2
     )
     paint.add_text(middle, imgui.get_color_u32(ui.muted()), text)
+
+
+# Toasts: what was said last, for a while.
+
+TOAST_EM, MOST_TOASTS = 30.0, 3
+
+
+class Toasts:
+    """The latest messages, over the scene for some seconds, or until the window is drawn again after that."""
+
+    def __init__(self) -> None:
+        self.seconds = 6.0
+        self._shown: list[tuple[Message, float]] = []  # and since when
+        self._last: Message | None = None
+
+    def draw(self, viewer: Viewer, area: ui.Area) -> None:
+        """Draw them at the foot of the scene; one that is pointed at stays, a click sends them away."""
+        now, said = imgui.get_time(), viewer.state.messages
+        new = [*takewhile(lambda message: message is not self._last, reversed(said))][::-1]
+        self._last = said[-1] if said else None
+        since = (*self._shown, *((message, now) for message in new))
+        self._shown = [(message, at) for message, at in since if now - at < self.seconds][-MOST_TOASTS:]
+        if not self._shown:
+            return
+        foot = ImVec2(area.left + area.width / 2, area.top + area.height - hello_imgui.em_size(2))
+        imgui.set_next_window_pos(foot, imgui.Cond_.always, ImVec2(0.5, 1))
+        over = ui.OVER & ~imgui.WindowFlags_.no_bring_to_front_on_focus | ui.FIXED
+        imgui.begin("toasts", None, over | imgui.WindowFlags_.no_nav | imgui.WindowFlags_.always_auto_resize)
+        imgui.push_text_wrap_pos(min(hello_imgui.em_size(TOAST_EM), 0.8 * area.width))
+        for number, (message, _) in enumerate(self._shown):
+            imgui.push_id(number)
+            self._toast(viewer, message)
+            imgui.pop_id()
+        imgui.pop_text_wrap_pos()
+        if imgui.is_window_hovered():
+            self._shown = [(message, now) for message, _ in self._shown]
+            if imgui.is_mouse_clicked(0) and not imgui.is_any_item_hovered():
+                self._shown = []
+        imgui.end()
+
+    def _toast(self, viewer: Viewer, message: Message) -> None:
+        imgui.text_colored(
+            ui.bad() if message.is_error else imgui.get_style_color_vec4(imgui.Col_.text), message.text
+        )
+        if message.file is not None and imgui.small_button("Show in folder"):
+            saving.show_in_folder(viewer, message.file)
+        is_last = message.undoes is not None and [message.undoes] == viewer.history.past[-1:]
+        if is_last and imgui.small_button("Undo"):
+            editing.undo(viewer)
+            self._shown = []
 
 
 # The file browser.

@@ -132,7 +132,7 @@ def _widen(width: float) -> None:
         imgui.internal.dock_builder_set_node_size(node.id_, ImVec2(width, node.size.y))
 
 
-def draw_over(viewer: Viewer, start: dialogs.StartPage) -> None:
+def draw_over(viewer: Viewer, start: dialogs.StartPage, toasts: dialogs.Toasts) -> None:
     """Draw what lies over the scene: legends, tools, questions, the file browser, help and palette."""
     area = ui.scene_area()
     start.draw(viewer, area)
@@ -148,6 +148,7 @@ def draw_over(viewer: Viewer, start: dialogs.StartPage) -> None:
         select.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
     menus.draw_toolbar(viewer, area)
+    toasts.draw(viewer, area)
     dialogs.draw_changed(viewer, area)
     dialogs.draw_unsaved(viewer)
     dialogs.draw_browser(viewer)
