@@ -253,8 +253,8 @@ class QueryEngine:
         elif field.calibration is None and self._kept is None:
             short = f"{name}, no calibration here: found is more than by chance"
             long = (
-                f"{short}. Of phrases that name nothing in the scene, 19 in 20 are not found. Percentages "
-                "need a calibration in such scenes"
+                f"{short}. Percentages are of phrases for nothing here that fit as well (found: up to 5); "
+                "probabilities need a calibration in such scenes"
             )
         elif field.calibration is None:
             short, calibration = f"{name}, calibrated by `langsplat doctor`", "the bundled room"

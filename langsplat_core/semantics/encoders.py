@@ -410,7 +410,7 @@ def _clip_config(weights: Weights, tower: str) -> Any:
 DEMO = "demo"
 DEMO_ELSEWHERE = (
     "the demo encoder was made for drawn rooms, and this scene is not marked as one: on photographs its "
-    "answers are guesses, without percentages. Real weights: "
+    "answers are guesses, without probabilities. Real weights: "
     f"langsplat train DATASET --out scene.ply --clip.model {OPEN_MODEL}"
 )
 FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.json
