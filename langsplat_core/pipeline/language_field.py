@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, unit
 from langsplat_core.config import LiftConfig, RadianceConfig, RasterSettings, TrainConfig
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import (
@@ -43,18 +43,16 @@ from langsplat_core.scene import (
 from langsplat_core.scene.codec import KINDS, CodebookCodec
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.scene import NEAR_CAMERAS
-from langsplat_core.scene.surface import build_surface, build_tree
+from langsplat_core.scene.surface import build_surface, build_tree, surface_areas
 from langsplat_core.semantics.encoders import Encoder, PhraseEncoder
 from langsplat_core.semantics.features import (
     FeatureStore,
-    ImageEncoder,
     ImageFeatures,
     StoredFeatures,
     embed_regions,
     fingerprint,
-    within,
 )
-from langsplat_core.semantics.relevancy import everyday_vectors
+from langsplat_core.semantics.relevancy import NARROWEST, bundled_vocabulary, everyday_vectors
 from langsplat_core.training.language.codec_fit import (
     CodecReport,
     codec_report,
@@ -343,8 +341,15 @@ def kept_mask_weights(
 # A segmenter without weights divides every photograph by itself, each one differently. Their consensus is a
 # tree of things on the Gaussians (`training.language.merge_tree`); three cuts of it, drawn into each
 # photograph, are masks that fit from all sides, and these are shown to the encoder.
+#
+# No cost tells a whole thing from half of one or from two that touch; its name does. Wholes are the nodes
+# that are named best: the sum of what `_named` makes of each is the largest.
 
 CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
+NAMED = (0.6, 0.9)  # costs between which wholes are those that have a name
+UNNAMED = 2.0  # spreads above everyday phrases that the nearest name of anything reaches
+AREA = 0.75  # power of a node's share of the area, by which its name counts
+VIEWS = 3  # that show most of a node, in which the encoder sees it alone
 LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing
 AGREED = "describing what masks agree on"  # stage
 VERSION = 2
@@ -354,7 +359,7 @@ def agreed_features(
     gaussians: Gaussians,
     views: Views,
     photographs: Sequence[tuple[Array, Array | None]],
-    encoder: ImageEncoder,
+    encoder: Encoder,
     config: TrainConfig,
     work: Path,
     progress: Progress,
@@ -379,17 +384,86 @@ def agreed_features(
 
     key = stage_key("tree", VERSION, *inputs)
     tree = MergeTree(**processes.once(lambda: kept(work / f"{key}.npz", make)))
-    cuts = [tree.cut(cost) for cost in CUTS]
-    store = FeatureStore(work / "features")
-    made_by = stage_key(key, VERSION, CUTS, LEAST, fingerprint(encoder))
+    drawn = [work / key / f"{index:05d}.npy" for index in range(len(views))]
     for index in processes.share(range(len(views))):
-        camera, _ = views[index]
-        if not store.has(camera.name, made_by):
-            view = rasterizer.view(gaussians, camera, formed)
-            drawn = draw_patches(view, gaussians, tree.patches, formed)
-            image, mask = photographs[index]
-            maps = within(nested_maps(drawn, cuts, LEAST), mask)
-            store.save(camera.name, ImageFeatures(maps, embed_regions(image, maps, encoder)), made_by)
-        progress(AGREED, (index + 1) / len(views))
+        if not drawn[index].exists():
+            view, mask = rasterizer.view(gaussians, views[index][0], formed), photographs[index][1]
+            patches = draw_patches(view, gaussians, tree.patches, formed)
+            write_array(drawn[index], patches if mask is None else np.where(mask, patches, -1))
+        progress(AGREED, 0.4 * (index + 1) / len(views))
+    processes.barrier()
+    told = stage_key("alone", VERSION, key, NAMED, VIEWS, LEAST, fingerprint(encoder))
+    shown = _alone(tree, drawn, photographs, encoder, work / told, progress, processes)
+    names = _named(tree, surface_areas(gaussians), shown, encoder)
+    wholes = tree.cut(CUTS[2]) if names is None else tree.cut(*NAMED, names)
+    cuts = [*(np.minimum(tree.cut(cost), wholes) for cost in CUTS[:2]), wholes]  # later nodes are larger
+    store = FeatureStore(work / "features")
+    made_by = stage_key(told, VERSION, CUTS, UNNAMED, AREA)
+    for index in processes.share(range(len(views))):
+        name = views[index][0].name
+        if not store.has(name, made_by):
+            maps = nested_maps(open_array(drawn[index]), cuts, LEAST)
+            vectors = embed_regions(photographs[index][0], maps, encoder)
+            store.save(name, ImageFeatures(maps, vectors), made_by)
+        progress(AGREED, 0.5 + 0.5 * (index + 1) / len(views))
     processes.barrier()
     return StoredFeatures(store, [camera.name for camera, _ in views])
+
+
+def _alone(
+    tree: MergeTree,
+    drawn: Sequence[Path],
+    photographs: Sequence[tuple[Array, Array | None]],
+    encoder: Encoder,
+    folder: Path,
+    progress: Progress,
+    processes: ProcessGroup,
+) -> Array:
+    """Return the (P + K, D) unit vectors of nodes that may be wholes, each alone in its `VIEWS`; else 0.
+
+    drawn: files of the (H, W) patches of each view.
+    """
+    seen = [open_array(path) for path in drawn]
+    counts = np.stack([np.bincount(one[one >= 0], minlength=tree.count) for one in seen], 1)
+    pixels, members = tree.totals(counts).T, tree.totals(np.eye(tree.count, dtype=bool))
+    ranks = np.argsort(np.argsort(-pixels, axis=0, kind="stable"), axis=0)
+    least = np.array([[max(LEAST * one.size, 1)] for one in seen])
+    chosen = tree.between(*NAMED) & (ranks < VIEWS) & (pixels >= least)
+    files = [folder / f"{index:05d}.npz" for index in range(len(drawn))]
+
+    def look(index: int) -> Arrays:
+        nodes, layers = np.flatnonzero(chosen[index]), np.full((1, tree.count + 1), -1, np.int32)
+        for row, node in enumerate(nodes):  # those that share no patch share a label map
+            own = np.flatnonzero(members[node])
+            free = (layers[:, own] < 0).all(1)
+            if not free.any():
+                layers = np.concatenate([layers, np.full_like(layers[:1], -1)])
+            layers[free.argmax() if free.any() else -1, own] = row
+        vectors = embed_regions(photographs[index][0], layers[:, seen[index]], encoder)
+        return {"nodes": nodes, "vectors": vectors}
+
+    for index in processes.share(range(len(drawn))):
+        kept(files[index], partial(look, index))
+        progress(AGREED, 0.4 + 0.1 * (index + 1) / len(drawn))
+    processes.barrier()
+    looks = [read_arrays(path) for path in files]
+    vectors = np.zeros((len(chosen[0]), looks[0]["vectors"].shape[1]), np.float32)
+    for look_at in looks:
+        vectors[look_at["nodes"]] += look_at["vectors"]
+    return unit(vectors)
+
+
+def _named(tree: MergeTree, areas: Array, vectors: Array, encoder: PhraseEncoder) -> Array | None:
+    """Return (P + K,) float64, how well nodes with `vectors` are named; None if the encoder cannot tell.
+
+    The nearest name of a thing, in spreads above everyday phrases, times a power of the area.
+    """
+    names = [name for name in bundled_vocabulary("things") if not encoder.unknown_words(name)]
+    everyday, shown = everyday_vectors(encoder), vectors.any(1)
+    if not names or everyday is None or (vectors[shown] == vectors[shown][:1]).all():
+        return None
+    inside, chance = tree.patches >= 0, vectors @ everyday.T
+    nearest = (vectors @ encoder.encode_texts(names).T).max(1) - chance.mean(1)
+    above = nearest / np.maximum(chance.std(1), NARROWEST) - UNNAMED
+    shares = tree.totals(np.bincount(tree.patches[inside], areas[inside], tree.count)) / areas.sum()
+    return np.asarray(np.where(shown, above, 0).clip(0) * shares**AREA)

@@ -20,6 +20,7 @@ a trained segmenter, this one does without: `--masks.source graph`.
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
@@ -59,16 +60,43 @@ class MergeTree:
         """Count P of the patches: a forest of one tree a connected surface has P - K roots."""
         return int(self.patches.max(initial=-1)) + 1
 
-    def cut(self, cost: float) -> Array:
-        """Return the (P,) int32 number of the largest node around each patch that costs at most `cost`."""
-        total = self.count + len(self.children)
-        highest, owner = np.zeros(total), np.arange(total)
+    @cached_property
+    def highest(self) -> Array:
+        """(P + K,) float64 the most that stood between what a node is made of; 0 of a patch."""
+        highest = np.zeros(self.count + len(self.children))
         for node, (children, own) in enumerate(zip(self.children, self.costs, strict=True), self.count):
             highest[node] = max(own, *highest[children])
-        for node in range(total - 1, self.count - 1, -1):
-            if highest[node] <= cost:
+        return highest
+
+    def totals(self, values: Array) -> Array:
+        """Return (P + K, ...) sums of (P, ...) values of patches in every node; of bools, whether any is."""
+        totals = np.concatenate([values, np.zeros((len(self.children), *values.shape[1:]), values.dtype)])
+        for node, (a, b) in enumerate(self.children, self.count):
+            totals[node] = totals[a] + totals[b]
+        return totals
+
+    def between(self, cost: float, most: float) -> Array:
+        """Return (P + K,) bool, the nodes that `cut` chooses from."""
+        above = np.full(len(self.highest), np.inf)
+        above[self.children] = self.highest[self.count :, None]
+        return np.asarray((above > cost) & (self.highest <= max(cost, most)))
+
+    def cut(self, cost: float, most: float = 0.0, values: Array | None = None) -> Array:
+        """Return the (P,) int32 node around each patch: the largest that costs at most `cost`.
+
+        A larger one, that costs at most `most`, takes its place where its value, of `values` (P + K,), is
+        more than the largest sum of those of nodes within it that can be kept together.
+        """
+        owner, kept = np.arange(len(self.highest), dtype=np.int32), self.highest <= max(cost, 0)
+        best = np.zeros(len(owner)) if values is None else values.copy()
+        for node in np.flatnonzero(~kept).tolist():
+            within = best[self.children[node - self.count]].sum()
+            kept[node] = self.highest[node] <= most and best[node] > within
+            best[node] = best[node] if kept[node] else within
+        for node in range(len(owner) - 1, self.count - 1, -1):
+            if kept[node] or owner[node] != node:
                 owner[self.children[node - self.count]] = owner[node]
-        return np.unique(owner[: self.count], return_inverse=True)[1].astype(np.int32).reshape(-1)
+        return owner[: self.count]
 
 
 @dataclass(frozen=True, eq=False)

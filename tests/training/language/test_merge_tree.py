@@ -1,7 +1,7 @@
 """The tree of things against plain loops in float64, and on scenes whose things are known."""
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -168,11 +168,31 @@ def test_cuts_at_rising_costs_are_nested():
     children, costs = merge(patches)
     tree = MergeTree(np.arange(24, dtype=np.int32), children, costs)
     assert tree.cut(-1.0).tolist() == list(range(24))
-    coarser = tree.cut(np.inf)
-    assert coarser.max() + 1 == 24 - len(children)
+    assert len(np.unique(tree.cut(np.inf))) == 24 - len(children)
     for low, high in pairwise(np.quantile(costs, [0.1, 0.4, 0.7, 0.9])):
         fine, coarse = tree.cut(low), tree.cut(high)
         assert len(np.unique(np.stack([fine, coarse]), axis=1).T) == len(np.unique(fine))
+
+
+def test_valued_cut_has_the_largest_sum_of_all_partitions():
+    patches = random_patches(2, count=10)
+    children, costs = merge(patches)
+    tree = MergeTree(np.arange(10, dtype=np.int32), children, costs)
+    low, high = np.quantile(tree.highest[10:], [0.3, 0.9])
+    members = tree.totals(np.eye(10, dtype=bool))
+    values = np.random.default_rng(3).uniform(size=len(tree.highest)) * members.sum(1) ** 0.75
+    chosen = np.flatnonzero(tree.between(low, high))
+    found = np.unique(tree.cut(low, high, values))
+    assert set(found) <= set(chosen)
+    sums = [
+        values[list(some)].sum()
+        for size in range(1, len(chosen) + 1)
+        for some in combinations(chosen, size)
+        if (members[list(some)].sum(0) == 1).all()
+    ]
+    assert len(sums) > 3
+    assert values[found].sum() == pytest.approx(max(sums))
+    assert tree.cut(low).tolist() == tree.cut(low, high, np.zeros(len(values))).tolist()
 
 
 @pytest.mark.parametrize("scale", [1, 0.01])
