@@ -458,7 +458,8 @@ def _named(tree: MergeTree, areas: Array, vectors: Array, encoder: PhraseEncoder
 
     The nearest name of a thing, in spreads above everyday phrases, times a power of the area.
     """
-    names = [name for name in bundled_vocabulary("things") if not encoder.unknown_words(name)]
+    plain = (name for name in bundled_vocabulary("things") if name.replace(" ", "").isalpha())
+    names = [name for name in plain if not encoder.unknown_words(name)]
     everyday, shown = everyday_vectors(encoder), vectors.any(1)
     if not names or everyday is None or (vectors[shown] == vectors[shown][:1]).all():
         return None
