@@ -289,7 +289,8 @@ def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any
     phrases: Sequence[str] = book
     if encoder is not None:
         phrases = (*book, *suggested, *(phrase for name in BUNDLED for phrase in bundled_vocabulary(name)))
-    known, vectors = engine.known_vectors(phrases)
+    things = filter(None, map(grammar.thing_of, phrases))
+    known, vectors = engine.known_vectors((*phrases, *things))
     return {"keys": known, "phrases": known if encoder else book}, {"vectors": vectors.astype(np.float16)}
 
 

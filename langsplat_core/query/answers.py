@@ -201,19 +201,27 @@ def chance_in(field: LanguageField, regions: Regions, scale: Scale) -> Array:
 # The answers.
 
 
+def own_fits(regions: Regions, scale: Scale, relevancy: Array) -> Array:
+    """Return the (R,) fits of the mean of (3, N) relevancy over each region of all levels."""
+    return np.concatenate([scale.fit(values) for values in regions.means(relevancy)])
+
+
 def by_regions(
     phrase: str,
     relevancy: Array,
+    fits: tuple[Array, Array | None],
     means: Array,
     regions: Regions,
-    scale: Scale,
     bars: Bars,
     calibration: Calibration | None,
     level: LevelChoice,
 ) -> QueryResult:
-    """Return the answer by the rule. relevancy: (3, N); means: (N, 3) of the Gaussians."""
-    own = np.concatenate([scale.fit(values) for values in regions.means(relevancy)])
-    decision = decide(regions.table, own, named(phrase), level, bars, calibration)
+    """Return the answer by the rule. relevancy: (3, N); means: (N, 3) of the Gaussians.
+
+    fits: (R,) of the regions with the phrase, and with the thing that it names a part of, see `decide`.
+    """
+    own, thing = fits
+    decision = decide(regions.table, own, named(phrase), level, bars, calibration, thing)
     chosen = decision.level
     place, box = regions.place(means, chosen, decision.best)
     return QueryResult(
@@ -234,7 +242,7 @@ def by_regions(
 def even_relevancy(regions: Regions, scale: Scale, relevancy: Array) -> Array:
     """Return (3, N) relevancy with that of its region's fit for every Gaussian; its own for one in none."""
     own = plain(relevancy)
-    fits = region_fits(regions.table, np.concatenate([scale.fit(values) for values in regions.means(own)]))
+    fits = region_fits(regions.table, own_fits(regions, scale, own))
     values = region_relevancies(fits).astype(np.float32)
     return np.stack(
         [regions.spread(level, regions.table.level(level, values), row) for level, row in enumerate(own)]

@@ -26,8 +26,9 @@ from langsplat_core.query.answers import (
     by_peak,
     by_regions,
     chance_in,
+    own_fits,
 )
-from langsplat_core.query.grammar import STOP_WORDS, check_names, only
+from langsplat_core.query.grammar import STOP_WORDS, check_names, only, thing_of
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, through_cells
 from langsplat_core.query.rule import Bars, bars_of
@@ -133,24 +134,40 @@ class QueryEngine:
         texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
         vectors = self.text_vectors(texts, progress)  # first: what it refuses leaves nothing cached
         relevancies = self._lookup.relevancies(vectors) if texts else iter(())
-        answers = []
+        things, answers = self._thing_fits(texts), []
         for phrase in phrases:
             progress(f"searching '{tidy(phrase)}'", 0.5)
             if self.is_taught(phrase):
                 answers.append(self._by_showing(self.taught[phrase_key(phrase)], level))
             else:
-                answers.append(self._answer(tidy(phrase), next(relevancies), level))
+                thing = things.get(thing_of(tidy(phrase)))
+                answers.append(self._answer(tidy(phrase), next(relevancies), level, thing))
         return answers
 
     def relevancy(self, vector: Array) -> Array:
         """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
         return next(self._lookup.relevancies(vector[None]))
 
-    def _answer(self, phrase: str, relevancy: Array, level: LevelChoice) -> QueryResult:
+    def _thing_fits(self, phrases: Sequence[str]) -> dict[str, Array]:
+        """Return the (R,) fits of the things that `phrases` name parts of, as far as they can be asked."""
+        wanted = dict.fromkeys(thing_of(tidy(phrase)) for phrase in phrases)
+        names = [name for name in wanted if self.bars is not None and self._is_known(name)]
+        relevancies = self._lookup.relevancies(self.text_vectors(names)) if names else ()
+        parts = self.regions, self.scale
+        return {name: own_fits(*parts, own) for name, own in zip(names, relevancies, strict=True)}
+
+    def _is_known(self, name: str) -> bool:
+        try:
+            return bool(name) and not (self.is_taught(name) or self.unknown_words(name))
+        except EncoderError:
+            return False
+
+    def _answer(self, phrase: str, relevancy: Array, level: LevelChoice, thing: Array | None) -> QueryResult:
         if self.bars is None:
             return by_peak(phrase, relevancy, self.surface, self.scale, self.field.found, level)
-        means, judged = self.scene.gaussians.means, (self.scale, self.bars, self.calibration)
-        return by_regions(phrase, relevancy, means, self.regions, *judged, level)
+        fits = own_fits(self.regions, self.scale, relevancy), thing
+        means, judged = self.scene.gaussians.means, (self.bars, self.calibration, level)
+        return by_regions(phrase, relevancy, fits, means, self.regions, *judged)
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """Return the things among the members of an answer, best first, or only so many of them."""

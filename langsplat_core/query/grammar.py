@@ -103,6 +103,11 @@ def named(phrase: str) -> Named:
     return "part" if only(ADJECTIVES | ARTICLES, before) else "part of a thing"
 
 
+def thing_of(phrase: str) -> str:
+    """Return the thing that a phrase names a part of, "red mug" of "red mug handle"; else ""."""
+    return " ".join(phrase.split()[:-1]) if named(phrase) == "part of a thing" else ""
+
+
 def only(words: frozenset[str], tokens: Sequence[str]) -> bool:
     """Return whether all `tokens` are among `words`, whatever their case; so also of no tokens."""
     return all(token.lower() in words for token in tokens)

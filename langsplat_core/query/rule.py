@@ -37,6 +37,7 @@ class Rule:
     reach: float = 0.45  # of the best fit: a region that fits less by this or less belongs to the answer,
     nearest: float = 0.15  # by this at least,
     farthest: float = 1.0  # and by this at most
+    around: float = 2.0  # times the reach: from wholes that fit a thing so nearly, its parts are taken
     nothing: float = float(logit(np.array(2 * NARROWEST)))  # fit; what fits less has no feature behind it
     smallest: int = SMALLEST  # Gaussians; smaller regions are crumbs and count where there is nothing else
     narrowest: float = NARROWEST  # distance of a relevancy from 0 and 1; least spread
@@ -103,6 +104,20 @@ def region_fits(table: RegionTable, own: Array) -> Array:
 def region_relevancies(fits: Array) -> Array:
     """Return the relevancies that fits stand for, 0 for what fits nothing."""
     return np.where(fits > RULE.nothing, sigmoid(fits), 0)
+
+
+def on_things(table: RegionTable, thing: Array) -> Array:
+    """Return where, (R,) bool, parts of a thing may be in a scene, by (R,) fits of regions with it.
+
+    That is in and below the wholes that fit it nearly as well as the best does.
+    """
+    whole, solid = table.level(len(LEVELS) - 1, thing), table.level(len(LEVELS) - 1, table.solid)
+    best = float(whole[solid if solid.any() else slice(None)].max(initial=RULE.nothing))
+    on = np.zeros(len(thing) + 1, bool)  # the last: what has no parent
+    on[len(thing) - len(whole) : -1] = whole >= RULE.least_fit(best, RULE.around)
+    for _ in LEVELS[1:]:
+        on[:-1] |= on[table.parents]
+    return on[:-1]
 
 
 def common_fits(table: RegionTable, fits: Array) -> Array:
@@ -313,7 +328,7 @@ class Decision:
 
     level: int  # index into LEVELS
     scores: Fits  # best relevancy per level
-    fits: Fits  # that these stand for
+    fits: Fits  # of the best region per level, wherever it is: what the verdict stands on
     relevancies: Array  # (r,) float32 of the regions of the level
     inside: Array  # (r,) bool: the regions that answer
     best: int  # the region that the place is taken from; -1 for none
@@ -327,16 +342,24 @@ def decide(
     level: LevelChoice,
     bars: Bars,
     calibration: Calibration | None,
+    thing: Array | None = None,
 ) -> Decision:
     """Return the answer of the whole regions of a scene that fit nearly as well as the best one.
 
-    own: (R,) fits of the mean relevancy of each region. named: what the phrase names.
+    own: (R,) fits of the mean relevancy of each region. named: what the phrase names. thing: the same as
+    `own` for the thing that the phrase names a part of: nothing else has the part, and no whole is one.
     """
     fits = region_fits(table, own)
+    evidence = triple(fit_of(best_relevancies(table, region_relevancies(fits))[0]))
+    common = float(common_fits(table, fits)[0])
+    if thing is not None:
+        fits = np.where(on_things(table, region_fits(table, thing)), fits, RULE.nothing)
     relevancies = region_relevancies(fits)
     scores = best_relevancies(table, relevancies)[0]
     best = fit_of(scores)
     given = best + RULE.advantage[named]
+    if thing is not None:
+        given[-1] = RULE.nothing
     # Of equal levels the coarsest.
     chosen = int(np.flatnonzero(given == given.max())[-1]) if level == "auto" else LEVELS.index(level)
     shown = table.level(chosen, relevancies).astype(np.float32)
@@ -344,11 +367,11 @@ def decide(
     return Decision(
         level=chosen,
         scores=triple(scores),
-        fits=triple(best),
+        fits=evidence,
         relevancies=shown,
         inside=table.level(chosen, fits) >= RULE.least_fit(float(best[chosen])),
         best=int(solid.argmax()) if solid.max(initial=0) > 0 else -1,
-        verdict=judge(triple(best), named, level, bars, calibration, float(common_fits(table, fits)[0])),
+        verdict=judge(evidence, named, level, bars, calibration, common),
     )
 
 

@@ -3,7 +3,7 @@
 
 import { ClipText, PhraseError, dot } from "./encoder.js";
 import { decide, fitOf, heatRange, levelRange, sigmoid, verdict } from "./rule.js";
-import { namedBy, phraseKey, tidy } from "./words.js";
+import { namedBy, phraseKey, thingOf, tidy } from "./words.js";
 
 // [page]
 const LISTS = ["articles", "stop_words", "adjectives", "parts"];
@@ -38,8 +38,10 @@ class Language {
     }
     const phrase = tidy(text);
     const relevancies = this.relevancies(this.vector(key));
-    const own = this.regionMeans(relevancies).map((mean) => fitOf(this.meta.rule, mean));
-    const decision = decide(this.meta.rule, this.regions, own, namedBy(phrase, this.lists), level, this.meta);
+    const named = namedBy(phrase, this.lists);
+    const thing = this.thingFits(thingOf(phrase, this.lists));
+    const own = this.ownFits(relevancies);
+    const decision = decide(this.meta.rule, this.regions, own, named, level, this.meta, thing);
     return this.answer(phrase, decision, relevancies);
   }
 
@@ -80,6 +82,26 @@ class Language {
       means[region[i]] += share[i] * relevancies[code[i]];
     }
     return means;
+  }
+
+  ownFits(relevancies) {
+    return this.regionMeans(relevancies).map((mean) => fitOf(this.meta.rule, mean));
+  }
+
+  // Fits of the regions with the thing that a phrase names a part of; null where it cannot be asked.
+  thingFits(thing) {
+    const key = phraseKey(thing);
+    if (!key || this.taught.has(key)) {
+      return null;
+    }
+    try {
+      return this.ownFits(this.relevancies(this.vector(key)));
+    } catch (error) {
+      if (error instanceof PhraseError) {
+        return null;
+      }
+      throw error;
+    }
   }
 
   // The answer to a taught word: its fits were computed when the page was made (query/taught.py, by_showing).

@@ -55,6 +55,23 @@ function bestRelevancy(rule, regions, relevancies, level) {
   return Math.max(solid > -Infinity ? solid : any, 0);
 }
 
+// Where parts of a thing may be: in and below the wholes that fit it nearly as well as the best one does.
+function onThings(rule, regions, thing) {
+  const [first, last] = levelRange(regions, regions.counts.length - 1);
+  const best = fitOf(rule, bestRelevancy(rule, regions, regionRelevancies(rule, thing), regions.counts.length - 1));
+  const least = leastFit(rule, best, rule.around);
+  const on = Array.from(thing, (fit, region) => region >= first && region < last && fit >= least);
+  for (let region = first - 1; region >= 0; --region) {
+    on[region] = regions.parents[region] >= 0 && on[regions.parents[region]];
+  }
+  return on;
+}
+
+// The fit from which a region belongs to an answer; `share`: of the way that it reaches.
+function leastFit(rule, best, share = 1) {
+  return best - share * Math.min(Math.max(rule.reach * best, rule.nearest), rule.farthest);
+}
+
 // The mean fit of regions, without crumbs and nothing.
 function commonFit(rule, regions, fits) {
   const heard = fits.filter((fit, region) => fit > rule.nothing && regions.sizes[region] >= rule.smallest);
@@ -100,20 +117,27 @@ function judge(rule, fits, named, level, { bars, calibration }, common) {
 
 // The answer of the whole regions that fit nearly as well as the best one: its level, `scores` and `fits` of
 // all levels, the regions that are `inside`, the `best` one that the place is of (-1: none), and the verdict.
-// evidence: { bars, calibration }.
-function decide(rule, regions, own, named, level, evidence) {
-  const every = regionFits(rule, regions, own);
+// evidence: { bars, calibration }. thing: the same as `own` for the thing that the phrase names a part of.
+function decide(rule, regions, own, named, level, evidence, thing = null) {
+  const anywhere = regionFits(rule, regions, own);
+  const on = thing && onThings(rule, regions, regionFits(rule, regions, thing));
+  const every = anywhere.map((fit, region) => (!on || on[region] ? fit : rule.nothing));
+  const bestOf = (relevancies) => regions.counts.map((_, at) => bestRelevancy(rule, regions, relevancies, at));
+  const fits = bestOf(regionRelevancies(rule, anywhere)).map((score) => fitOf(rule, score));
   const relevancies = regionRelevancies(rule, every);
-  const scores = regions.counts.map((_, at) => bestRelevancy(rule, regions, relevancies, at));
-  const fits = scores.map((score) => fitOf(rule, score));
-  const given = fits.map((fit, at) => fit + rule.advantage[named][at]);
+  const scores = bestOf(relevancies);
+  const bests = scores.map((score) => fitOf(rule, score));
+  const given = bests.map((fit, at) => fit + rule.advantage[named][at]);
+  if (thing) {
+    given[given.length - 1] = rule.nothing;
+  }
   const chosen = level < 0 ? given.lastIndexOf(Math.max(...given)) : level; // of equal levels the coarsest
-  const reach = Math.min(Math.max(rule.reach * fits[chosen], rule.nearest), rule.farthest);
+  const least = leastFit(rule, bests[chosen]);
   const [first, last] = levelRange(regions, chosen);
   const inside = [];
   let best = -1;
   for (let region = first; region < last; ++region) {
-    if (every[region] >= fits[chosen] - reach) {
+    if (every[region] >= least) {
       inside.push(region);
     }
     const solid = relevancies[region] > 0 && relevancies[region] <= scores[chosen];
@@ -128,7 +152,7 @@ function decide(rule, regions, own, named, level, evidence) {
     regionFits: every,
     inside,
     best,
-    verdict: judge(rule, fits, named, level, evidence, commonFit(rule, regions, every)),
+    verdict: judge(rule, fits, named, level, evidence, commonFit(rule, regions, anywhere)),
   };
 }
 

@@ -67,6 +67,11 @@ function namedBy(phrase, { parts, adjectives, articles }) {
   }
   return words.every((word) => adjectives.has(word) || articles.has(word)) ? "part" : "part of a thing";
 }
+
+// The thing that a phrase names a part of, "red mug" of "red mug handle"; else "".
+function thingOf(phrase, lists) {
+  return namedBy(phrase, lists) === "part of a thing" ? phrase.split(" ").slice(0, -1).join(" ") : "";
+}
 // [/page]
 
-export { namedBy, phraseKey, tidy, tokens };
+export { namedBy, phraseKey, tidy, thingOf, tokens };

@@ -9,7 +9,15 @@ import pytest
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.sidecar import Words
-from langsplat_core.query.answers import QueryResult, Regions, build_regions, by_peak, by_regions, chance_in
+from langsplat_core.query.answers import (
+    QueryResult,
+    Regions,
+    build_regions,
+    by_peak,
+    by_regions,
+    chance_in,
+    own_fits,
+)
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
@@ -20,6 +28,7 @@ from langsplat_core.query.rule import (
     Verdict,
     bars_of,
     common_fits,
+    decide,
     excess,
     judge,
     region_fits,
@@ -63,7 +72,8 @@ def asked(
         return by_peak(phrase, relevancy, surface, scale, field.found, level)
     regions, calibration = regions_of(Scene(gaussians, field), surface), field.calibration
     by_chance = bars_of(regions.table, chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
-    return by_regions(phrase, relevancy, gaussians.means, regions, scale, by_chance, calibration, level)
+    fits = own_fits(regions, scale, relevancy), None
+    return by_regions(phrase, relevancy, fits, gaussians.means, regions, by_chance, calibration, level)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -312,7 +322,8 @@ def answer_of(
     surface: Surface, relevancy, regions: Regions, level="auto", named: Named = "thing"
 ) -> QueryResult:
     means = np.random.default_rng(1).normal(size=(len(surface.anchors), 3))
-    return by_regions(PHRASES[named], relevancy, means, regions, SCALE, BARS, None, level)
+    fits = own_fits(regions, SCALE, relevancy), None
+    return by_regions(PHRASES[named], relevancy, fits, means, regions, BARS, None, level)
 
 
 def plain_extent(fits, sizes, level: str, named: Named) -> tuple[int, list[bool]]:
@@ -346,6 +357,26 @@ def test_extent_equals_that_of_the_rule_written_out(surface, level, named, middl
         np.testing.assert_allclose(got.scores, sigmoid(fits[:, solid].max(1)), atol=1e-6)
         np.testing.assert_allclose(got.even[surface.rows], sigmoid(fits[chosen])[of], atol=1e-6)
         assert got.members.any()
+
+
+# Two wholes, each with one part of one subpart. A part that fits better than all is on the second one.
+TWO = RegionTable(np.array([[2, 2, 2]]), np.array([2, 3, 4, 5, -1, -1]), np.ones(6, bool))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "level", "answer"),
+    [
+        (2.0, -1.0, "auto", (0, [True, False])),
+        (2.0, 1.0, "auto", (0, [False, True])),  # nearly as much the thing
+        (2.0, -1.0, "whole", (2, [True, False])),
+    ],
+)
+def test_parts_are_looked_for_on_wholes_that_fit_their_thing(first, second, level, answer):
+    own = np.array([1.5, 2.5, 0.0, 0.0, 0.5, 3.0])
+    thing = np.array([-2.0, -2.0, -2.0, -2.0, first, second])
+    decision = decide(TWO, own, "part of a thing", level, BARS, None, thing)
+    assert (decision.level, decision.inside.tolist()) == answer
+    assert decision.fits == decide(TWO, own, "part of a thing", level, BARS, None).fits
 
 
 # Words taught by showing, in scenes whose regions have the statistics of images: a gap between image and
