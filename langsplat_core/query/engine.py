@@ -151,10 +151,10 @@ class QueryEngine:
     def _thing_fits(self, phrases: Sequence[str]) -> dict[str, Array]:
         """Return the (R,) fits of the things that `phrases` name parts of, as far as they can be asked."""
         wanted = dict.fromkeys(thing_of(tidy(phrase)) for phrase in phrases)
-        names = [name for name in wanted if self.bars is not None and self._is_known(name)]
+        names = [name for name in wanted if self._is_known(name) and self.bars is not None]
         relevancies = self._lookup.relevancies(self.text_vectors(names)) if names else ()
-        parts = self.regions, self.scale
-        return {name: own_fits(*parts, own) for name, own in zip(names, relevancies, strict=True)}
+        found = zip(names, relevancies, strict=True)
+        return {name: own_fits(self.regions, self.scale, relevancy) for name, relevancy in found}
 
     def _is_known(self, name: str) -> bool:
         try:
