@@ -155,7 +155,7 @@ MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list of commands alone
     "File": (
-        Command("open a scene", opening.ask_for_file, ("Ctrl+O",), "Open a scene ..."),
+        Command("open a scene ...", opening.ask_for_file, ("Ctrl+O",), "Open a scene ..."),
         Command("start page", settings.toggle_start, is_on=lambda viewer: viewer.state.show_start),
         Command("reload the scene", opening.reload, ("F5",), apart=True),
         Command("next scene of the list", lambda v: opening.step_scene(v, 1), ("Ctrl+PageDown",)),
@@ -184,7 +184,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("undo", editing.undo, ("Ctrl+Z",), repeats=True, is_edit=True, apart=True),
         Command("redo", editing.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), repeats=True, is_edit=True),
         Command(
-            "gizmo: move, rotate, scale, off",
+            "gizmo: move, rotate, scale, box, off",
             editing.next_gizmo,
             ("G",),
             is_on=lambda viewer: viewer.state.edit_form.gizmo != "off",
@@ -240,7 +240,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             is_on=lambda viewer: viewer.state.session.split.mode == "levels",
             icon="LAYER_GROUP",
         ),
-        Command("compare with another scene", opening.ask_for_beside),
+        Command("compare with another scene ...", opening.ask_for_beside),
         *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
         Command(
             "measure a distance",
@@ -269,7 +269,9 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         ),
         Command("next training camera", lambda v: viewpoint.step_camera(v, 1), (".",), "", True),
         Command("level the horizon", lambda v: viewpoint.move(v, level), (), "Horizon", apart=True),
-        Command("align the up axis with the picture", lambda v: viewpoint.move(v, adopt_up), (), "Align up"),
+        Command(
+            "align the up axis with the view", lambda v: viewpoint.move(v, adopt_up), (), "Align up axis"
+        ),
         *(_side(side, key) for side, key in SIDE_KEYS),
         Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
         Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True),
@@ -325,7 +327,7 @@ def with_key(text: str, act: Callable[[Viewer], object]) -> str:
 
 # Other words that people look for, by what a command does.
 SYNONYMS = {
-    "open a scene": "load import file browse ply splat project",
+    "open a scene ...": "load import file browse ply splat project",
     "start page": "home welcome recent close demo example bundled",
     "train a scene": "photographs photos images video reconstruct create make new colmap",
     "save a picture": "screenshot image png export capture snapshot render photo",
@@ -335,12 +337,12 @@ SYNONYMS = {
     "search": "find query ask phrase text words language where",
     "remove all queries": "clear reset delete search results answers",
     "undo": "back revert",
-    "gizmo: move, rotate, scale, off": "transform translate turn resize handles crop box",
+    "gizmo: move, rotate, scale, box, off": "transform translate turn resize handles crop box",
     "delete the selection": "remove erase clean cut crop",
     "save the selection": "export extract cut out ply",
     "save the scene without what was deleted": "export clean cleaned ply write",
     "compare two displays": "split side by side beside wipe divide",
-    "compare with another scene": "split side by side beside difference",
+    "compare with another scene ...": "split side by side beside difference",
     "show or hide the boxes of what was found": "bounding box outline 3d",
     "say what is under the cursor": "inspect pick hover identify info",
     "show or hide the axes": "compass orientation xyz cube",

@@ -377,6 +377,11 @@ class Painter {
     gl.disable(gl.BLEND);
   }
 
+  // Wait until the image is drawn.
+  wait() {
+    this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
+  }
+
   // (height, width, 4) bytes of what `paint` drew in this very task, its top row first.
   pixels() {
     const { gl } = this;

@@ -18,7 +18,7 @@ const OUTCOMES = {
   "not here": ["none", "Not here"],
 };
 const KEYS = { c: "rgb", r: "relevancy", s: "segmentation", l: "latent" };
-const SLOW = 60; // ms between frames of a moving camera, above which fewer pixels are drawn until it rests
+const SLOW = 60; // ms of an image while the camera moves, above which fewer pixels are drawn until it rests
 const COARSEST = 0.3;
 const REST = 180; // ms
 const MOST_BOXES = 24;
@@ -31,7 +31,7 @@ const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((corner) => {
 
 class Page {
   constructor(meta, tensors) {
-    Object.assign(this, { meta, level: "auto", display: "rgb", answer: null, share: 1, last: 0, shown: [] });
+    Object.assign(this, { meta, level: "auto", display: "rgb", answer: null, share: 1, moving: false, shown: [] });
     this.painter = new Painter(byId("scene"), meta, tensors);
     this.painter.onorder = () => this.redraw();
     this.language = meta.language && new Language(meta.language, tensors);
@@ -400,16 +400,7 @@ class Page {
   }
 
   moved() {
-    const now = performance.now();
-    if (now - this.last < 2 * REST && now - this.last > SLOW) {
-      this.share = Math.max(this.share * 0.8, COARSEST);
-    }
-    this.last = now;
-    clearTimeout(this.rest);
-    this.rest = setTimeout(() => {
-      this.share = 1;
-      this.redraw();
-    }, REST);
+    this.moving = true;
     this.redraw();
   }
 
@@ -421,14 +412,39 @@ class Page {
       this.asked = 0;
       const camera = this.controls.camera(devicePixelRatio * this.share);
       this.painter.sort(camera);
+      const began = performance.now();
       this.painter.paint(camera, this.appearance());
       this.draw();
+      if (this.moving) {
+        this.keepUp(began);
+      }
     });
+  }
+
+  // Fewer pixels next time where an image took long, until none was asked for twice as long as that.
+  keepUp(began) {
+    this.painter.wait();
+    const taken = performance.now() - began;
+    if (taken > SLOW) {
+      this.share = Math.max(this.share * Math.sqrt(SLOW / taken), COARSEST);
+    }
+    clearTimeout(this.rest);
+    this.rest = setTimeout(
+      () => {
+        Object.assign(this, { share: 1, moving: false });
+        this.redraw();
+      },
+      Math.max(REST, 2 * taken),
+    );
   }
 
   // Boxes over the image, in pixels of the screen.
   draw() {
     const canvas = byId("marks");
+    canvas.hidden = !this.shown.length || !byId("boxes").checked; // a cleared one may stay on screen
+    if (canvas.hidden) {
+      return;
+    }
     const dots = devicePixelRatio;
     const camera = this.controls.camera(dots);
     const { width, height } = camera;
@@ -437,9 +453,6 @@ class Page {
     }
     const context = canvas.getContext("2d");
     context.clearRect(0, 0, width, height);
-    if (!byId("boxes").checked) {
-      return;
-    }
     for (const [rank, corners] of this.shown.entries()) {
       const seen = Array.from({ length: 8 }, (_, k) =>
         project(camera, Array.from(corners.slice(3 * k, 3 * k + 3))),

@@ -397,6 +397,44 @@ def test_mouse_and_touch_move_the_camera(browser: Any, thin: Path) -> None:
         assert tab.faults == []
 
 
+SLOW_PAINTER = """async () => {
+  const { page } = await langsplat;
+  const paint = page.painter.paint.bind(page.painter);
+  const full = page.controls.camera(devicePixelRatio).width;
+  globalThis.widths = [];
+  page.painter.paint = (camera, appearance) => {
+    const began = performance.now();
+    paint(camera, appearance);
+    while (performance.now() - began < 500 * (camera.width / full) ** 2);
+    widths.push(camera.width / full);
+  };
+}"""
+
+
+def test_page_draws_coarsely_however_slow_it_is(browser: Any, thin: Path) -> None:
+    with open_tab(browser, thin, viewport={"width": 390, "height": 800}) as tab:
+        tab.run(SLOW_PAINTER)
+        tab.page.mouse.move(150, 150)
+        tab.page.mouse.down()
+        for step in range(12):
+            tab.page.mouse.move(155 + 5 * step, 160)
+        tab.page.mouse.up()
+        tab.page.wait_for_function("() => widths.length > 2 && widths.at(-1) === 1")  # once it rests
+        widths = tab.run("() => widths")
+        assert min(widths) < 0.5
+        assert sum(width == 1 for width in widths) <= 3  # at first, and at rest
+
+
+def test_page_hides_boxes_with_their_answer(browser: Any, thin: Path) -> None:
+    with open_tab(browser, thin, viewport={"width": 800, "height": 600}) as tab:
+        marks = tab.page.locator("#marks")
+        assert tab.page.get_attribute("#phrase", "placeholder") != "what to look for"  # what is here
+        for phrase, visible in (("teddy bear", True), ("banana", False), ("teddy bear", True), ("", False)):
+            tab.run(f"async () => (await langsplat).page.search({phrase!r})")
+            tab.page.wait_for_timeout(100)
+            assert marks.is_visible() == visible, phrase
+
+
 def test_unsearchable_scenes_are_shown(browser: Any, tmp_path: Path) -> None:
     cameras = tuple(random_camera(seed) for seed in range(2))
     scene = Scene(random_gaussians(40), random_field(40), cameras)

@@ -321,11 +321,8 @@ def drag_the_gizmo(s: Any) -> None:
 
 def drag_the_crop_box(s: Any) -> None:
     """A corner of the box is dragged, and what lies outside is cropped."""
-    viewer = s.viewer
     s.open_panel("Transform", frames=1)
-    editing.fill_box(viewer)
-    s.ctx.yield_(2)
-    s.ctx.item_click("//Transform/Box##gizmo")
+    s.click("//Transform/Box##gizmo", frames=2)  # around everything, as nothing is selected
     form, means = s.state.edit_form, s.state.scene.gaussians.means
     middle = np.array(s.on_screen(np.mean([form.low, form.high], 0)))
     for corner in product(*zip(form.low, form.high, strict=True)):
@@ -374,7 +371,7 @@ def pin_a_note(s: Any) -> None:
     s.click_at(s.on_screen(BOOK))
     s.wait(lambda: imgui.get_io().want_text_input)
     s.ctx.key_chars("lent by Ada")
-    s.key("enter", frames=2)
+    s.key("escape", frames=2)
     (note,) = s.state.session.notes
     assert (note.text, s.state.pins_notes) == ("lent by Ada", False)
     assert np.linalg.norm(note.at - BOOK) < 1.0

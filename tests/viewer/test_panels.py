@@ -76,7 +76,7 @@ def test_every_panel_can_be_opened_by_a_command(viewer):
 
 
 LOOKED_FOR = {
-    "open a scene": "load import file browse",
+    "open a scene ...": "load import file browse",
     "start page": "home welcome recent demo close",
     "train a scene": "photos colmap reconstruct",
     "save a picture": "screenshot png image snapshot",

@@ -10,6 +10,8 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError
+from langsplat_core.query.describe import Word
+from langsplat_core.query.inventory import Outline
 from langsplat_viewer.actions import editing, opening, outline, queries, saving, settings
 from langsplat_viewer.actions.editing import take
 from langsplat_viewer.panels.search import BINS, hint, histogram
@@ -353,3 +355,12 @@ def test_outline_needs_a_field_and_downloads_no_encoder(viewer, monkeypatch):
     assert outline.wanted(viewer) is None
     outline.select(viewer, np.zeros(3))
     assert "language field" in errors(viewer)[-1]
+
+
+def test_outline_begins_with_things():
+    def row(node: int, word: str | None) -> Outline:
+        name = None if word is None else Word(word, 0.9)
+        return Outline(node, 2, name, 9, 0.1, np.zeros(3), np.ones(3), (1, 0), ())
+
+    rows = [row(0, "wall"), row(1, "table"), row(2, "wooden floor or floor"), row(3, None), row(4, "wallet")]
+    assert [found.node for found in outline.things_first(rows)] == [1, 3, 4, 0, 2]

@@ -264,8 +264,15 @@ def drawn_stroke(viewer: Viewer) -> Drawn | None:
 def next_gizmo(viewer: Viewer) -> None:
     """Show the gizmo that moves, the one that rotates, the one that scales, the handles of the box, none."""
     kinds: tuple[Gizmo, ...] = get_args(Gizmo)
-    here = kinds.index(viewer.state.edit_form.gizmo)
-    viewer.state.edit_form = replace(viewer.state.edit_form, gizmo=kinds[(here + 1) % len(kinds)])
+    set_gizmo(viewer, kinds[(kinds.index(viewer.state.edit_form.gizmo) + 1) % len(kinds)])
+
+
+def set_gizmo(viewer: Viewer, kind: Gizmo) -> None:
+    """Choose the gizmo; the box begins around the selection, unless it was set by hand."""
+    form = viewer.state.edit_form
+    viewer.state.edit_form = replace(form, gizmo=kind)
+    if kind == "box" and (form.low, form.high) == (EditForm.low, EditForm.high):
+        fill_box(viewer)
 
 
 def pivot(viewer: Viewer) -> Array | None:
@@ -365,13 +372,21 @@ def fill_box(viewer: Viewer) -> None:
         set_box(viewer, low, high)
 
 
+def in_crop_box(viewer: Viewer) -> Array:
+    """Return (N,) bool: Gaussians whose centres lie in the box of the panel."""
+    form, scene = viewer.state.edit_form, viewer.state.scene
+    corners = np.array([form.low, form.high])
+    return in_box(
+        np.zeros((0, 3)) if scene is None else scene.gaussians.means, corners.min(0), corners.max(0)
+    )
+
+
 def crop(viewer: Viewer) -> None:
     """Delete what lies outside the box of the panel; refused where nothing lies inside."""
-    state, form, marks = viewer.state, viewer.state.edit_form, viewer.state.marks
-    if not has_scene(viewer) or state.scene is None:
+    marks = viewer.state.marks
+    if not has_scene(viewer):
         return
-    corners = np.array([form.low, form.high])
-    inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0))
+    inside = in_crop_box(viewer)
     if (inside & marks.kept).any():
         mark(viewer, replace(marks, selected=marks.selected & inside, deleted=marks.deleted | ~inside))
     else:

@@ -532,7 +532,7 @@ def follow_beside(viewer: Viewer) -> None:
     beside.take_results()
     viewpoint.tick(beside, viewer.clock)
     for message in other.messages:
-        state.say(f"beside: {message.text}", message.is_error)
+        state.say(f"compared scene: {message.text}", message.is_error)
     other.messages, other.size = [], state.size
     if other.scene is None or state.view is None:
         return

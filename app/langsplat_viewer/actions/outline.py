@@ -20,6 +20,8 @@ from langsplat_viewer.actions.viewpoint import focus_on
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
+BACKGROUND = {"wall", "floor", "ground", "ceiling", "skirting", "rug", "carpet"}  # the last in the outline
+
 
 def wanted(viewer: Viewer) -> OutlineView | None:
     """Return the outline of the scene, as far as it is known.
@@ -42,7 +44,7 @@ def _find(viewer: Viewer) -> None:
     def work(engine: QueryEngine, progress: Progress) -> tuple[Describer, OutlineView]:
         describer = viewer.describing(engine, progress)
         progress("looking for what is here", 0.5)
-        roots = scene_outline(describer)
+        roots = things_first(scene_outline(describer))
         tree = engine.tree
         sizes = tree.totals(np.bincount(tree.leaves[tree.leaves != NO_NODE], minlength=tree.count))
         return describer, OutlineView(roots, tree, sizes)
@@ -54,6 +56,15 @@ def _find(viewer: Viewer) -> None:
         viewer.state.outline = OutlineView(problem=reason)
 
     viewer.ask_engine("looking for what is here", work, done, failed)
+
+
+def things_first(rows: Iterable[Outline]) -> tuple[Outline, ...]:
+    """Return rows with those that are likely to be walls and floors last, else in their order."""
+
+    def is_background(row: Outline) -> bool:
+        return row.word is not None and not BACKGROUND.isdisjoint(row.word.phrase.split())
+
+    return tuple(sorted(rows, key=is_background))
 
 
 def name_of(viewer: Viewer, row: Outline) -> str:

@@ -14,6 +14,7 @@ from langsplat_viewer.panels.overlays import begin_legend, clicked
 from langsplat_viewer.viewer import Viewer
 
 LEGEND_ROWS, LEGEND_EM = 8, 9.0
+SURE = 0.7  # probability of a name below which it is a question
 MENU = "menu of a thing"
 
 
@@ -42,13 +43,19 @@ def _row(viewer: Viewer, row: Outline) -> None:
     flags |= imgui.TreeNodeFlags_.leaf if not row.parts else 0
     colour = outline.colour_of(viewer, row.node)
     name, sure = outline.name_of(viewer, row), ""
-    if row.word and row.node not in viewer.state.session.things.names:
-        sure = f" {100 * row.word.probability:.0f} %"
+    named = row.node in viewer.state.session.things.names
+    if row.word and not named:
+        named = row.word.probability >= SURE
+        sure = f"{'' if named else '?'} {100 * row.word.probability:.0f} %"
     taken = (1 if colour is None else 2) * (side + spacing)
     room = imgui.get_content_region_avail().x - taken - imgui.get_tree_node_to_label_spacing()
     label = ui.elided(name + sure, room)
     imgui.align_text_to_frame_padding()
+    imgui.push_style_color(
+        imgui.Col_.text, imgui.get_style_color_vec4(imgui.Col_.text) if named else ui.muted()
+    )
     opened = imgui.tree_node_ex(f"{label}###row", flags)
+    imgui.pop_style_color()
     if _chosen("thing"):
         outline.visit(viewer, row.node)
     _about(row, name)

@@ -515,7 +515,7 @@ def draw_notes(viewer: Viewer) -> None:
             imgui.set_keyboard_focus_here()
             settings.put(state, fresh_note=None)
         changed, text = imgui.input_text("##note", note.text)
-        if changed:
+        if changed and not imgui.is_key_pressed(imgui.Key.escape):  # which would take back what was typed
             settings.write_note(viewer, note, text)
         imgui.same_line()
         if imgui.button("x", ImVec2(side, 0)):

@@ -213,7 +213,10 @@ def draw_transform(viewer: Viewer) -> None:
     chosen = int(state.marks.selected.sum())
     what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
     ui.small_wrapped(what, ui.muted())
-    form = replace(state.edit_form, gizmo=ui.radio(GIZMOS, state.edit_form.gizmo))
+    kind = ui.radio(GIZMOS, state.edit_form.gizmo)
+    if kind != state.edit_form.gizmo:
+        editing.set_gizmo(viewer, kind)
+    form = state.edit_form
     move = _three("Move", form.move, "World units along x, y and z")
     rotate = _three("Rotate", form.rotate, "Degrees about x, then y, then z, right-handed")
     ui.leave_room("Scale", 12)
@@ -228,8 +231,11 @@ def draw_transform(viewer: Viewer) -> None:
         editing.set_box(viewer, low, high)
     if ui.button("Fit", "The box around the selection, or around everything"):
         editing.fill_box(viewer)
-    if ui.next_button("Crop", "Delete what lies outside the box; the file stays as it is"):
+    if ui.next_button("Crop"):
         editing.crop(viewer)
+    if imgui.is_item_hovered():
+        outside = int((state.marks.kept & ~editing.in_crop_box(viewer)).sum())
+        ui.tip(f"Delete the {outside:,} Gaussians outside the box; the file stays as it is")
     imgui.end_disabled()
 
 

@@ -24,7 +24,7 @@ def draw_camera(viewer: Viewer) -> None:
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
         _training_cameras(viewer, state.scene.cameras)
-    ui.verbs(viewer, "Reset", "Focus", "Frame all", "Horizon", "Align up")
+    ui.verbs(viewer, "Reset", "Focus", "Frame all", "Horizon", "Align up axis")
     if state.view is not None:
         _projection(viewer, state.view)
     if state.extent is not None:
