@@ -49,7 +49,7 @@ from tests.support.processes import (
     check_full_disk,
     contents,
     files_of_at_most,
-    stopped_everywhere,
+    killed_everywhere,
 )
 from tests.support.scenes import random_camera, random_gaussians
 from tests.support.windowless import flight as some_flight
@@ -248,7 +248,7 @@ def test_a_writer_killed_at_any_step_leaves_whole_files(name: str, tmp_path: Pat
 
     killed = 0
     begin()
-    for code in stopped_everywhere(work, folder, signal.SIGKILL):
+    for code in killed_everywhere(work, folder):
         after = contents(folder)
         seen = {path for path in after if not Path(path).name.startswith(".writing-")}
         gone = {path for path in before if name.startswith("scene") and path.endswith(companions)}

@@ -268,7 +268,7 @@ def _match_and_triangulate(
         members.setdefault((params, max(camera.width, camera.height)), []).append(name)
     groups = [CameraGroup(tuple(group), "PINHOLE", params, side) for (params, side), group in members.items()]
     extract_features(workspace, groups, progress)
-    pairs = [(names[i], names[j]) for i, j in neighbouring_views(cameras)]
+    pairs = [(names[i], names[j]) for i, j in neighbouring_pairs(cameras)]
     match_features(workspace, pairs, progress)
     progress("triangulating points", 0.0)
     triangulate(workspace, names, cameras)
@@ -295,7 +295,7 @@ def _write_images(
     return tuple(cameras)
 
 
-def neighbouring_views(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+def neighbouring_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     """Return pairs (i < j) to match: every view with the nearest `NEIGHBOURS` that look a similar way."""
     centres = np.array([camera.position for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])

@@ -104,22 +104,13 @@ class _Origin(Struct):
     origin: tuple[camera_files.Coordinate, camera_files.Coordinate, camera_files.Coordinate]
 
 
-def load_gaussians(path: Path | str) -> Gaussians:
-    """Return the Gaussians of a scene in any supported format where they lie in the world.
-
-    Far from zero float32 is coarse; `load_scene` keeps an origin instead. Raises InputError for what cannot
-    be opened or is of no supported kind, FormatError for what breaks the rules of its format.
-    """
-    return _read(Path(path)).world_gaussians()
-
-
 def load_scene(path: Path | str) -> Scene:
     """Return a scene with its language field and cameras, where they lie beside it.
 
     Cameras are `<scene>.cameras.json`, or for a PLY in the folder structure of the INRIA code
     (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. A companion that is unusable or
-    made for other Gaussians is left out, with the reason in `Scene.unread`. Raises InputError and FormatError
-    as `load_gaussians` does.
+    made for other Gaussians is left out, with the reason in `Scene.unread`. Raises InputError for what cannot
+    be opened or is of no supported kind, FormatError for what breaks the rules of its format.
     """
     scene = load_without_language(path)
     sidecar = companion_path(path, language_files.SUFFIX)

@@ -46,10 +46,34 @@ from tests.support.photographs import (
 
 pytestmark = pytest.mark.long
 
-PARAMS = [190.0, 188.0, 103.0, 74.0, -0.1, 0.02, 0.001, -0.001]
-LENS = PhotoIntrinsics(200, 150, *PARAMS[:4], BrownDistortion(*PARAMS[4:]))
+CURVE = BrownDistortion(-0.1, 0.02, 0.001, -0.001)
+LENS = PhotoIntrinsics(200, 150, 190.0, 188.0, 103.0, 74.0, CURVE)
+SMALL_LENS = PhotoIntrinsics(40, 30, 38.0, 37.6, 20.6, 14.8, CURVE)
 WHOLE = DatasetConfig(max_side=200)
-SMALL_LENS = PhotoIntrinsics(40, 30, 38.0, 37.6, 20.6, 14.8, BrownDistortion(-0.1, 0.02, 0.001, -0.001))
+
+
+def params_of(lens: PhotoIntrinsics) -> list[float]:
+    """As COLMAP's OPENCV and nerfstudio's order them."""
+    assert lens.distortion == CURVE
+    return [lens.fx, lens.fy, lens.cx, lens.cy, CURVE.k1, CURVE.k2, CURVE.p1, CURVE.p2]
+
+
+def write_model(
+    out: Path,
+    form: str,
+    lens: PhotoIntrinsics,
+    names: list[str],
+    matrices: list[Array],
+    at: Array = NO_ORIGIN,
+) -> None:
+    """A COLMAP model, "bin" or "txt", with ten points on the floor of the room that lies `at`."""
+    matrices = [moved_pose(matrix, at) for matrix in matrices]
+    model = colmap_reconstruction("OPENCV", (lens.width, lens.height), params_of(lens), names, matrices)
+    for index in range(10):
+        point = at + np.array([3.0, 0.2 * index + 1.5, 0.0])
+        model.add_point3D(point, pycolmap.Track(), np.array([index, 2, 3], np.uint8))
+    out.mkdir(parents=True)
+    (model.write_binary if form == "bin" else model.write_text)(out)
 
 
 def write_dataset(
@@ -61,16 +85,8 @@ def write_dataset(
     """
     matrices = poses(views)
     names = write_photos(folder / "images", LENS, matrices)
-    matrices = [moved_pose(matrix, at) for matrix in matrices]
     # Listed backwards: the order of the file must not matter.
-    model = colmap_reconstruction("OPENCV", (200, 150), PARAMS, names[::-1], matrices[::-1])
-    track = pycolmap.Track()
-    for index in range(10):
-        point = at + np.array([3.0, 0.2 * index + 1.5, 0.0])
-        model.add_point3D(point, track, np.array([index, 2, 3], np.uint8))
-    out = folder / subfolder
-    out.mkdir(parents=True)
-    (model.write_binary if form == "bin" else model.write_text)(out)
+    write_model(folder / subfolder, form, LENS, names[::-1], matrices[::-1], at)
 
 
 @pytest.mark.parametrize("form", ["bin", "txt"])
@@ -99,19 +115,10 @@ def test_a_capture_shows_what_its_cameras_see_at_any_place(tmp_path: Path, form:
     else:
         write_dataset(tmp_path, at=place)
     if form == "json":  # the same photographs as nerfstudio lists them
-        model, flip = read_model(tmp_path / "sparse/0"), np.diag([1.0, -1, -1, 1])
-        frames = []
-        for image in model.images:
-            pose = np.linalg.inv(moved_pose(image.world_to_camera, -place)) @ flip
-            pose[:3, 3] += place
-            frames.append({"file_path": f"images/{image.name}", "transform_matrix": pose.tolist()})
-        keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
-        content = dict(zip(keys, PARAMS, strict=True)) | {"frames": frames, "ply_file_path": "points.ply"}
-        points = np.zeros(10, [(axis, "f8") for axis in "xyz"])
-        for number, axis in enumerate("xyz"):
-            points[axis] = model.points["position"][:, number]
-        PlyData([PlyElement.describe(points, "vertex")]).write(tmp_path / "points.ply")
-        (tmp_path / "transforms.json").write_text(json.dumps(content))
+        points = read_model(tmp_path / "sparse/0").points["position"]
+        write_ply(tmp_path / "points.ply", dict(zip("xyz", points.T, strict=True)))
+        frames = frames_of([f"view_{index}.png" for index in range(3)], poses(3), place)
+        rewrite(tmp_path, {**stated(LENS), "frames": frames, "ply_file_path": "points.ply"})
     labels: list[str] = []
     capture = load_capture(tmp_path, WHOLE, tmp_path / "work", Progress(lambda at: labels.append(at.stage)))
     assert set(labels) == {"reading photographs"}
@@ -217,22 +224,28 @@ def test_points_of_a_ply_beside_the_model_are_used(tmp_path: Path, name: str, le
 
 # transforms.json: poses, intrinsics in all their spellings, points, and what may be missing.
 
-NERFSTUDIO_LENS = PhotoIntrinsics(
-    160, 120, 150.0, 148.0, 83.0, 58.0, BrownDistortion(-0.1, 0.02, 0.001, -0.001)
-)
-GLOBAL = {
-    "w": 160, "h": 120, "fl_x": 150.0, "fl_y": 148.0, "cx": 83.0, "cy": 58.0,
-    "k1": -0.1, "k2": 0.02, "p1": 0.001, "p2": -0.001, "camera_model": "OPENCV",
-}  # fmt: skip
+
+def stated(lens: PhotoIntrinsics) -> dict[str, Any]:
+    """The lens as a transforms.json states it."""
+    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+    size = {"w": lens.width, "h": lens.height, "camera_model": "OPENCV"}
+    return {**size, **dict(zip(keys, params_of(lens), strict=True))}
 
 
-def opengl_pose(world_to_camera: Array) -> list[list[float]]:
-    """Camera-to-world with y up and z backwards, spelled out column by column."""
-    rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
-    right, down, forward = rotation
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([right, -down, -forward, -rotation.T @ translation], axis=1)
-    return matrix.tolist()
+NERFSTUDIO_LENS = PhotoIntrinsics(160, 120, 150.0, 148.0, 83.0, 58.0, CURVE)
+GLOBAL = stated(NERFSTUDIO_LENS)
+
+
+def frames_of(names: list[str], matrices: list[Array], at: Array = NO_ORIGIN) -> list[dict[str, Any]]:
+    """Frames of the room that lies `at`: camera-to-world with y up and z backwards, column by column."""
+    frames = []
+    for name, matrix in zip(names, matrices, strict=True):
+        rotation, translation = matrix[:3, :3], matrix[:3, 3]
+        right, down, forward = rotation
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, -down, -forward, at - rotation.T @ translation], axis=1)
+        frames.append({"file_path": f"./images/{name}", "transform_matrix": pose.tolist()})
+    return frames
 
 
 def write_transforms(
@@ -240,11 +253,7 @@ def write_transforms(
 ) -> dict[str, Any]:
     matrices = poses(views)
     names = write_photos(folder / "images", intrinsics, matrices)
-    frames = [
-        {"file_path": f"./images/{name}", "transform_matrix": opengl_pose(matrix)}
-        for name, matrix in zip(names, matrices, strict=True)
-    ]
-    data = {**top, "frames": frames}
+    data = {**top, "frames": frames_of(names, matrices)}
     rewrite(folder, data)
     return data
 
@@ -537,23 +546,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same photographs and cameras as a COLMAP model in text and as a transforms.json."""
     folder = tmp_path_factory.mktemp("whole")
     matrices = poses(4)
-    for name in ("colmap", "nerfstudio"):
-        write_photos(folder / name / "images", SMALL_LENS, matrices)
-    params = [SMALL_LENS.fx, SMALL_LENS.fy, SMALL_LENS.cx, SMALL_LENS.cy, -0.1, 0.02, 0.001, -0.001]
-    names = [f"view_{index}.png" for index in range(4)]
-    model = colmap_reconstruction("OPENCV", (40, 30), params, names, matrices)
-    for index in range(10):
-        track = pycolmap.Track()
-        model.add_point3D(np.array([3.0, 0.2 * index, 0.0]), track, np.array([index, 2, 3], np.uint8))
-    (folder / "colmap/sparse/0").mkdir(parents=True)
-    model.write_text(folder / "colmap/sparse/0")
-    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
-    frames = [
-        {"file_path": f"images/{name}", "transform_matrix": opengl_pose(matrix)}
-        for name, matrix in zip(names, matrices, strict=True)
-    ]
-    top = {**dict(zip(keys, params, strict=True)), "w": 40, "h": 30, "camera_model": "OPENCV"}
-    rewrite(folder / "nerfstudio", {**top, "frames": frames})
+    write_transforms(folder / "nerfstudio", stated(SMALL_LENS), SMALL_LENS, views=4)
+    names = write_photos(folder / "colmap/images", SMALL_LENS, matrices)
+    write_model(folder / "colmap/sparse/0", "txt", SMALL_LENS, names, matrices)
     return folder
 
 

@@ -18,7 +18,7 @@ from langsplat_core.datasets import load_capture, reconstruction, sfm
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.photos import find_photos
-from langsplat_core.datasets.sfm import add_points, neighbouring_views, pairs_by_name
+from langsplat_core.datasets.sfm import add_points, neighbouring_pairs, pairs_by_name
 from langsplat_core.datasets.workspace import ROOM, Matches, read_matches
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
@@ -236,14 +236,14 @@ def test_pairs_are_all_of_few_and_linked_ones_of_many() -> None:
     assert (0, 256) in linked
 
 
-def test_neighbouring_views_look_a_similar_way() -> None:
+def test_neighbouring_pairs_look_a_similar_way() -> None:
     around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     eyes = np.stack([np.cos(around), np.sin(around), 0 * around], axis=1)
     ring = [look_at(eye, 2 * eye, np.array([0, 0, 1.0]), (9, 9)) for eye in eyes]
-    pairs = neighbouring_views(tuple(ring))
+    pairs = neighbouring_pairs(tuple(ring))
     steps = {min(j - i, 24 - (j - i)) for i, j in pairs}
     assert steps == {1, 2, 3, 4, 5}  # 15 degrees each: 75 at most, never back to back
-    assert neighbouring_views(tuple(ring[:1])) == []
+    assert neighbouring_pairs(tuple(ring[:1])) == []
 
 
 def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from langsplat_core.errors import STRICTNESS, InputError
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
 from langsplat_core.io.quantised import read_splat_scene, write_splat
-from langsplat_core.io.scenes import load_gaussians, load_scene, save_scene, writable_suffixes
+from langsplat_core.io.scenes import load_scene, save_scene, writable_suffixes
 from langsplat_core.io.shapes import write_mesh, write_points
 from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.sog import write_sog
@@ -38,6 +38,7 @@ from tests.support.file_samples import (
     bytes_of,
     compressed_ply,
     glb,
+    load_gaussians,
     plain_ply,
     random_field,
     sog_files,

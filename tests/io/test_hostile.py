@@ -29,11 +29,19 @@ from langsplat_core.io.hostile import (
     read_npz,
 )
 from langsplat_core.io.ply import GREY, read_cloud
-from langsplat_core.io.scenes import formats, load_gaussians
+from langsplat_core.io.scenes import formats
 from langsplat_core.io.spz import read_spz_scene
 from langsplat_core.progress import silent
 from tests.support.file_kinds import KINDS, STRICT, FileKind, few_and_many, tried
-from tests.support.file_samples import assert_refused, glb, sog_files, spz_bytes, write_folder, zipped
+from tests.support.file_samples import (
+    assert_refused,
+    glb,
+    load_gaussians,
+    sog_files,
+    spz_bytes,
+    write_folder,
+    zipped,
+)
 from tests.support.scenes import random_gaussians
 
 

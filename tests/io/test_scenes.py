@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from langsplat_core.io.scenes import (
     LOSSES,
     companion_path,
     formats,
-    load_gaussians,
     load_scene,
     load_without_language,
     save_scene,
@@ -38,11 +36,12 @@ from tests.support.file_samples import (
     assert_same_extras,
     assert_same_field,
     compressed_ply,
+    load_gaussians,
     random_field,
     sog_files,
     write_folder,
 )
-from tests.support.processes import refusal, run, stopped_everywhere
+from tests.support.processes import killed_everywhere, refusal, run
 from tests.support.scenes import random_camera, random_extras, random_gaussians
 
 N = 60
@@ -163,7 +162,7 @@ def test_replacing_a_scene_removes_its_companions(tmp_path):
 def test_a_killed_saving_never_leaves_a_mixture(tmp_path):
     path, old, new = tmp_path / "scene.ply", full_scene(0), full_scene(1)
     save_scene(path, old)
-    for code in stopped_everywhere(lambda: save_scene(path, new), tmp_path, signal.SIGKILL):
+    for code in killed_everywhere(lambda: save_scene(path, new), tmp_path):
         got = load_scene(path)  # without a line about a sidecar of the other scene
         assert got.unread == ()
         (source,) = (one for one in (old, new) if np.array_equal(got.gaussians.means, one.gaussians.means))

@@ -27,6 +27,7 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from langsplat_core.arrays import unit
 from langsplat_core.cli.app import parse
@@ -666,21 +667,18 @@ def transforms(folder: Path) -> list[bytes]:
 
 
 def clouds(_: Path) -> list[bytes]:
+    """Colours of three types, each in binary and as text."""
     rng = np.random.default_rng(0)
-    axes = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     made = []
-    for colour in ("u1", "<f4", "<i4"):
-        table = np.zeros(12, [*axes, *((name, colour) for name in ("red", "green", "blue"))])
-        for name in table.dtype.names or ():
-            table[name] = rng.uniform(0, 1 if colour == "<f4" else 200, 12)
-        kinds = {"u1": "uchar", "<f4": "float", "<i4": "int"}
-        header = ["ply", "format binary_little_endian 1.0", "element vertex 12"]
-        header += [f"property float {name}" for name in "xyz"]
-        header += [f"property {kinds[colour]} {name}" for name in ("red", "green", "blue")]
-        made.append("\n".join([*header, "end_header\n"]).encode() + table.tobytes())
-        header[1] = "format ascii 1.0"
-        rows = [" ".join(str(value) for value in row) for row in table.tolist()]
-        made.append("\n".join([*header, "end_header", *rows]).encode() + b"\n")
+    for colour in ("u1", "f4", "i4"):
+        types = [(name, "f4") for name in "xyz"] + [(name, colour) for name in ("red", "green", "blue")]
+        table = np.zeros(12, types)
+        for name, _ in types:
+            table[name] = rng.uniform(0, 1 if colour == "f4" else 200, 12)
+        for text in (False, True):
+            buffer = io.BytesIO()
+            PlyData([PlyElement.describe(table, "vertex")], text=text).write(buffer)
+            made.append(buffer.getvalue())
     return made
 
 

@@ -27,6 +27,7 @@ from torch import nn
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import FormatError
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     AutoencoderCodec,
@@ -474,6 +475,11 @@ def autoencoder(
 
 TREE = ("leaves", "parents", "levels", "votes")
 FIELDS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh")
+
+
+def load_gaussians(path: Path) -> Gaussians:
+    """Of a scene file, where they lie in the world."""
+    return load_scene(path).world_gaussians()
 
 
 def assert_same(got: Gaussians, want: Gaussians) -> None:

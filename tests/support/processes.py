@@ -367,8 +367,8 @@ def check_full_disk(write: Write, tmp_path: Path, capsys: Captured, earlier: byt
 STEPS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.chmod", "os.chown", "os.truncate"}
 
 
-def stopped_everywhere(work: Callable[[], int | None], folder: Path, number: int) -> Iterator[int]:
-    """Do `work` in forks of this process, each sent a signal at another of its steps in `folder`.
+def killed_everywhere(work: Callable[[], int | None], folder: Path) -> Iterator[int]:
+    """Do `work` in forks of this process, each killed at another of its steps in `folder`.
 
     Steps are what opens, makes, renames or removes a file. Yields the exit codes, the last of which is of a
     fork that ended otherwise.
@@ -379,7 +379,7 @@ def stopped_everywhere(work: Callable[[], int | None], folder: Path, number: int
 
             def watch(event: str, given: tuple[object, ...], left: Iterator[int] = left) -> None:
                 if event in STEPS and str(given[0]).startswith(str(folder)) and next(left, None) is None:
-                    os.kill(os.getpid(), number)
+                    os.kill(os.getpid(), signal.SIGKILL)
 
             code = 1
             try:
@@ -390,7 +390,7 @@ def stopped_everywhere(work: Callable[[], int | None], folder: Path, number: int
                 os._exit(code)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         yield code
-        if code not in (-number, 128 + number):
+        if code != -signal.SIGKILL:
             return
 
 

@@ -113,8 +113,7 @@ def shifted(gaussians: Gaussians, camera: Camera, offset: Array) -> tuple[Gaussi
     return moved, replace(camera, world_to_camera=matrix)
 
 
-PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort"}
-PLY_TYPES |= {"i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
+PLY_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 
 
 def random_extras(count: int = 40) -> dict[str, Array]:

@@ -111,7 +111,6 @@ class TrainingState:
     updates: dict[str, int]  # how often Adam has updated each parameter
     step: int = 0  # steps done
     queue: list[int] = field(default_factory=list)  # views still to come in this pass over the photographs
-    non_finite: int = 0  # gradient entries that were not finite and were taken as zero
 
     def __len__(self) -> int:
         return len(self.values["means"])
@@ -156,14 +155,12 @@ def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | Non
 
 
 def clean_gradients(state: TrainingState) -> None:
-    """Zero and count gradient entries that are NaN or infinite: one bad pixel must not end a training."""
+    """Zero gradient entries that are NaN or infinite: one bad pixel must not end a training."""
     gradients = [value.grad for value in state.values.values() if value.grad is not None]
     if not gradients or bool(torch.isfinite(torch.stack([gradient.sum() for gradient in gradients]).sum())):
         return  # a finite sum has finite terms; an overflowing sum is looked at entry by entry
     for gradient in gradients:
-        bad = ~torch.isfinite(gradient)
-        state.non_finite += int(bad.sum())
-        gradient[bad] = 0
+        gradient[~torch.isfinite(gradient)] = 0
 
 
 def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
@@ -299,7 +296,7 @@ def save_checkpoint(path: Path, state: TrainingState, made_from: str) -> None:
     tensors = {name: getattr(state, name) for name in TENSORS}
     tensors |= {f"watched.{name}": torch.from_numpy(getattr(state.transients, name)) for name in WATCHED}
     tensors |= {f"{rows}.{name}": getattr(state, rows)[name].detach() for rows in ROWS for name in PARAMETERS}
-    header = {name: getattr(state, name) for name in ("step", "updates", "queue", "non_finite")}
+    header = {name: getattr(state, name) for name in ("step", "updates", "queue")}
     header |= {"fingerprint": made_from, "rng": state.rng.bit_generator.state}
     with atomic_path(path) as temporary:
         save_file(
@@ -336,7 +333,6 @@ def load_checkpoint(path: Path, made_from: str, device: torch.device) -> Trainin
             updates={name: int(header["updates"][name]) for name in PARAMETERS},
             step=int(header["step"]),
             queue=[int(index) for index in header["queue"]],
-            non_finite=int(header["non_finite"]),
         )
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         problem = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -1,7 +1,5 @@
 """A compact scene keeps its error budget, its meaning and its order, or is not written; floaters go."""
 
-import os
-import signal
 from dataclasses import replace
 
 import numpy as np
@@ -37,7 +35,7 @@ from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.transform import moving, scaling, transform_scene
 from tests.support.file_samples import random_field
 from tests.support.hard_cases import balls
-from tests.support.processes import contents, run, stopped_everywhere
+from tests.support.processes import contents
 from tests.support.scenes import random_gaussians
 
 N = 400
@@ -167,33 +165,6 @@ def test_unforeseen_loss_leaves_the_old_file(source, tmp_path, monkeypatch):
     with pytest.raises(InputError):
         compact_scene(source, out, CONFIG)
     assert contents(tmp_path) == old
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="no signal 9")
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_compact_stopped_at_any_step_leaves_a_whole_scene(number, scene, source):
-    """The old one or the new one, perhaps without companions, and nothing else that is not hidden."""
-    out = source.with_name("small.ply")
-    old = scene.take(np.arange(N // 3))
-    compact_scene(source, out, CONFIG)
-    new, names = load_scene(out), set(contents(source.parent))
-    words = ["compact", str(source), "--out", str(out), "--max-psnr-loss", "0.3", "--max-side", "64"]
-    codes, counts, before = [], [], source.read_bytes()
-    save_scene(out, old)
-    for code in stopped_everywhere(lambda: run(*words), source.parent, number):
-        codes.append(code)
-        found = load_scene(out)
-        counts.append(len(found.gaussians))
-        assert found.unread == ()
-        if found.language is not None:
-            assert len(found.language.known[0]) == counts[-1]
-        assert {name for name in contents(source.parent) if not name.startswith(".writing-")} <= names
-        save_scene(out, old)
-    assert source.read_bytes() == before
-    assert codes[-1] == 0
-    assert len(codes) > 10
-    assert set(counts) == {len(old.gaussians), len(new.gaussians)}
 
 
 def test_bisection_weighs_counts_against_sh_degrees():
