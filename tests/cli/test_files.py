@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from langsplat_core.arrays import psnr
 from langsplat_core.cli.export import Convert
 from langsplat_core.io.scenes import companion_path, load_scene, save_scene
 from langsplat_core.io.sidecar import SUFFIX as SIDECAR
 from langsplat_core.io.sidecar import write_language
 from langsplat_core.raster.render import render
-from langsplat_core.scene import Camera, Gaussians, Scene, TaughtWord
+from langsplat_core.scene import Scene, TaughtWord
 from langsplat_core.scene.language import tree_of_wholes
 from tests.support.file_samples import assert_same_extras, random_field, sog_files, write_folder
 from tests.support.processes import refusal, run
@@ -102,11 +103,6 @@ def test_sources_are_not_replaced_by_another_name(tmp_path, capsys, monkeypatch)
 # ---- the demo scene: image and size ----
 
 
-def psnr(scene: Gaussians, truth: Gaussians, cameras: list[Camera]) -> float:
-    images = [[render(Scene(one), camera).colours.clip(0, 1) for camera in cameras] for one in (scene, truth)]
-    return float(-10 * np.log10(np.mean(np.square(np.subtract(*images)))))
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("suffix", "least", "bytes_each"), [(".spz", 48, 29), (".splat", 55, 32)])
 def test_small_formats_keep_the_demo_scenes_image(suffix, least, bytes_each, tmp_path, measured):
@@ -118,7 +114,8 @@ def test_small_formats_keep_the_demo_scenes_image(suffix, least, bytes_each, tmp
     got, want = convert(DEMO, tmp_path / f"demo{suffix}").gaussians, demo.gaussians
     if suffix == ".splat":
         want = replace(want, sh=np.clip(want.sh[:, :1], -0.5 / 0.28209479, 0.5 / 0.28209479))
-    value = psnr(got, want, views)
+    images = (np.stack([render(Scene(one), at).colours.clip(0, 1) for at in views]) for one in (got, want))
+    value = psnr(*images)
     measured("demo scene", f"PSNR {suffix}", value)
     assert value > least
     size = (tmp_path / f"demo{suffix}").stat().st_size

@@ -25,8 +25,8 @@ from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.scene.transform import moving, rotating, scaling
 from tests.support.photographs import (
-    colmap_reconstruction,
     poses,
+    write_model,
     write_nerfstudio,
     write_photos,
     write_picture,
@@ -238,10 +238,7 @@ def test_a_capture_gets_its_scale_from_its_photographs(tmp_path: Path) -> None:
     """Cameras a few units apart whose photographs are tens of metres apart."""
     seen = poses(8)
     names = write_photos(tmp_path / "images", LENS, seen)
-    params = [LENS.fx, LENS.fy, LENS.cx, LENS.cy]
-    (tmp_path / "sparse" / "0").mkdir(parents=True)
-    model = colmap_reconstruction("PINHOLE", (LENS.width, LENS.height), params, names, seen)
-    model.write_binary(tmp_path / "sparse" / "0")
+    write_model(tmp_path / "sparse" / "0", LENS, names, seen)
     config = DatasetConfig()
 
     def loaded(config: DatasetConfig) -> float | None:

@@ -33,13 +33,14 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import NO_ORIGIN, moved_pose
 from tests.support.photographs import (
     CONFIG,
-    colmap_reconstruction,
+    lens_params,
     photograph,
     pinhole_picture,
     poses,
     psnr,
     refuse,
     write_colmap,
+    write_model,
     write_nerfstudio,
     write_photos,
 )
@@ -50,43 +51,21 @@ CURVE = BrownDistortion(-0.1, 0.02, 0.001, -0.001)
 LENS = PhotoIntrinsics(200, 150, 190.0, 188.0, 103.0, 74.0, CURVE)
 SMALL_LENS = PhotoIntrinsics(40, 30, 38.0, 37.6, 20.6, 14.8, CURVE)
 WHOLE = DatasetConfig(max_side=200)
-
-
-def params_of(lens: PhotoIntrinsics) -> list[float]:
-    """As COLMAP's OPENCV and nerfstudio's order them."""
-    assert lens.distortion == CURVE
-    return [lens.fx, lens.fy, lens.cx, lens.cy, CURVE.k1, CURVE.k2, CURVE.p1, CURVE.p2]
-
-
-def write_model(
-    out: Path,
-    form: str,
-    lens: PhotoIntrinsics,
-    names: list[str],
-    matrices: list[Array],
-    at: Array = NO_ORIGIN,
-) -> None:
-    """A COLMAP model, "bin" or "txt", with ten points on the floor of the room that lies `at`."""
-    matrices = [moved_pose(matrix, at) for matrix in matrices]
-    model = colmap_reconstruction("OPENCV", (lens.width, lens.height), params_of(lens), names, matrices)
-    for index in range(10):
-        point = at + np.array([3.0, 0.2 * index + 1.5, 0.0])
-        model.add_point3D(point, pycolmap.Track(), np.array([index, 2, 3], np.uint8))
-    out.mkdir(parents=True)
-    (model.write_binary if form == "bin" else model.write_text)(out)
+FLOOR = np.array([[3.0, 0.2 * index + 1.5, 0.0] for index in range(10)])  # points on it
 
 
 def write_dataset(
     folder: Path, form: str = "bin", subfolder: str = "sparse/0", views: int = 3, at: Array = NO_ORIGIN
 ) -> None:
-    """Photographs of the room through an OPENCV lens, and a model with ten points on its floor.
+    """Photographs of the room through an OPENCV lens, and a model with points on its floor.
 
     at: where in the world its zero is.
     """
     matrices = poses(views)
     names = write_photos(folder / "images", LENS, matrices)
     # Listed backwards: the order of the file must not matter.
-    write_model(folder / subfolder, form, LENS, names[::-1], matrices[::-1], at)
+    matrices = [moved_pose(matrix, at) for matrix in matrices[::-1]]
+    write_model(folder / subfolder, LENS, names[::-1], matrices, FLOOR + at, form)
 
 
 @pytest.mark.parametrize("form", ["bin", "txt"])
@@ -132,8 +111,7 @@ def test_a_capture_shows_what_its_cameras_see_at_any_place(tmp_path: Path, form:
         assert psnr(image, pinhole_picture(back, 3)) > 35  # 28 when half a pixel off
     again = capture.read_at([0], 100)
     np.testing.assert_array_equal(again.cameras[0].world_to_camera, capture.cameras[0].world_to_camera)
-    want = [[3.0, 0.2 * index + 1.5, 0.0] for index in range(10)]
-    np.testing.assert_allclose(capture.points + (capture.origin - place), want, atol=1e-8)
+    np.testing.assert_allclose(capture.points + (capture.origin - place), FLOOR, atol=1e-8)
 
 
 def test_the_model_with_most_photographs_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -229,7 +207,7 @@ def stated(lens: PhotoIntrinsics) -> dict[str, Any]:
     """The lens as a transforms.json states it."""
     keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     size = {"w": lens.width, "h": lens.height, "camera_model": "OPENCV"}
-    return {**size, **dict(zip(keys, params_of(lens), strict=True))}
+    return {**size, **dict(zip(keys, lens_params(lens), strict=True))}
 
 
 NERFSTUDIO_LENS = PhotoIntrinsics(160, 120, 150.0, 148.0, 83.0, 58.0, CURVE)
@@ -548,7 +526,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     matrices = poses(4)
     write_transforms(folder / "nerfstudio", stated(SMALL_LENS), SMALL_LENS, views=4)
     names = write_photos(folder / "colmap/images", SMALL_LENS, matrices)
-    write_model(folder / "colmap/sparse/0", "txt", SMALL_LENS, names, matrices)
+    write_model(folder / "colmap/sparse/0", SMALL_LENS, names, matrices, FLOOR, "txt")
     return folder
 
 

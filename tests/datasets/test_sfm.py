@@ -24,11 +24,11 @@ from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
 from langsplat_core.scene import Camera, look_at
 from tests.support.photographs import (
-    colmap_reconstruction,
     distance_to_room,
     mask_file,
     photograph,
     poses,
+    write_model,
     write_photos,
 )
 from tests.support.processes import files_of_at_most, in_this_process, small_disk, stop_at
@@ -198,10 +198,8 @@ def test_known_poses_give_points_in_their_own_world(tmp_path: Path, monkeypatch:
 
 def test_points_come_from_larger_pictures_of_the_training_views(tmp_path: Path) -> None:
     """Pictures of 120 px lack what is found at 400; a photograph that is held out gives no point."""
-    names, params = write_photos(tmp_path / "images", LENS, poses(5)), [LENS.fx, LENS.cx, LENS.cy, -0.06]
-    (tmp_path / "sparse").mkdir()
-    model = colmap_reconstruction("SIMPLE_RADIAL", (400, 300), params, names, poses(5))
-    model.write_binary(tmp_path / "sparse")
+    names = write_photos(tmp_path / "images", LENS, poses(5))
+    write_model(tmp_path / "sparse", LENS, names, poses(5))
     small = DatasetConfig(max_side=120, test_every=4, hold_out="every")  # views 0 and 4 are held out
     capture = load_capture(tmp_path, small, tmp_path / "work")
     assert max(capture.images[0].shape) <= 120

@@ -21,7 +21,7 @@ from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, kept, sole_use, stage_key
 from langsplat_core.progress import Report
-from tests.support.photographs import colmap_reconstruction, poses, write_photos
+from tests.support.photographs import poses, write_model, write_photos
 from tests.support.processes import resize, small_disk
 from tests.support.tiny_models import tiny_clip, tiny_room, tiny_sam
 
@@ -204,11 +204,7 @@ def photographs(folder: Path, kind: str) -> Path:
     """Photographs of the room, plain or with the cameras of a COLMAP model without points."""
     names = write_photos(folder / "images", LENS, poses(VIEWS))
     if kind == "COLMAP":
-        (folder / "sparse" / "0").mkdir(parents=True)
-        params = [LENS.fx, LENS.fy, LENS.cx, LENS.cy]
-        size = (LENS.width, LENS.height)
-        model = colmap_reconstruction("PINHOLE", size, params, names, poses(VIEWS))
-        model.write_binary(folder / "sparse" / "0")
+        write_model(folder / "sparse" / "0", LENS, names, poses(VIEWS))
     return folder
 
 

@@ -111,17 +111,35 @@ def write_photos(
     return names
 
 
-def colmap_reconstruction(
-    model: str, size: tuple[int, int], params: list[float], names: list[str], matrices: list[Array]
-) -> "pycolmap.Reconstruction":
-    """One shared camera, one image per name, no points."""
-    result = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=params, camera_id=1)
+def lens_params(lens: PhotoIntrinsics) -> list[float]:
+    """In the order of COLMAP's PINHOLE or OPENCV, which is nerfstudio's too."""
+    curve = lens.distortion
+    known = [] if curve is None else [getattr(curve, name) for name in ("k1", "k2", "p1", "p2")]
+    return [lens.fx, lens.fy, lens.cx, lens.cy, *known]
+
+
+def write_model(
+    out: Path,
+    lens: PhotoIntrinsics,
+    names: list[str],
+    matrices: Sequence[Array],
+    points: Array | None = None,
+    form: str = "bin",
+) -> Path:
+    """A COLMAP model, "bin" or "txt": one camera, an image per name, (M, 3) points; returns its folder."""
+    result, kind = pycolmap.Reconstruction(), "PINHOLE" if lens.distortion is None else "OPENCV"
+    camera = pycolmap.Camera(
+        model=kind, width=lens.width, height=lens.height, params=lens_params(lens), camera_id=1
+    )
     result.add_camera_with_trivial_rig(camera)
     for index, (name, matrix) in enumerate(zip(names, matrices, strict=True), 1):
         image = pycolmap.Image(name=name, camera_id=1, image_id=index)
         result.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.ascontiguousarray(matrix[:3])))
-    return result
+    for index, point in enumerate(() if points is None else points):
+        result.add_point3D(point, pycolmap.Track(), np.array([index, 2, 3], np.uint8))
+    out.mkdir(parents=True, exist_ok=True)
+    (result.write_binary if form == "bin" else result.write_text)(out)
+    return out
 
 
 CONFIG = DatasetConfig(max_side=64)
@@ -156,13 +174,8 @@ def write_colmap(folder: Path, form: str = "bin") -> Path:
     names = ["a.png", "b.png"]
     for name in names:
         write_picture(folder / "images" / name)
-    model = colmap_reconstruction("PINHOLE", (40, 30), [50.0, 50, 20, 15], names, [np.eye(4)] * 2)
-    for x in range(3):
-        model.add_point3D(np.array([x, 0, 3.0]), pycolmap.Track(), np.array([1, 2, 3], np.uint8))
-    out = folder / "sparse" / "0"
-    out.mkdir(parents=True)
-    (model.write_binary if form == "bin" else model.write_text)(out)
-    return out
+    lens, points = PhotoIntrinsics(40, 30, 50.0, 50.0, 20.0, 15.0), np.array([[x, 0, 3.0] for x in range(3)])
+    return write_model(folder / "sparse" / "0", lens, names, [np.eye(4)] * 2, points, form)
 
 
 def write_nerfstudio(folder: Path, **top: object) -> None:
