@@ -218,8 +218,7 @@ class QueryScene:
             number = count_things(engine, result) if counts else Number(0, 0, 0)
             answer |= {"count": {"best": number.best, "least": number.least, "most": number.most}}
             because = {} if explain is None else {"evidence": explain(engine, result, of)}
-            answer |= basis_fields(engine) | {"metres_per_unit": unit.metres, **listed(things)}
-            answer |= because
+            answer |= basis_fields(engine) | {"metres_per_unit": unit.metres, **listed(things), **because}
             asked[text] = answer, instance_lines(things, unit) + _reasons(**because)
         if pixels is not None:
             pixels.fill()
