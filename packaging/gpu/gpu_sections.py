@@ -37,7 +37,7 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError
 from langsplat_core.extensions.benchmarks.raster_speed import (
     Case,
-    Foresight,
+    Rates,
     default_camera,
     describe_machine,
     label_maps,
@@ -247,14 +247,14 @@ def measure_raster(plan: Plan) -> Iterator[str]:
     settings = {"cpu": INRIA, "cuda": gsplat.drawn_settings(INRIA)}
     warm_up(backends, plan.channels)
     yield "# gsplat's rasterizer\n\n" + NOTES
-    foresight = Foresight(LONGEST_S)
+    rates = Rates()
     for count, size in plan.scenes:
         case = Case("random", random_scene(count), default_camera(*size))
         rows = []
         for backend in backends:
             exact = reference_windows(case.gaussians, case.camera, settings[backend.name])
             for channels in plan.channels:
-                rows += measure_backend(backend, case, channels, exact, foresight)
+                rows += measure_backend(backend, case, channels, exact, LONGEST_S, rates)
         yield speed_table(rows)
         yield "On the device alone, scene and picture staying there:\n"
         yield _on_device(case, plan.channels)
@@ -488,7 +488,7 @@ def tables(plan: Plan, context: moderngl.Context) -> Iterator[str]:
         exact = reference_windows(case.gaussians, case.camera, ENDLESS)
         rows = []
         for backend in backends:
-            rows += measure_backend(backend, case, 3, exact, Foresight(30.0))
+            rows += measure_backend(backend, case, 3, exact, 30.0, {})
         yield speed_table(rows)
 
 
