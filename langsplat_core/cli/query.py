@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -39,9 +40,10 @@ from langsplat_core.query.compose import (
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.lookup import PLANES, PeakPixels, decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.selection import of_rows
 from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.cpu.rasterizer import CpuView
 from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
@@ -366,13 +368,14 @@ def _answer(result: QueryResult, camera: Camera | None) -> dict[str, Any]:
 
 
 class _Pixels:
-    """Pixels of answers in one view; relevancies of several phrases are blended together."""
+    """Pixels of answers in one view, found for several together."""
 
     def __init__(self, engine: QueryEngine, view: View, mode: str) -> None:
         self._engine, self._view, self._paper = engine, view, mode == "paper"
         size = max(view.count, view.camera.height * view.camera.width)
         self._most = max(min(CHANNELS_AT_ONCE, 2**25 // size), 1)  # 128 MB of numbers, twice
         self._waiting: list[tuple[dict[str, Any], Array]] = []
+        self._even: list[tuple[dict[str, Any], Array]] = []  # with relevancies of `engine.alike`
 
     def add(self, result: QueryResult, answer: dict[str, Any]) -> None:
         """Take an answer, whose pixel fields are filled sooner or later."""
@@ -380,11 +383,19 @@ class _Pixels:
         if self._paper:
             phrase = self._engine.text_vectors([result.phrase])
             image = decoded_relevancy(self._view, self._engine.field, result.level, phrase, gate)
-            self._take(answer, image[..., 0])
-            return
-        self._waiting.append((answer, result.even))
-        if len(self._waiting) == self._most:
+            answer |= _pixel(*peak_pixel(image[..., 0], PAPER_FILTER))
+        elif result.spread is not None and self._peaks is not None:
+            self._even.append((answer, result.spread.at(self._engine.alike[1])))
+        else:
+            self._waiting.append((answer, result.even))
+        if len(self._waiting) == self._most or len(self._even) == CHANNELS_AT_ONCE:
             self.fill()
+
+    @cached_property
+    def _peaks(self) -> PeakPixels | None:
+        assert isinstance(self._view, CpuView)
+        shares = self._view.label_shares(self._engine.alike[0], PictureConfig().alpha_gate, PLANES)
+        return None if shares is None else PeakPixels(shares, self._view.camera, PAPER_FILTER)
 
     def fill(self) -> None:
         """Fill the pixel fields of all that was added."""
@@ -392,12 +403,17 @@ class _Pixels:
             answers, columns = zip(*self._waiting, strict=True)
             images = splatted_relevancy(self._view, np.stack(columns, 1), PictureConfig().alpha_gate)
             for answer, image in zip(answers, np.moveaxis(images, -1, 0), strict=True):
-                self._take(answer, image)
+                answer |= _pixel(*peak_pixel(image, PAPER_FILTER))
             self._waiting.clear()
+        if self._even and self._peaks is not None:
+            answers, values = zip(*self._even, strict=True)
+            for answer, (column, row, score) in zip(answers, self._peaks.of(np.stack(values)), strict=True):
+                answer |= _pixel(int(column), int(row), float(score))
+            self._even.clear()
 
-    def _take(self, answer: dict[str, Any], relevancy: Array) -> None:
-        column, row, score = peak_pixel(relevancy, PAPER_FILTER)
-        answer |= {"pixel": [column, row], "pixel_score": score}
+
+def _pixel(column: int, row: int, score: float) -> dict[str, Any]:
+    return {"pixel": [column, row], "pixel_score": score}
 
 
 def _lines(answer: dict[str, Any], unit: Unit) -> list[str]:

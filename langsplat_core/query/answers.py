@@ -1,18 +1,19 @@
 """Answers to a phrase: whole regions of a scene's tree by `rule.decide`, or, as published, its peak."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, vstack
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import named
 from langsplat_core.query.instances import axis_aligned_box
+from langsplat_core.query.lookup import Relevancy
 from langsplat_core.query.rule import (
     RULE,
     Bars,
@@ -31,22 +32,46 @@ from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale, rele
 AnswerRule = Literal["regions", "peak"]  # by `rule.decide`, or as published
 
 
+class Deferred:
+    """A field of a dataclass: an array, or a function that makes it when the field is first read."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, instance: object | None, owner: type) -> Array:
+        if instance is None:
+            raise AttributeError(self._name)  # the field has no default
+        value = vars(instance)[self._name]
+        if callable(value):
+            value = vars(instance)[self._name] = value()
+        return value
+
+    def __set__(self, instance: object, value: Array | Callable[[], Array]) -> None:
+        vars(instance)[self._name] = value
+
+
 @dataclass(frozen=True, eq=False)
 class QueryResult(Judged):
-    """The answer to one phrase."""
+    """The answer to one phrase; its arrays of N numbers are made when they are first read."""
 
     phrase: str
     level: int  # index into LEVELS
     scores: Fits  # best relevancy per level: of a region, or of a neighbourhood
-    relevancy: Array  # (3, N) float32 in [0, 1] per level and Gaussian
-    even: Array  # (N,) float32 relevancy at the level, the same all over a region
     peak: float  # score of the chosen level
     fits: Fits  # of the best region, or neighbourhood, of each level, see `Scale.fit`
     judgement: Verdict
-    members: Array  # (N,) bool: the Gaussians that answer, wherever they are
     place: Array | None  # (3,) world units
     box: Array | None  # (2, 3) corners, world units
+    relevancy: Deferred = Deferred()  # (3, N) float32 in [0, 1] per level and Gaussian
+    even: Deferred = Deferred()  # (N,) float32 relevancy at the level, the same all over a region
+    members: Deferred = Deferred()  # (N,) bool: the Gaussians that answer, wherever they are
     own_cut: float | None = None  # relevancy from which on everything is a member, where it was set by hand
+
+    @property
+    def spread(self) -> "Spread | None":
+        """The even relevancy as that of whole regions, where it is and was not yet read."""
+        even = vars(self)["even"]
+        return even if isinstance(even, Spread) else None
 
     @property
     def cut(self) -> float:
@@ -86,17 +111,34 @@ class Regions:
     sizes: tuple[Array, ...]  # (R,) Gaussians that count
     totals: tuple[Array, ...]  # (R,) float64 sums of their weights
     table: RegionTable  # of all levels one after the other, as the rule for answers reads them
+    _places: dict[tuple[int, int], tuple[Array, Array]] = field(default_factory=dict)  # of those asked for
 
     def means(self, values: Array) -> tuple[Array, ...]:
-        """Return the (R,) float64 opacity-weighted means of (3, N) values over the regions of every level.
+        """Return the (R,) float64 opacity-weighted means of (3, N) values over the regions of every level."""
+        counts = self.counts
+        weighted = self.weights[counts] * values[:, counts].astype(np.float64)
+        return tuple(
+            np.bincount(of, row, len(total)) / total
+            for of, row, total in zip(self.everywhere[:, counts], weighted, self.totals, strict=True)
+        )
 
-        Summed in the order of the Gaussians and not of the surface: memory is read from front to back.
-        """
-        pieces, longest = 4, max(map(len, self.totals))  # of a level, so that more than three cores have work
-        sums = np.zeros((len(LEVELS) * pieces, longest))
-        shared_workers().run(_sum_pieces, len(sums), plain(values), self.everywhere, self.weights, sums)
-        levels = sums.reshape(len(LEVELS), pieces, longest).sum(1)
-        return tuple(row[: len(total)] / total for row, total in zip(levels, self.totals, strict=True))
+    @cached_property
+    def counts(self) -> Array:
+        """(M,) numbers of the Gaussians that count: they are in a region at every level."""
+        return np.flatnonzero(self.weights > 0)
+
+    def mixtures(self, features: Array, count: int) -> csr_matrix:
+        """(3, N) numbers of features -> (R, `count`) float64 shares of each in the regions of all levels."""
+        counts = self.counts
+        return vstack(
+            [
+                csr_matrix((self.weights[counts] / total[of], (of, own)), (len(total), count))
+                for of, own, total in zip(
+                    self.everywhere[:, counts], features[:, counts], self.totals, strict=True
+                )
+            ],
+            format="csr",
+        )
 
     def spread(self, level: int, values: Array, others: Array) -> Array:
         """Return the (N,) of the (R,) `values` of a level's regions; in none, its own of `others` (N,)."""
@@ -116,7 +158,11 @@ class Regions:
         """Return place (3,) and box (2, 3) of a region, see `place_of`; region: -1 for none."""
         if region < 0:
             return None, None
-        return place_of(means[np.flatnonzero((self.everywhere[level] == region) & (self.weights > 0))])
+        if (level, region) not in self._places:
+            self._places[level, region] = place_of(
+                means[self.counts[self.everywhere[level, self.counts] == region]]
+            )
+        return self._places[level, region]
 
 
 def build_regions(tree: Tree, weights: Array) -> Regions:
@@ -143,15 +189,24 @@ def build_regions(tree: Tree, weights: Array) -> Regions:
     return Regions(tuple(nodes), np.stack(everywhere), weights, tuple(sizes), tuple(totals), table)
 
 
-@partial(kernel, shapes="values L N, everywhere L N, weights N")
-def _sum_pieces(first: int, last: int, values: Array, everywhere: Array, weights: Array, sums: Array) -> None:
-    """Rows [first, last) of `sums` (3 P, R): of a level's P pieces the weighted sums over its regions."""
-    count, pieces = len(weights), len(sums) // len(values)
-    for row in range(first, last):
-        level, piece = row // pieces, row % pieces
-        for i in range(count * piece // pieces, count * (piece + 1) // pieces):
-            if weights[i] > 0:
-                sums[row, everywhere[level, i]] += np.float64(weights[i]) * values[level, i]
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Relevancy at a level, the same all over a region: of all N Gaussians when called, or of some."""
+
+    regions: Regions
+    level: int
+    values: Array  # (R,) float32 of the level's regions
+    own: Relevancy  # of what is in none of them
+
+    def __call__(self) -> Array:
+        """(N,) float32."""
+        return self.regions.spread(self.level, self.values, self.own.of_level(self.level))
+
+    def at(self, rows: Array) -> Array:
+        """Return the (K,) float32 of some Gaussians."""
+        of, spread = self.regions.everywhere[self.level, rows], self.own.of_level(self.level, rows)
+        spread[of >= 0] = self.values[of[of >= 0]]
+        return spread
 
 
 @partial(kernel, shapes="of N, values R, others N, spread N")
@@ -208,7 +263,7 @@ def own_fits(regions: Regions, scale: Scale, relevancy: Array) -> Array:
 
 def by_regions(
     phrase: str,
-    relevancy: Array,
+    relevancy: Relevancy,
     fits: tuple[Array, Array | None],
     means: Array,
     regions: Regions,
@@ -216,7 +271,7 @@ def by_regions(
     calibration: Calibration | None,
     level: LevelChoice,
 ) -> QueryResult:
-    """Return the answer by the rule. relevancy: (3, N); means: (N, 3) of the Gaussians.
+    """Return the answer by the rule. means: (N, 3) of the Gaussians.
 
     fits: (R,) of the regions with the phrase, and with the thing that it names a part of, see `decide`.
     """
@@ -229,11 +284,11 @@ def by_regions(
         level=chosen,
         scores=decision.scores,
         relevancy=relevancy,
-        even=regions.spread(chosen, decision.relevancies, relevancy[chosen]),
+        even=Spread(regions, chosen, decision.relevancies, relevancy),
         peak=decision.scores[chosen],
         fits=decision.fits,
         judgement=decision.verdict,
-        members=regions.spread(chosen, decision.inside, np.zeros(relevancy.shape[1], bool)),
+        members=lambda: regions.spread(chosen, decision.inside, np.zeros(len(means), bool)),
         place=place,
         box=box,
     )

@@ -11,6 +11,7 @@ from pathlib import Path
 from threading import RLock
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
@@ -26,11 +27,10 @@ from langsplat_core.query.answers import (
     by_peak,
     by_regions,
     chance_in,
-    own_fits,
 )
 from langsplat_core.query.grammar import STOP_WORDS, check_names, only, thing_of
 from langsplat_core.query.instances import Instance, find_instances
-from langsplat_core.query.lookup import Lookup, through_cells
+from langsplat_core.query.lookup import Lookup, Relevancy, through_cells
 from langsplat_core.query.rule import Bars, bars_of
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
 from langsplat_core.scene import (
@@ -146,7 +146,7 @@ class QueryEngine:
 
     def relevancy(self, vector: Array) -> Array:
         """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
-        return next(self._lookup.relevancies(vector[None]))
+        return next(self._lookup.relevancies(vector[None]))()
 
     def _thing_fits(self, phrases: Sequence[str]) -> dict[str, Array]:
         """Return the (R,) fits of the things that `phrases` name parts of, as far as they can be asked."""
@@ -154,7 +154,10 @@ class QueryEngine:
         names = [name for name in wanted if self._is_known(name) and self.bars is not None]
         relevancies = self._lookup.relevancies(self.text_vectors(names)) if names else ()
         found = zip(names, relevancies, strict=True)
-        return {name: own_fits(self.regions, self.scale, relevancy) for name, relevancy in found}
+        return {name: self._own_fits(relevancy) for name, relevancy in found}
+
+    def _own_fits(self, relevancy: Relevancy) -> Array:
+        return self.scale.fit(self._mixtures @ relevancy.values)
 
     def _is_known(self, name: str) -> bool:
         try:
@@ -162,10 +165,12 @@ class QueryEngine:
         except EncoderError:
             return False
 
-    def _answer(self, phrase: str, relevancy: Array, level: LevelChoice, thing: Array | None) -> QueryResult:
+    def _answer(
+        self, phrase: str, relevancy: Relevancy, level: LevelChoice, thing: Array | None
+    ) -> QueryResult:
         if self.bars is None:
-            return by_peak(phrase, relevancy, self.surface, self.scale, self.field.found, level)
-        fits = own_fits(self.regions, self.scale, relevancy), thing
+            return by_peak(phrase, relevancy(), self.surface, self.scale, self.field.found, level)
+        fits = self._own_fits(relevancy), thing
         means, judged = self.scene.gaussians.means, (self.bars, self.calibration, level)
         return by_regions(phrase, relevancy, fits, means, self.regions, *judged)
 
@@ -216,6 +221,10 @@ class QueryEngine:
         return Lookup(self.compared, self.scale)
 
     @cached_property
+    def _mixtures(self) -> csr_matrix:
+        return self.regions.mixtures(self._lookup.features, self._lookup.count + 1)
+
+    @cached_property
     def surface(self) -> Surface:
         """The surface of the scene's Gaussians: a tenth of a second at 80k."""
         return build_surface(self.scene.gaussians)
@@ -234,6 +243,18 @@ class QueryEngine:
     def regions(self) -> Regions:
         """The tree's nodes at each level."""
         return build_regions(self.tree, surface_weights(self.scene.gaussians))
+
+    @cached_property
+    def alike(self) -> tuple[Array, Array]:
+        """(N,) int32 set of each Gaussian, of those in the same region at every level; (L,) one of each set.
+
+        What is in no region is a set of its own.
+        """
+        alone = (self.regions.everywhere < 0).any(0)
+        sets = np.where(alone, self.tree.count + np.cumsum(alone), self.tree.leaves).astype(np.int32)
+        some = np.zeros(int(sets.max(initial=0)) + 1, np.int64)
+        some[sets] = np.arange(len(sets))
+        return sets, some
 
     @cached_property
     def chance(self) -> Array | None:

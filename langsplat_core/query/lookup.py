@@ -6,23 +6,44 @@ decoded once. Of other codecs every latent is a feature of its own.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.compiled import kernel, shared_workers
+from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.display.displays import gated_mean
 from langsplat_core.errors import InputError
+from langsplat_core.raster.cpu.rasterizer import TileShares
+from langsplat_core.raster.cpu.tiles import PIXELS, TILE
 from langsplat_core.raster.protocol import View
-from langsplat_core.scene import CodebookCodec, LanguageField
+from langsplat_core.scene import Camera, CodebookCodec, LanguageField
 from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy_of
 
 CELLS = 32_768  # of the sphere, at most: twice as many halve the squared error, and take twice the time
 FINEST = 4096  # cells per side of the octahedral map
 CHUNK = 16_384  # latents decoded and compared at a time: 32 MB at 512 numbers
 TOGETHER = 16  # phrases compared with every feature at a time: 4 bytes each per feature
+
+
+@dataclass(frozen=True, eq=False)
+class Relevancy:
+    """Relevancy of a phrase: of K distinct features, from which follows that of N Gaussians."""
+
+    values: Array  # (K + 1,) float32 in [0, 1]; the last, 0, is that of no feature
+    features: Array  # (3, N) number of the feature of each Gaussian at each level
+
+    def __call__(self) -> Array:
+        """(3, N) float32."""
+        found = np.empty(self.features.shape, np.float32)
+        flat = self.features.reshape(-1), found.reshape(-1)
+        shared_workers().run(_fetch, found.size, self.values, *flat)
+        return found
+
+    def of_level(self, level: int, rows: Array | slice = slice(None)) -> Array:
+        """(K,) float32 of some Gaussians at a level."""
+        return np.asarray(self.values[self.features[level, rows]])
 
 
 class Lookup:
@@ -34,15 +55,17 @@ class Lookup:
         self._latents, of = field.codec.unique(field.latents.reshape(-1, field.latents.shape[-1]))
         count = len(self._latents)
         kind = np.uint16 if count <= np.iinfo(np.uint16).max else np.uint32
-        self._of = np.where(field.known, of.reshape(field.known.shape), count).astype(kind)
+        # (3, N) number of the feature of each Gaussian and level, `count` for none.
+        self.features = np.where(field.known, of.reshape(field.known.shape), count).astype(kind)
+        self.count = count
         self._zero, self._rate = np.empty(count, np.float32), np.empty(count, np.float32)
         for start in range(0, count, CHUNK):
             part = slice(start, start + CHUNK)
             cosines = self._codec.cosines(self._latents[part], scale.texts)
             self._zero[part], self._rate[part] = scale.of(cosines)
 
-    def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """Yield of (Q, D) unit phrase vectors each one's (3, N) float32 relevancies, 0 without a feature."""
+    def relevancies(self, phrases: Array) -> Iterator[Relevancy]:
+        """Yield the relevancy of each of (Q, D) unit phrase vectors."""
         # A codebook's vectors are there already; what is decoded is decoded a chunk at a time.
         step = CHUNK if self._codec.blends else max(len(self._latents), 1)
         for first in range(0, len(phrases), TOGETHER):
@@ -53,9 +76,7 @@ class Lookup:
                 cosines = self._codec.cosines(self._latents[part], some)
                 values[:, part] = relevancy_of(cosines, self._zero[part, None], self._rate[part, None]).T
             for row in values:
-                found = np.empty(self._of.shape, np.float32)
-                shared_workers().run(_fetch, found.size, row, self._of.reshape(-1), found.reshape(-1))
-                yield found
+                yield Relevancy(row, self.features)
 
 
 @partial(kernel, shapes="values K, codes N, found N")
@@ -144,11 +165,150 @@ def decoded_relevancy(
 
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
     """Return the peak (column, row, value) of a (H, W) map's means over `window` px, edges repeated."""
-    from scipy.ndimage import uniform_filter  # here, since the window, which needs none, imports this module
+    height, width = relevancy.shape
+    window = max(1, min(window, height, width))
+    means = _box_means(plain(relevancy), 0, 0, (height, width), window, (0, height, 0, width))
+    row, column, value = _middle_peak(means)
+    return int(column), int(row), float(value)
 
-    window = max(1, min(window, *relevancy.shape))
-    smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")
-    # Of those as high the middle one: which is higher by its last digits follows from the unit of lengths.
-    tied = np.argwhere(smooth >= smooth.max() - 1e-6)
-    row, column = tied[np.square(tied - tied.mean(0)).sum(1).argmin()]
-    return int(column), int(row), float(smooth[row, column])
+
+PLANES = 2**17  # of shares of regions in tiles, at most: 128 MB
+ROUNDING = 1e-5  # of means of float32 shares, generously
+
+
+class PeakPixels:
+    """Peak pixels in one view of many answers whose relevancy is even over sets of Gaussians.
+
+    The sets' shares in the pixels are blended once; an answer then costs the tiles where its peak may be. A
+    mean over pixels is at most the largest relevancy in them, so that these are the tiles around those that
+    see a set of at least the peak of any one tile.
+    """
+
+    def __init__(self, shares: TileShares, camera: Camera, window: int) -> None:
+        """window: as of `peak_pixel`."""
+        self._shares, self._averages = shares, shares.shares.mean(1)
+        self._size = camera.height, camera.width
+        self._window = max(1, min(window, *self._size))
+
+    def of(self, values: Array) -> Array:
+        """(Q, L) float32 relevancies >= 0 of the sets -> (Q, 3) float64 columns, rows and values."""
+        peaks = np.empty((len(values), 3))
+        arguments = self._shares, self._averages, self._size, self._window, plain(values), peaks
+        shared_workers().run(_find_peaks, len(values), *arguments)
+        return peaks
+
+
+@kernel
+def _find_peaks(
+    first: int,
+    last: int,
+    shares: TileShares,
+    averages: Array,
+    size: tuple[int, int],
+    window: int,
+    values: Array,
+    peaks: Array,
+) -> None:
+    """Fill rows [first, last) of `peaks`."""
+    columns = (size[1] + TILE - 1) // TILE
+    rows, around = (size[0] + TILE - 1) // TILE, (window // 2 + TILE - 1) // TILE
+    largest = np.empty(rows * columns, np.float32)
+    for q in range(first, last):
+        own, lead, highest = values[q], 0, -1.0
+        for tile in range(len(largest)):
+            largest[tile], mean = 0, 0.0
+            for plane in range(shares.starts[tile], shares.starts[tile + 1]):
+                value = own[shares.labels[plane]]
+                largest[tile] = max(largest[tile], value)
+                mean += averages[plane] * value
+            if mean > highest:
+                lead, highest = tile, mean
+        y, x = lead // columns, lead % columns
+        _, _, least = _peak_in(shares, own, size, window, (y, y + 1, x, x + 1))
+        top, bottom, left, right = rows, 0, columns, 0
+        for tile in range(len(largest)):
+            if largest[tile] >= least - ROUNDING:
+                y, x = tile // columns, tile % columns
+                top, bottom = min(top, y - around), max(bottom, y + around + 1)
+                left, right = min(left, x - around), max(right, x + around + 1)
+        box = max(top, 0), min(bottom, rows), max(left, 0), min(right, columns)
+        row, column, value = _peak_in(shares, own, size, window, box)
+        peaks[q, 0], peaks[q, 1], peaks[q, 2] = column, row, value
+
+
+@kernel
+def _peak_in(
+    shares: TileShares, values: Array, size: tuple[int, int], window: int, box: tuple[int, int, int, int]
+) -> tuple[int, int, float]:
+    """Return row, column and value of the peak in the tiles of `box`: top, bottom, left, right."""
+    columns, rows = (size[1] + TILE - 1) // TILE, (size[0] + TILE - 1) // TILE
+    around = (window // 2 + TILE - 1) // TILE
+    top, left = max(box[0] - around, 0), max(box[2] - around, 0)
+    bottom, right = min(box[1] + around, rows), min(box[3] + around, columns)
+    image = np.empty((TILE * (bottom - top), TILE * (right - left)), np.float32)
+    mean = np.empty(PIXELS, np.float32)
+    for y in range(top, bottom):
+        for x in range(left, right):
+            mean[:] = 0
+            tile = y * columns + x
+            for plane in range(shares.starts[tile], shares.starts[tile + 1]):
+                value, share = values[shares.labels[plane]], shares.shares[plane]
+                for n in range(PIXELS):
+                    mean[n] += value * share[n]
+            at = TILE * (y - top), TILE * (x - left)
+            image[at[0] : at[0] + TILE, at[1] : at[1] + TILE] = mean.reshape(TILE, TILE)
+    y0, x0 = TILE * box[0], TILE * box[2]
+    region = y0, min(TILE * box[1], size[0]), x0, min(TILE * box[3], size[1])
+    row, column, value = _middle_peak(_box_means(image, TILE * top, TILE * left, size, window, region))
+    return y0 + row, x0 + column, value
+
+
+@kernel
+def _box_means(
+    part: Array, top: int, left: int, size: tuple[int, int], window: int, box: tuple[int, int, int, int]
+) -> Array:
+    """Return float64 means over `window` px, edges repeated, of the pixels in `box` of an image of `size`.
+
+    part: the image from row `top` and column `left` on, as far as it is needed.
+    """
+    y0, y1, x0, x1 = box
+    before, after = window // 2, window - 1 - window // 2
+    means, sums = np.empty((y1 - y0, x1 - x0)), np.zeros(part.shape[1])
+    for y in range(y0, y1):
+        if y == y0:
+            for other in range(y - before, y + after + 1):
+                sums += part[min(max(other, 0), size[0] - 1) - top]
+        else:
+            new, old = min(y + after, size[0] - 1) - top, max(y - before - 1, 0) - top
+            for x in range(len(sums)):
+                sums[x] += np.float64(part[new, x]) - np.float64(part[old, x])
+        total = 0.0
+        for other in range(x0 - before, x0 + after):
+            total += sums[min(max(other, 0), size[1] - 1) - left]
+        for x in range(x0, x1):
+            total += sums[min(x + after, size[1] - 1) - left]
+            means[y - y0, x - x0] = total / (window * window)
+            total -= sums[max(x - before, 0) - left]
+    return means
+
+
+@kernel
+def _middle_peak(means: Array) -> tuple[int, int, float]:
+    """Return row, column and value of the highest pixel, of those as high the middle one.
+
+    Which is higher by its last digits follows from the unit of lengths.
+    """
+    least = means.max() - 1e-6
+    count = rows = columns = 0
+    for y in range(means.shape[0]):
+        for x in range(means.shape[1]):
+            if means[y, x] >= least:
+                count, rows, columns = count + 1, rows + y, columns + x
+    nearest, row, column = np.inf, 0, 0
+    for y in range(means.shape[0]):
+        for x in range(means.shape[1]):
+            if means[y, x] >= least:
+                far = (y - rows / count) ** 2 + (x - columns / count) ** 2
+                if far < nearest:
+                    nearest, row, column = far, y, x
+    return row, column, means[row, column]

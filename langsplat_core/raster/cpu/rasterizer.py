@@ -246,6 +246,65 @@ def label_weights(
     return weights.astype(np.float32)
 
 
+# ``W onehot(labels)``: how much of every pixel each set of Gaussians paints. A tile meets few of them.
+
+
+class TileShares(NamedTuple):
+    """Shares of sets of Gaussians in the alpha of pixels, as P planes of T tiles of 16 x 16 pixels."""
+
+    starts: Array  # (T + 1,) int64: tile t has planes starts[t] to starts[t + 1]
+    labels: Array  # (P,) int32 set of each plane
+    shares: Array  # (P, 256) float32 row by row, 0 beyond the image
+
+
+@kernel
+def _number_labels(
+    first: int, last: int, tiles: Tiles, labels: Array, all_labels: int, slots: Array, counts: Array
+) -> None:
+    """(M,) labels in depth order -> (I,) `slots`, each a number among those of its tile, (T,) counts."""
+    slot_of = np.full(all_labels, -1, np.int32)
+    for tile in range(first, last):
+        start, end, count = tiles.starts[tile], tiles.starts[tile + 1], 0
+        for s in range(start, end):
+            label = labels[tiles.ranks[s]]
+            if slot_of[label] < 0:
+                slot_of[label] = count
+                count += 1
+            slots[s] = slot_of[label]
+        for s in range(start, end):
+            slot_of[labels[tiles.ranks[s]]] = -1
+        counts[tile] = count
+
+
+@helper
+def _fetch_slot(work: Any, s: int, later: int) -> Any:
+    return work[0][s]
+
+
+@helper
+def _add_to_slot(work: Any, slot: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
+    at = slot * PIXELS + row * TILE
+    store(work[1], at, load(work[1], at) + weight)
+
+
+@kernel
+def _share_tiles(
+    first: int, last: int, tiles: Tiles, labels: Array, slots: Array, gate: float, out: TileShares
+) -> None:
+    """Fill `out`: weights are divided by an alpha above `gate`, and are 0 where it is not."""
+    for i in range(first, last):
+        tile = tile_at(i, tiles)
+        planes = out.shares[out.starts[tile] : out.starts[tile + 1]]
+        planes[:] = 0
+        for s in range(tiles.starts[tile], tiles.starts[tile + 1]):
+            out.labels[out.starts[tile] + slots[s]] = labels[tiles.ranks[s]]
+        work = slots, planes.reshape(-1)
+        transmittance, _ = walk(tile, tiles, work, _fetch_slot, _add_to_slot, nothing_to_close)
+        for n in range(PIXELS):
+            alpha = np.float32(1) - abs(transmittance[n])
+            planes[:, n] *= np.float32(1) / alpha if alpha > gate else np.float32(0)
+
+
 # Views.
 
 _SPARE_BLOCKS = 16  # a view takes five, its gradients seven
@@ -358,6 +417,25 @@ class CpuView(LiftingView):
         self.check_labels(maps, count)
         labels = np.require(maps, np.int32, ["C", "W"])
         return label_weights(self.tiles, self.order, self.workers, labels, (self.count, count), least)
+
+    def label_shares(self, labels: Array, gate: float, most: int) -> TileShares | None:
+        """Return the shares of sets of Gaussians in pixels; None where they take more than `most` planes.
+
+        labels: (N,) int32 >= 0, the set of each. The mean of values that sets have, as `splat` over alpha
+        gives it, is the sum of shares times values; 0 where alpha is at most `gate`.
+        """
+        check_array("labels", labels, (self.count,), dtype=np.int32)
+        own, number = labels[self.order], len(self.tiles.starts) - 1
+        slots, counts = np.empty(len(self.tiles.ranks), np.int32), np.empty(number, np.int64)
+        every = int(own.max(initial=-1)) + 1
+        self.workers.run(_number_labels, number, self.tiles, own, every, slots, counts)
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        if starts[-1] > most:
+            return None
+        planes = np.empty((starts[-1], PIXELS), np.float32)
+        shares = TileShares(starts, np.empty(starts[-1], np.int32), planes)
+        self._over_tiles(_share_tiles, own, slots, np.float32(gate), shares)
+        return shares
 
     def backward(
         self, values: Array, image_grad: Array, alpha_grad: Array | None = None
