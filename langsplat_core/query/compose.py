@@ -150,7 +150,7 @@ class _Asking:
                 if isinstance(unwanted, Atom):
                     # A green mug may be in the answer to "red mug", for want of a better one; it is not what
                     # "not red mug" means.
-                    members = members & within_reach(self.engine, excluded, HALF)
+                    members = members & within_reach(self.engine, excluded, HALF)[0]
                 return restricted(wanted, ~members, wanted) if excluded.found else wanted
             case Inside(part, whole):
                 return self._inside(part, whole, level)
@@ -280,11 +280,11 @@ def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryRe
     )
 
 
-def within_reach(engine: QueryEngine, answer: QueryResult, share: float) -> Array:
-    """Return (N,) bool: what the answer would hold if it reached `share` as far below its best region."""
+def within_reach(engine: QueryEngine, answer: QueryResult, *shares: float) -> list[Array]:
+    """Return (N,) bool of each share: the answer if it reached so far below its best region."""
     fits = engine.scale.fit(answer.even)
     best = float(fits[answer.members].max(initial=-np.inf))
-    return np.asarray(fits >= RULE.least_fit(best, share))
+    return [np.asarray(fits >= RULE.least_fit(best, share)) for share in shares]
 
 
 @dataclass(frozen=True)
@@ -298,7 +298,7 @@ class Number:
 
 def count_things(engine: QueryEngine, answer: QueryResult) -> Number:
     """Return the number of single things in an answer, as `separate` tells them apart, and its range."""
-    least, most = (within_reach(engine, answer, share) for share in (STRICT, WIDE))
+    least, most = within_reach(engine, answer, STRICT, WIDE)
     low, own, high = (
         len(separate(engine.surface, inside[engine.surface.rows], engine.tree))
         for inside in (least & answer.members, answer.members, most | answer.members)

@@ -47,7 +47,7 @@ from langsplat_core.scene.surface import Surface, build_surface, build_tree, sur
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, kept_calibration, same_vectors
 from langsplat_core.semantics.relevancy import FEWEST, Scale, TextEncoder, everyday_vectors, relevancy_of
 
-BATCH = 256  # phrases that are encoded at a time
+BATCH = 512  # phrases that are encoded at a time
 NO_FIELD = "this scene has no language field: it can be looked at, not searched; `langsplat train` makes one"
 
 LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
@@ -177,7 +177,7 @@ class QueryEngine:
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """Return the things among the members of an answer, best first, or only so many of them."""
         relevancy, whole = result.relevancy[result.level], len(LEVELS) - 1
-        told = self.tree.voted(whole), result.level == whole
+        told = self.tree.voted_wholes, result.level == whole
         return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most, *told)
 
     # What answers stand on: each is computed when first needed.

@@ -352,10 +352,8 @@ def _of_it(unwanted: Phrase, wanted: Phrase) -> Phrase:
 
 def _exclusion_at(tokens: list[str], at: int) -> int:
     """Return number of tokens of the exclusion that begins at token `at`; 0 for none."""
-    for words in _EXCLUSIONS:
-        if tuple(token.lower() for token in tokens[at : at + len(words)]) == words:
-            return len(words)
-    return 0
+    ahead = tuple(token.lower() for token in tokens[at : at + 3])
+    return next((len(words) for words in _EXCLUSIONS if ahead[: len(words)] == words), 0)
 
 
 def _alternatives(tokens: list[str]) -> Phrase:

@@ -1,7 +1,7 @@
 """Instances of an answer: its Gaussians, taken apart where the surface is, with boxes and scores."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -59,6 +59,11 @@ def oriented_box(points: Array) -> OrientedBox:
     signs = np.sign(axes[np.abs(axes).argmax(0), range(3)])
     signs[2] = signs[0] * signs[1] * np.sign(np.linalg.det(axes))
     return OrientedBox(centre, axes * signs, (high - low) / 2)
+
+
+@lru_cache(512)  # of many phrases, the same things answer; at most 25 MB
+def _oriented_box(points: bytes) -> OrientedBox:
+    return oriented_box(np.frombuffer(points).reshape(-1, 3))
 
 
 def _turned(columns: Array, axes: Array) -> Array:
@@ -119,7 +124,7 @@ class Instance:
     @cached_property
     def oriented(self) -> OrientedBox:
         """Box along its own axes, between the same quantiles."""
-        return oriented_box(self.points)
+        return _oriented_box(self.points.tobytes())
 
     @property
     def size(self) -> Array:

@@ -273,23 +273,34 @@ def _box_means(
     """
     y0, y1, x0, x1 = box
     before, after = window // 2, window - 1 - window // 2
-    means, sums = np.empty((y1 - y0, x1 - x0)), np.zeros(part.shape[1])
+    means, sums, scale = np.empty((y1 - y0, x1 - x0)), np.zeros(part.shape[1]), 1 / window**2
+    running = np.zeros(x1 - x0 + window)
     for y in range(y0, y1):
         if y == y0:
             for other in range(y - before, y + after + 1):
                 sums += part[min(max(other, 0), size[0] - 1) - top]
         else:
-            new, old = min(y + after, size[0] - 1) - top, max(y - before - 1, 0) - top
+            new, old = part[min(y + after, size[0] - 1) - top], part[max(y - before - 1, 0) - top]
             for x in range(len(sums)):
-                sums[x] += np.float64(part[new, x]) - np.float64(part[old, x])
-        total = 0.0
-        for other in range(x0 - before, x0 + after):
-            total += sums[min(max(other, 0), size[1] - 1) - left]
-        for x in range(x0, x1):
-            total += sums[min(x + after, size[1] - 1) - left]
-            means[y - y0, x - x0] = total / (window * window)
-            total -= sums[max(x - before, 0) - left]
+                sums[x] += np.float64(new[x]) - np.float64(old[x])
+        for n in range(1, len(running)):
+            column = min(max(x0 - before + n - 1, 0), size[1] - 1)
+            running[n] = running[n - 1] + sums[column - left]
+        for x in range(x1 - x0):
+            means[y - y0, x] = (running[x + window] - running[x]) * scale
     return means
+
+
+@partial(kernel, fastmath={"nnan", "nsz", "reassoc"})
+def _highest_of_rows(means: Array) -> Array:
+    """(H, W) -> (H,); a loop of its own, which runs in lanes."""
+    highest = np.empty(len(means))
+    for y in range(len(means)):
+        top = means[y, 0]
+        for x in range(means.shape[1]):
+            top = means[y, x] if means[y, x] > top else top
+        highest[y] = top
+    return highest
 
 
 @kernel
@@ -298,17 +309,18 @@ def _middle_peak(means: Array) -> tuple[int, int, float]:
 
     Which is higher by its last digits follows from the unit of lengths.
     """
-    least = means.max() - 1e-6
+    highest = _highest_of_rows(means)
+    least = highest.max() - 1e-6
+    high = np.flatnonzero(highest >= least)
     count = rows = columns = 0
-    for y in range(means.shape[0]):
+    for y in high:
         for x in range(means.shape[1]):
             if means[y, x] >= least:
                 count, rows, columns = count + 1, rows + y, columns + x
     nearest, row, column = np.inf, 0, 0
-    for y in range(means.shape[0]):
+    for y in high:
         for x in range(means.shape[1]):
-            if means[y, x] >= least:
-                far = (y - rows / count) ** 2 + (x - columns / count) ** 2
-                if far < nearest:
-                    nearest, row, column = far, y, x
+            far = (y - rows / count) ** 2 + (x - columns / count) ** 2
+            if means[y, x] >= least and far < nearest:
+                nearest, row, column = far, y, x
     return row, column, means[row, column]

@@ -87,7 +87,7 @@ def body(positions: Array, frame: Array) -> Body:
 
 def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[Array]:
     """(M,) bool -> surface numbers of each thing, by the tree's voted wholes, largest first, no specks."""
-    wholes = None if tree is None else tree.voted(WHOLE)
+    wholes = None if tree is None else tree.voted_wholes
     parts = told_apart(surface, np.flatnonzero(inside), wholes, join=True)
     parts.sort(key=len, reverse=True)
     return [part for part in parts if len(part) >= max(FEWEST, SPECK * len(parts[0]))]

@@ -8,7 +8,7 @@ import re
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -124,6 +124,11 @@ class Tree:
         at = self.at(level)
         votes = np.append(self.votes[:, 0] > 0, False)
         return np.where(votes[at], at, np.int32(NO_NODE))
+
+    @cached_property
+    def voted_wholes(self) -> Array:
+        """`voted` at the level of wholes, kept: what divides answers into things."""
+        return self.voted(len(LEVELS) - 1)
 
     def members(self, node: int) -> Array:
         """(N,) bool: the Gaussians of a node, those of its descendants included."""

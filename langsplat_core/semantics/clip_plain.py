@@ -67,6 +67,8 @@ def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int])
 class PlainClipText:
     """A `TextTower` in NumPy."""
 
+    batch = 512  # the threads of a product of matrices wait for each other, which takes longer than it does
+
     def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: "PairTokenizer") -> None:
         self.id = id
         self.temperature, self.dim = TEMPERATURE, config.projection_dim

@@ -21,6 +21,7 @@ from langsplat_core.query.answers import (
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
+from langsplat_core.query.lookup import Relevancy
 from langsplat_core.query.rule import (
     RULE,
     Bar,
@@ -72,8 +73,14 @@ def asked(
         return by_peak(phrase, relevancy, surface, scale, field.found, level)
     regions, calibration = regions_of(Scene(gaussians, field), surface), field.calibration
     by_chance = bars_of(regions.table, chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
-    fits = own_fits(regions, scale, relevancy), None
-    return by_regions(phrase, relevancy, fits, gaussians.means, regions, by_chance, calibration, level)
+    fits, judged = (own_fits(regions, scale, relevancy), None), (by_chance, calibration, level)
+    return by_regions(phrase, each_alone(relevancy), fits, gaussians.means, regions, *judged)
+
+
+def each_alone(relevancy) -> Relevancy:
+    """(3, N) relevancy, every number as a feature of its own."""
+    values = np.append(relevancy, 0).astype(np.float32)
+    return Relevancy(values, np.arange(values.size - 1).reshape(np.shape(relevancy)))
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -322,8 +329,8 @@ def answer_of(
     surface: Surface, relevancy, regions: Regions, level="auto", named: Named = "thing"
 ) -> QueryResult:
     means = np.random.default_rng(1).normal(size=(len(surface.anchors), 3))
-    fits = own_fits(regions, SCALE, relevancy), None
-    return by_regions(PHRASES[named], relevancy, fits, means, regions, BARS, None, level)
+    fits = own_fits(regions, SCALE, np.asarray(relevancy)), None
+    return by_regions(PHRASES[named], each_alone(relevancy), fits, means, regions, BARS, None, level)
 
 
 def plain_extent(fits, sizes, level: str, named: Named) -> tuple[int, list[bool]]:

@@ -354,7 +354,7 @@ def test_every_lookup_finds_the_relevancy_of_its_latents(kind, temperature, exac
     field.confidence[1, 5:20] = 0
     scale = scale_of(field, chance)
     phrase = unit(np.random.default_rng(3).normal(size=field.codec.vector_dim)).astype(np.float32)
-    got = next(Lookup(field if exact else through_cells(field), scale).relevancies(phrase[None]))
+    got = next(Lookup(field if exact else through_cells(field), scale).relevancies(phrase[None]))()
     vectors = field.codec.decode(field.latents.reshape(-1, field.latents.shape[2]))
     known = field.known.reshape(-1)
     want = [plain_relevancy(v, phrase, scale) if k else 0 for v, k in zip(vectors, known, strict=True)]
@@ -368,7 +368,7 @@ def test_codeword_zero_is_a_feature():
     field.confidence[:] = 1
     field.confidence[2, 4] = 0
     lookup = Lookup(field, scale_of(field, chance=False))
-    values = next(lookup.relevancies(field.codec.vectors[:1]))
+    values = next(lookup.relevancies(field.codec.vectors[:1]))()
     assert values[2, 4] == 0
     assert (np.delete(values[2], 4) > 0.5).all()
 
