@@ -129,16 +129,16 @@ class Regions:
 
     def mixtures(self, features: Array, count: int) -> csr_matrix:
         """(3, N) numbers of features -> (R, `count`) float64 shares of each in the regions of all levels."""
-        counts = self.counts
-        return vstack(
-            [
-                csr_matrix((self.weights[counts] / total[of], (of, own)), (len(total), count))
-                for of, own, total in zip(
-                    self.everywhere[:, counts], features[:, counts], self.totals, strict=True
-                )
-            ],
-            format="csr",
-        )
+        counts, parts = self.counts, []
+        weights = self.weights[counts].astype(np.float64)
+        for of, own, total in zip(self.everywhere[:, counts], features[:, counts], self.totals, strict=True):
+            shape = len(total), count
+            if len(total) * count < 8 * len(counts):  # much faster, where the table is small
+                table = np.bincount(of * np.int64(count) + own, weights, len(total) * count).reshape(shape)
+                parts.append(csr_matrix(table / total[:, None]))
+            else:
+                parts.append(csr_matrix((weights / total[of], (of, own)), shape))
+        return vstack(parts, format="csr")
 
     def spread(self, level: int, values: Array, others: Array) -> Array:
         """Return the (N,) of the (R,) `values` of a level's regions; in none, its own of `others` (N,)."""

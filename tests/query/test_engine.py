@@ -5,6 +5,7 @@ import math
 import multiprocessing
 import threading
 import time
+import tracemalloc
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
@@ -12,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
@@ -19,6 +21,7 @@ from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import (
     Lookup,
+    PeakPixels,
     decoded_relevancy,
     peak_pixel,
     sphere_cells,
@@ -27,7 +30,7 @@ from langsplat_core.query.lookup import (
 )
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.raster.render import render
+from langsplat_core.raster.render import render, view_of
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     AutoencoderCodec,
@@ -122,6 +125,62 @@ def test_peak_pixel_accepts_any_window(shape):
     column, row, _ = peak_pixel(image, 20)
     assert 0 <= column < shape[1]
     assert 0 <= row < shape[0]
+
+
+def plain_peak(image, window: int) -> tuple[int, int, float]:
+    """Peak column, row and value of a (H, W) map, by SciPy's filter in float64."""
+    smooth = uniform_filter(np.asarray(image, np.float64), min(window, *image.shape), mode="nearest")
+    tied = np.argwhere(smooth >= smooth.max() - 1e-6)
+    row, column = tied[np.square(tied - tied.mean(0)).sum(1).argmin()]
+    return column, row, smooth[row, column]
+
+
+@pytest.mark.parametrize("shape", [(1, 9), (33, 47), (48, 16)])
+@pytest.mark.parametrize("window", [1, 5, 20, 90])
+def test_peak_pixel_equals_the_plain_filter(shape, window):
+    for seed in range(12):
+        image = np.random.default_rng(seed).random(shape).astype(np.float32).round(seed % 3)
+        got, want = peak_pixel(image, window), plain_peak(image, window)
+        assert got[:2] == want[:2]
+        assert got[2] == pytest.approx(want[2], abs=1e-9)
+
+
+@pytest.mark.parametrize("size", [(97, 61), (64, 48)])
+def test_peaks_by_shares_equal_those_of_images(size):
+    """Of values all over, a few high ones, one alone, ties, and none."""
+    rng = np.random.default_rng(4)
+    scene, camera = Scene(random_gaussians(400)), random_camera(3, *size)
+    view = view_of(scene, camera)
+    sets = rng.integers(0, 40, len(scene.gaussians)).astype(np.int32)
+    values = rng.random((25, 40)).astype(np.float32)
+    values[5:10] *= values[5:10] > 0.9
+    values[10:15] = np.eye(40)[rng.integers(0, 40, 5)]
+    values[15:20] = values[15:20].round()
+    values[20:] = np.array([0, 1, 0.5, 0, 1])[:, None]
+    shares = view.label_shares(sets, 0.3, 10**6)
+    for own, (column, row, score) in zip(values, PeakPixels(shares, camera, 9).of(values), strict=True):
+        wanted = plain_peak(splatted_relevancy(view, own[sets][:, None], 0.3)[..., 0], 9)
+        assert score == pytest.approx(wanted[2], abs=1e-5)
+        assert (column, row) == wanted[:2]
+    assert view.label_shares(sets, 0.3, len(shares.labels) - 1) is None
+
+
+def test_many_answers_take_no_memory_per_gaussian():
+    field = random_field(30_000, "codebook")
+    vectors = unit(np.random.default_rng(8).normal(size=(60, field.codec.vector_dim))).astype(np.float32)
+    book = {f"phrase {number}": vector for number, vector in enumerate(vectors)}
+    asked = LanguageField(field.latents, field.confidence, field.codec, field.canonical, "none", book)
+    engine = QueryEngine(Scene(random_gaussians(30_000), replace(asked, everyday=field.everyday)))
+    engine.run_many([*book])  # what depends on the scene, and the places of regions
+    tracemalloc.start()
+    many = engine.run_many([*book])
+    taken = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert engine.rule == "regions"
+    assert taken < 60 * 30_000
+    at = np.arange(0, 30_000, 7)
+    np.testing.assert_array_equal(many[7].spread.at(at), many[7].even[at])
+    assert many[7].members.shape == (30_000,)
 
 
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])

@@ -67,8 +67,10 @@ def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
             composed = run_phrase(engine, phrase, level, viewpoint, progress)
         except UnknownWordError as error:
             return QueryAnswer(problem=str(error), meant=corrected(phrase, error.near) or "")
+        # A copy has its arrays: they are made here, and not by the thread that draws.
+        found = replace(composed.answer)
         reading = "" if isinstance(composed.tree, Atom) else composed.reading
-        return QueryAnswer(composed.answer, (), reading, heads(composed.tree))
+        return QueryAnswer(found, (), reading, heads(composed.tree))
 
     def done(found: QueryAnswer) -> None:
         if phrase not in state.answers:  # it was taken off meanwhile
