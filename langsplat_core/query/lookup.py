@@ -311,7 +311,7 @@ def _middle_peak(means: Array) -> tuple[int, int, float]:
     """
     highest = _highest_of_rows(means)
     least = highest.max() - 1e-6
-    high = np.flatnonzero(highest >= least)
+    high = [y for y in range(len(means)) if highest[y] >= least]
     count = rows = columns = 0
     for y in high:
         for x in range(means.shape[1]):
