@@ -191,7 +191,10 @@ def test_query_why_draws_a_sheet(trained, capsys):
         yellow, blue = ((np.asarray(sheet) == colour).all(-1) for colour in ((255, 210, 0), (0, 200, 255)))
     assert yellow.sum() > 1000
     assert blue.sum() > 200  # of the merged one and the blank one, whose masks lie elsewhere
-    assert run("query", "a.ply", "mug", "--why", "out.png") == 0
+    (trained / "a.work").rename(trained / "w")
+    (trained / "photographs").rename(trained / "p")
+    assert run("query", "a.ply", "mug", "--why", "new.png", "--work", "w", "--photographs", "p") == 0
+    assert (trained / "new.png").exists()
     said = capsys.readouterr().out
     assert "5 of 7 photographs" in said
     assert f"worst photo_{WRONG}" in said
@@ -214,13 +217,6 @@ def test_missing_masks_are_one_line(trained, capsys, spoil):
     said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning")]
     assert names in said[-1]
     assert not (trained / out).exists()
-
-
-def test_evidence_reads_masks_and_photographs_elsewhere(trained, capsys):
-    (trained / "a.work").rename(trained / "w")
-    (trained / "photographs").rename(trained / "p")
-    assert run("query", "a.ply", "mug", "--why", "out.png", "--work", "w", "--photographs", "p") == 0
-    assert (trained / "out.png").exists()
 
 
 @pytest.mark.long
