@@ -280,7 +280,11 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
     ),
     "Window": (
         Command("hide or show the panels", settings.toggle_panels, ("F11",)),
-        Command("reset the layout", settings.reset_layout, apart=True),
+        Command(
+            "reset the layout",
+            lambda v: settings.put(v.state, show_panel=True, resets_panels=True),
+            apart=True,
+        ),
         Command(
             "light theme, or dark again",
             settings.toggle_theme,

@@ -382,7 +382,7 @@ def test_a_film_can_be_stopped(opened, tmp_path, frames):
     record_three(opened)
     settings.put(opened.state.record, size=(320, 240))
     saving.save_film(opened, tmp_path)
-    saving.cancel_film(opened)
+    opened.recorder.cancel()
     recorded(opened)
     opened.recorder.close(10.0)
     assert len(list(tmp_path.glob("blobs-film-001/*.png"))) < 121

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -261,16 +262,6 @@ def ask_for(viewer: Viewer, choice: FileChoice) -> None:
     browse(viewer, (Path.cwd() if path is None else path.parent).absolute())
 
 
-def ask_for_file(viewer: Viewer) -> None:
-    """Open the browser to choose what is opened."""
-    ask_for(viewer, FileChoice("Open a scene", open_file))
-
-
-def ask_for_beside(viewer: Viewer) -> None:
-    """Open the browser to choose a scene to show beside this one."""
-    ask_for(viewer, FileChoice("Scene to compare with", open_beside))
-
-
 def browse(viewer: Viewer, folder: Path) -> None:
     """Show a folder in the browser."""
     viewer.state.browser = disk.list_folder(folder)
@@ -396,11 +387,6 @@ def _restore(viewer: Viewer, project: Project, path: Path) -> None:
 # Training a scene from photographs, in a process of its own.
 
 WARNING = "warning: "  # before each warning that `langsplat train` ends with
-
-
-def ask_for_dataset(viewer: Viewer) -> None:
-    """Open the browser to choose the photographs to train on."""
-    ask_for(viewer, FileChoice("Photographs to train on", choose_photographs, is_folder=True))
 
 
 def choose_photographs(viewer: Viewer, folder: Path) -> None:
@@ -561,3 +547,10 @@ def _mirrored(state: ViewerState, other: ViewerState) -> Session:
         clip=first.clip,
         queries=tuple(replace(query, slot=None) if hidden(query) else query for query in answered),
     )
+
+
+# What the browser is opened for.
+
+ask_for_file = partial(ask_for, choice=FileChoice("Open a scene", open_file))
+ask_for_beside = partial(ask_for, choice=FileChoice("Scene to compare with", open_beside))
+ask_for_dataset = partial(ask_for, choice=FileChoice("Photographs to train on", choose_photographs, True))

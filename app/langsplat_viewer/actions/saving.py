@@ -73,6 +73,15 @@ def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
     return viewer.save(path, write)
 
 
+def _record(viewer: Viewer, label: str, work: Callable[[Progress], tuple[Path, str]]) -> None:
+    """Have the recorder's thread write a file; `work` returns it with what is said of it."""
+
+    def done(written: tuple[Path, str]) -> None:
+        viewer.state.say(written[1], file=written[0])
+
+    viewer.recorder.submit(label, work, done, viewer.say_error)
+
+
 def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
     """Have the scene as shown drawn by the CPU in the size of a film, and saved to a new file."""
     state, (width, height) = viewer.state, viewer.state.record.size
@@ -81,17 +90,14 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
         return
     request = state.request((width, height), state.session.picture.transparent)
 
-    def work(progress: Progress) -> Path:
+    def work(progress: Progress) -> tuple[Path, str]:
         path = _new_file(viewer, folder, ".png", f"-{width}x{height}")
         progress("drawing", 0.0, path.name)
         with output.in_one_line(path, f"{width}x{height}"), open_renderer("cpu") as renderer:
             output.save_png(path, output.draw_something(request, renderer))
-        return path
+        return path, f"saved {path}"
 
-    def done(path: Path) -> None:
-        state.say(f"saved {path}", file=path)
-
-    viewer.recorder.submit(f"picture of {width} x {height}", work, done, viewer.say_error)
+    _record(viewer, f"picture of {width} x {height}", work)
 
 
 def save_page(viewer: Viewer, folder: Path = Path()) -> None:
@@ -100,18 +106,15 @@ def save_page(viewer: Viewer, folder: Path = Path()) -> None:
     if not has_scene(viewer) or state.scene is None:
         return
     scene, kept = replace(state.scene, language=viewer.language), state.marks.kept
-    path = _new_file(viewer, folder, ".html")
 
-    def work(progress: Progress) -> str:
+    def work(progress: Progress) -> tuple[Path, str]:
+        path = _new_file(viewer, folder, ".html")
         left = scene if kept.all() else scene.take(np.flatnonzero(kept))
         engine = viewer.services.engine(left) if left.language is not None else None
         report = write_page(path, left, engine, path.stem, progress)
-        return f"saved {path}: {report.bytes / 1e6:.1f} MB, opens in any browser"
+        return path, f"saved {path}: {report.bytes / 1e6:.1f} MB, opens in any browser"
 
-    def done(text: str) -> None:
-        state.say(text, file=path)
-
-    viewer.recorder.submit(f"web page {path.name}", work, done, viewer.say_error)
+    _record(viewer, "web page", work)
 
 
 def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
@@ -162,20 +165,11 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
         viewer.say_error(f"no film: {error}")
         return
 
-    def work(progress: Progress) -> str:
+    def work(progress: Progress) -> tuple[Path, str]:
         say_compiling(progress)
-        return "; ".join(output.make_film(shot, out, progress))
+        return out, "; ".join(output.make_film(shot, out, progress))
 
-    def done(text: str) -> None:
-        state.say(text, file=out)
-
-    viewer.recorder.submit(f"film {out.name}", work, done, viewer.say_error)
-
-
-def cancel_film(viewer: Viewer) -> None:
-    """Stop what is being drawn."""
-    viewer.recorder.cancel()
-    viewer.state.say("film stopped")
+    _record(viewer, f"film {out.name}", work)
 
 
 # The selection, the rest, or the scene without what was deleted.

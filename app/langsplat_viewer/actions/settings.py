@@ -203,11 +203,6 @@ toggle_panels, toggle_help = _switch("show_panel"), _switch("show_help")
 toggle_start = _switch("show_start")
 
 
-def reset_layout(viewer: Viewer) -> None:
-    """Put the panels where they are at first."""
-    viewer.state.show_panel = viewer.state.resets_panels = True
-
-
 def toggle_palette(viewer: Viewer) -> None:
     """Show or close the list of everything that can be done."""
     viewer.state.show_palette = not viewer.state.show_palette

@@ -76,57 +76,37 @@ class StartPage:
             if number % columns:
                 imgui.same_line()
             imgui.push_id(number)
-            if _card(path, None if image is None else picture.texture(image)):
+            if _card(path, None if image is None else picture.texture(image), card):
                 opening.open_file(viewer, path)
             imgui.pop_id()
-        _drop_target(viewer, width)
+        imgui.dummy(ImVec2(0, hello_imgui.em_size(0.4)))
+        opened = viewer.state.opening
+        text = "Drop a scene, a project or a folder of photographs here"
+        imgui.begin_disabled()  # it takes no click; files are taken all over the window
+        imgui.button(
+            f"Opening {opened.name} ..." if opened else text, ImVec2(width, hello_imgui.em_size(DROP_EM))
+        )
+        imgui.end_disabled()
         imgui.end()
 
 
-def _card(path: Path, texture: moderngl.Texture | None) -> bool:
-    """Draw a card of a file, its image over its name; return whether it was clicked."""
-    width, height = hello_imgui.em_size(CARD_EM), hello_imgui.em_size(PICTURE_EM)
-    line, edge, paint = (
-        imgui.get_text_line_height(),
-        imgui.get_style().frame_padding.x,
-        imgui.get_window_draw_list(),
-    )
-    clicked = imgui.button("##card", ImVec2(width, height + 2.4 * line + 2 * edge))
-    ui.tip("The scene that comes with the program" if path == BUNDLED else str(path))
-    corner = imgui.get_item_rect_min()
-    x, y = corner.x + edge, corner.y + edge
-    end, round_ = ImVec2(corner.x + width - edge, y + height), imgui.get_style().frame_rounding
-    if texture is not None:
-        paint.add_image_rounded(
-            imgui.ImTextureRef(texture.glo), ImVec2(x, y), end, ImVec2(0, 0), ImVec2(1, 1), 0xFFFFFFFF, round_
-        )
+def _card(path: Path, texture: moderngl.Texture | None, width: float) -> bool:
+    """Draw the card of a file, its image over its name; return whether it was clicked."""
+    height, name, where = hello_imgui.em_size(PICTURE_EM), path.name, str(path.parent)
+    if path == BUNDLED:
+        name, where = "A room to try", "comes with the program"
+    imgui.begin_group()
+    if texture is None:
+        clicked = imgui.button(f"{icons_fontawesome_6.ICON_FA_CUBES}###card", ImVec2(width, height))
     else:
-        paint.add_rect_filled(ImVec2(x, y), end, imgui.get_color_u32(imgui.Col_.frame_bg), round_)
-        middle = ImVec2((x + end.x - line) / 2, (y + end.y - line) / 2)
-        paint.add_text(middle, imgui.get_color_u32(ui.muted()), icons_fontawesome_6.ICON_FA_CUBES)
-    name, where = ("A room to try", "bundled") if path == BUNDLED else (path.name, str(path.parent))
-    y += height + 0.3 * line
-    for text, colour in ((name, imgui.get_style_color_vec4(imgui.Col_.text)), (where, ui.muted())):
-        paint.add_text(ImVec2(x, y), imgui.get_color_u32(colour), ui.elided(text, width - 2 * edge))
-        y += line
+        edge = imgui.get_style().frame_padding
+        inside = ImVec2(width - 2 * edge.x, height - 2 * edge.y)
+        clicked = imgui.image_button("###card", imgui.ImTextureRef(texture.glo), inside)
+    ui.tip(str(path))
+    imgui.text_unformatted(ui.elided(name, width))
+    imgui.text_colored(ui.muted(), ui.elided(where, width))
+    imgui.end_group()
     return bool(clicked)
-
-
-def _drop_target(viewer: Viewer, width: float) -> None:
-    """Draw where files are dropped, which is everywhere, or what is being opened."""
-    imgui.dummy(ImVec2(0, hello_imgui.em_size(0.5)))
-    corner, size = imgui.get_cursor_screen_pos(), ImVec2(width, hello_imgui.em_size(DROP_EM))
-    imgui.dummy(size)
-    end, paint = ImVec2(corner.x + size.x, corner.y + size.y), imgui.get_window_draw_list()
-    paint.add_rect(corner, end, imgui.get_color_u32(imgui.Col_.text_disabled), 8.0, 1.5)
-    opened = viewer.state.opening
-    text = "Drop a scene, a project or a folder of photographs here"
-    text = f"Opening {opened.name} ..." if opened else text
-    text = ui.elided(text, width)
-    middle = ImVec2(
-        corner.x + (size.x - ui.width_of(text)) / 2, corner.y + (size.y - imgui.get_text_line_height()) / 2
-    )
-    paint.add_text(middle, imgui.get_color_u32(ui.muted()), text)
 
 
 # Toasts: what was said last, for a while.

@@ -236,6 +236,7 @@ def draw_messages(viewer: Viewer) -> None:
     """Draw progress, messages (the latest first), and backend, time and size of the last image."""
     if viewer.worker.current is not None and ui.stoppable(*viewer.worker.current):
         opening.cancel(viewer)
+    ui.recorder_bar(viewer)
     line, stats = imgui.get_text_line_height_with_spacing(), viewer.state.stats
     height = max(imgui.get_content_region_avail().y - line, 2 * line)  # however low the panel is
     if imgui.begin_child("messages", ImVec2(0, height)):

@@ -22,16 +22,8 @@ from langsplat_viewer.state import Gizmo
 from langsplat_viewer.viewer import Viewer
 
 OF_SELECTED = (
-    "None",
-    "Grow",
-    "Shrink",
-    "More like it",
-    "Hide",
-    "Isolate",
-    "Delete",
-    "Selection",
-    "Rest",
-    "Points",
+    *("None", "Grow", "Shrink", "More like it", "Hide", "Isolate", "Delete"),
+    *("Selection", "Rest", "Points"),
 )
 
 

@@ -146,6 +146,15 @@ def stoppable(label: str, fraction: float, tag: str = "") -> bool:
     return bool(imgui.button(f"Cancel##{tag}" if tag else "Cancel"))
 
 
+def recorder_bar(viewer: Viewer) -> bool:
+    """Draw how far the film, picture or page is that is written, with its Cancel; return whether one is."""
+    work = viewer.recorder.current
+    if work is not None and stoppable(*work, tag="recorder"):
+        viewer.recorder.cancel()
+        viewer.state.say("stopped: nothing was written")
+    return work is not None
+
+
 def width_of(text: str) -> float:
     """Return the width of a text, window units."""
     return float(imgui.calc_text_size(text).x)

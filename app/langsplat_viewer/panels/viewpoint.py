@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from imgui_bundle import hello_imgui, imgui
 
 from langsplat_core.scene import Camera
-from langsplat_viewer.actions import saving, settings, viewpoint
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, with_fov
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.commands import with_key
@@ -184,12 +184,8 @@ def _films(viewer: Viewer) -> None:
     hint = "film.mp4, .webp, .gif or a folder; empty: a new name"
     _, typed = imgui.input_text_with_hint("##film", hint, record.film_file)
     settings.put(record, film_file=typed)
-    work = viewer.recorder.current
-    if work is not None:
-        if ui.stoppable(*work, tag="film"):
-            saving.cancel_film(viewer)
-        return
-    ui.verbs(viewer, "Save film", "Picture of this size")
+    if not ui.recorder_bar(viewer):
+        ui.verbs(viewer, "Save film", "Picture of this size")
 
 
 # The panel "Bookmarks".
