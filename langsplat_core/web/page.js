@@ -31,7 +31,15 @@ const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((corner) => {
 
 class Page {
   constructor(meta, tensors) {
-    Object.assign(this, { meta, level: "auto", display: "rgb", answer: null, share: 1, moving: false, shown: [] });
+    Object.assign(this, {
+      meta,
+      level: "auto",
+      display: "rgb",
+      answer: null,
+      share: 1,
+      moving: false,
+      shown: [],
+    });
     this.painter = new Painter(byId("scene"), meta, tensors);
     this.painter.onorder = () => this.redraw();
     this.language = meta.language && new Language(meta.language, tensors);
