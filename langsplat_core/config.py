@@ -386,7 +386,8 @@ def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
 
 
 Display = Literal["rgb", "latent", "tree", "relevancy", "segmentation", "depth", "alpha"]
-ColourMap = Literal["turbo", "viridis", "cividis", "magma", "grey"]
+ColourMap = Literal["inferno", "viridis", "turbo", "amber", "cividis", "magma", "grey"]
+HeatOf = Literal["smooth", "own", "node", "everywhere"]
 LevelChoice = Literal["auto", "subpart", "part", "whole"]
 
 
@@ -395,9 +396,12 @@ class PictureConfig:
     """Settings for composing an image of channels, on a graphics device and on the CPU alike."""
 
     display: Display = "rgb"
-    heat_opacity: Share = 0.85  # of the heat map over the colours where relevancy is high
-    colour_map: ColourMap = "turbo"  # of relevancy and depth; viridis and cividis suit the colour-blind
-    dim: Share = 0.6  # colours are multiplied by this where a query finds nothing
+    # of an answer: each Gaussian's own relevancy, the same smoothed, or the mean of its node in the tree;
+    # or its own, in the answer or not
+    heat: HeatOf = "smooth"
+    heat_opacity: Share = 0.85  # of the heat map over the colours
+    colour_map: ColourMap = "inferno"  # of relevancy and depth; all but turbo suit the colour-blind
+    dim: Share = 0.7  # colours are multiplied by this where a query finds nothing
     own_colours: bool = False  # heat in the colour of each query instead of the colour map
     threshold: Share = 0.5  # of a pixel's light from an answer's Gaussians from which it is segmented
     alpha_gate: Share = 0.3  # pixels with less alpha carry no relevancy

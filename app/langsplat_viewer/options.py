@@ -12,6 +12,7 @@ import tyro
 from langsplat_core.config import (
     ColourMap,
     Display,
+    HeatOf,
     LevelChoice,
     NotNegative,
     PictureConfig,
@@ -60,6 +61,8 @@ class ViewerOptions:
     """Without a window: depth beyond which nothing is drawn, world units (default: everything is)."""
     heat_scale: Annotated[tuple[Share, Share] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
     """Relevancies at the ends of the heat map, the same in every image (default: each answer's own)."""
+    heat: HeatOf = PictureConfig.heat
+    """Relevancy in a heat map of an answer: smoothed, each Gaussian's own, its node's; or of everything."""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = ""
     """Size of the window or image in pixels."""
     camera: Annotated[str, tyro.conf.arg(metavar="FILE|INDEX")] = ""
@@ -85,7 +88,7 @@ class ViewerOptions:
     fps: PicturesPerSecond = 30.0
     """Images per second of a film."""
     colour_map: ColourMap | None = None
-    """Colours of relevancy and depth in an image of --headless (default: turbo)."""
+    """Colours of relevancy and depth in an image of --headless (default: inferno)."""
     transparent: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Draw the image of --headless without a background, transparent where the scene is not."""
 
@@ -109,6 +112,7 @@ class ViewerOptions:
             raise InputError(f"--heat-scale {scale[0]:g} {scale[1]:g}: the second must be the larger")
         return PictureConfig(
             display=self.shown_display,
+            heat=self.heat,
             heat_scale=scale,
             colour_map=self.colour_map or PictureConfig.colour_map,
             transparent=self.transparent,

@@ -7,7 +7,7 @@ that is named with it.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -196,6 +196,7 @@ class Session:
     queries: Annotated[tuple[Query, ...], Meta(max_length=200)] = ()  # in the order of asking
     chosen: str = ""  # the phrase whose details are shown
     level: LevelChoice = "auto"
+    adds: bool = False  # a new answer is shown beside those that are, not in their place
 
     # what was selected, edited, named and noted
     marks: Marked = field(default_factory=Marked)
@@ -251,9 +252,14 @@ class Session:
             phrase, slot=slot, shown_since=1 + max((q.shown_since for q in shown), default=0)
         )
 
-    def answering(self, phrase: str, painted: bool) -> "Session":
-        """Return the session with a display of answers, and a query shown where something is painted."""
-        session = self.showing(phrase) if painted else self
+    def answering(self, phrase: str, painted: bool, beside: Collection[str]) -> "Session":
+        """Return the session with a display of answers, and a query shown where something is painted.
+
+        What was shown before goes, unless it `adds`; `beside`: the phrases that were asked together.
+        """
+        kept = (q if self.adds or q.phrase in beside else replace(q, slot=None) for q in self.queries)
+        session = replace(self, queries=tuple(kept))
+        session = session.showing(phrase) if painted else session
         if DISPLAYS[self.picture.display].needs_query:
             return session
         return replace(session, picture=replace(self.picture, display="relevancy"))
@@ -279,7 +285,7 @@ class Session:
         return replace(self, **kept, marks=Marked(), moves=())
 
 
-OF_WINDOW = ("picture", "latent_level", "split", "splats", "overlays", "level")  # not of a scene
+OF_WINDOW = ("picture", "latent_level", "split", "splats", "overlays", "level", "adds")  # not of a scene
 
 
 # Preferences, kept in the platform's folder for settings.
@@ -296,7 +302,7 @@ class Preferences:
     ui_scale: Annotated[float, Meta(ge=SCALES[0], le=SCALES[1])] = 1.0  # of letters and widgets
     recent: tuple[str, ...] = ()  # scenes that were opened, the latest first
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
-    colour_map: ColourMap = "turbo"  # that a session begins with
+    colour_map: ColourMap = PictureConfig.colour_map  # that a session begins with
     overlays: tuple[str, ...] = ()  # that a session begins with
     fly_speed: Annotated[float, widget("Camera", "Fly speed", "Scene radii per second", 0.05, 4)] = 0.5
     coarse_while_moving: Annotated[

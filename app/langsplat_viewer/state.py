@@ -69,6 +69,8 @@ class QueryAnswer:
     problem: str = ""  # why it has no result, one line
     meant: str = ""  # the phrase with its unknown words replaced by known ones, where there are such
     pending: bool = False
+    has_evidence: bool = False  # training kept what it stands on
+    like: QueryResult | None = None  # of a name that finds what was given it: all that is like that
     _cuts: dict[float, QueryResult] = field(default_factory=dict)  # the last one that was wanted
 
     def at(self, cut: float | None) -> QueryResult | None:
@@ -214,6 +216,9 @@ class SceneState:
     opened: Scene | None = None  # the scene as its file has it, once something was transformed
     marks: Marks = field(default_factory=lambda: unmarked(0))
     answers: dict[str, QueryAnswer] = field(default_factory=dict)  # by phrase
+    named: dict[str, Array] = field(
+        default_factory=dict
+    )  # (N,) bool of what was given a name here, by its key
 
     view: OrbitCamera | None = None
     glide: Glide | None = None

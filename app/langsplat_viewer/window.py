@@ -271,8 +271,7 @@ class Window:
         return self._second.textures[:1]
 
     def _ask(self, viewer: Viewer) -> None:
-        for phrase in self._options.query:
-            queries.ask(viewer, phrase)
+        queries.ask(viewer, "; ".join(self._options.query))
 
     def _first_view(self, viewer: Viewer) -> None:
         """Do what else the command line asks for, once its scene is open."""
@@ -288,7 +287,9 @@ class Window:
         if span is not None:
             viewpoint.move(viewer, lambda view: spanning(view, span))
         wanted = options.picture
-        settings.set_picture(viewer, replace(state.session.picture, heat_scale=wanted.heat_scale))
+        settings.set_picture(
+            viewer, replace(state.session.picture, heat=wanted.heat, heat_scale=wanted.heat_scale)
+        )
         if options.path is not None:
             viewpoint.load_path(viewer, options.path)
         queries.set_level(viewer, options.level)

@@ -1,10 +1,12 @@
 // From channels to an image; composing.py beside it does the same on the CPU and a test compares the two.
-// Channels are premultiplied by alpha, row 0 is the top row. HEAT_FADE, HEAT_LIGHTNESS, SEGMENT_OPACITY, LEAST_ALPHA,
-// MAX_QUERIES, MAP_NODES and SHOWN, all drawings as one expression, are defined from displays.py.
+// Channels are premultiplied by alpha, row 0 is the top row. What is written in capitals, with SHOWN, all drawings as
+// one expression, is defined from displays.py.
 
 uniform sampler2D colours;      // rgb, alpha
 uniform sampler2D extra;        // latent colours, alpha; one query per channel (0: none), alpha; or
                                 // sum of weight * camera z, alpha
+uniform sampler2D selection;    // 1 for what is selected, alpha
+uniform bool has_selection;
 uniform sampler2D colour_maps;  // MAP_NODES x maps
 uniform int colour_map;         // row of the one in use
 uniform vec3 query_colours[MAX_QUERIES];
@@ -58,45 +60,54 @@ vec3 mapped_lab(float t) {
                oklab(texelFetch(colour_maps, ivec2(low + 1, colour_map), 0).rgb), position - float(low));
 }
 
-bool is_hot(ivec2 pixel) {
-    vec4 sums = texelFetch(extra, clamp(pixel, ivec2(0), textureSize(extra, 0) - 1), 0);
-    bool hot = false;
-    for (int j = 0; j < MAX_QUERIES; ++j)
-        hot = hot || (sums[j] / sums.a - ranges[j].x) / (ranges[j].y - ranges[j].x) >= HEAT_EDGE;
-    return sums.a > alpha_gate && hot;
+// 1 for each component of a layer whose mean is at least so much.
+vec3 inside(sampler2D layer, ivec2 pixel, float least) {
+    vec4 sums = texelFetch(layer, clamp(pixel, ivec2(0), textureSize(layer, 0) - 1), 0);
+    return step(least * sums.a, sums.rgb) * float(sums.a > alpha_gate);
 }
 
-// A hot pixel near one that is not.
-bool on_edge(vec2 place) {
+// A pixel inside near one that is not.
+bool on_edge(sampler2D layer, vec2 place, float least) {
+    ivec2 pixel = ivec2(place * vec2(textureSize(layer, 0)));
+    vec3 around = inside(layer, pixel + ivec2(0, EDGE_PX), least) * inside(layer, pixel - ivec2(0, EDGE_PX), least) *
+                  inside(layer, pixel + ivec2(EDGE_PX, 0), least) * inside(layer, pixel - ivec2(EDGE_PX, 0), least);
+    vec3 edges = inside(layer, pixel, least) * (1.0 - around);
+    return max(edges.r, max(edges.g, edges.b)) > 0.0;
+}
+
+// The query that a pixel shows: of those with at least so much one after another, in stripes, else the largest.
+int query_of(vec3 values, vec2 place, float least) {
     ivec2 pixel = ivec2(place * vec2(textureSize(extra, 0)));
-    return is_hot(pixel) && !(is_hot(pixel + ivec2(0, EDGE_PX)) && is_hot(pixel - ivec2(0, EDGE_PX)) &&
-                              is_hot(pixel + ivec2(EDGE_PX, 0)) && is_hot(pixel - ivec2(EDGE_PX, 0)));
-}
-
-vec3 heat_map(vec3 base, vec3 relevancy) {
-    float heat = 0.0;
-    float total = 0.0;
-    vec3 mean = vec3(0.0);
+    int count = 0;
+    int found = 0;
     for (int j = 0; j < MAX_QUERIES; ++j) {
-        vec2 range = ranges[j];
-        float own = clamp((relevancy[j] - range.x) / (range.y - range.x), 0.0, 1.0);
-        heat = max(heat, own);
-        total += own;
-        mean += own * oklab(query_colours[j]);
+        count += int(values[j] >= least);
+        found = abs(values[j]) > abs(values[found]) ? j : found;
     }
-    vec3 hot = own_colours ? mean / max(total, 1e-9) : mapped_lab(heat);
-    return mix(base * dim, shaded(hot, base), heat_opacity * smoothstep(0.0, own_colours ? 1.0 : HEAT_FADE, heat));
+    int left = count > 1 ? (pixel.x + pixel.y) / STRIPE_PX % count : -1;
+    for (int j = 0; j < MAX_QUERIES; ++j)
+        if (values[j] >= least && left-- == 0)
+            found = j;
+    return found;
 }
 
-vec3 segments(vec3 base, vec3 relevancy) {
-    int winner = 0;
-    for (int j = 1; j < MAX_QUERIES; ++j)
-        if (relevancy[j] > relevancy[winner])
-            winner = j;
-    bool inside = relevancy[winner] > threshold;
+vec3 heat_map(vec3 base, vec3 values, vec2 place) {
+    int query = query_of(values, place, HEAT_EDGE);
+    float value = values[query];
+    vec2 range = ranges[query];
+    float heat = clamp((value - range.x) / (range.y - range.x), 0.0, 1.0);
+    vec3 hot = own_colours ? oklab(query_colours[query]) : mapped_lab(heat);
+    float shown = smoothstep(0.0, 1.0, value < 0.0 ? heat / HEAT_FADE : value / HEAT_BASE);
+    if (own_colours)
+        shown *= 0.5 + 0.5 * heat;
+    return mix(base * dim, shaded(hot, base), heat_opacity * shown);
+}
+
+vec3 segments(vec3 base, vec3 values, vec2 place) {
+    int winner = query_of(values, place, threshold);
     vec2 range = ranges[winner];
     float opacity = SEGMENT_OPACITY * clamp((1.0 - range.x) / (range.y - range.x), 0.0, 1.0);
-    return inside ? mix(base, query_colours[winner], opacity) : base * dim;
+    return values[winner] > threshold ? mix(base, query_colours[winner], opacity) : base * dim;
 }
 
 vec4 depth_map(vec2 sums) {
@@ -115,5 +126,7 @@ void main() {
     vec3 base = clamp(c.rgb / share + uncovered, 0.0, 1.0);
     vec3 mean = sums.a > alpha_gate ? sums.rgb / sums.a : vec3(0.0);
     vec4 shown = SHOWN;
+    if (has_selection && inside(selection, ivec2(place * vec2(textureSize(selection, 0))), threshold).r > 0.0)
+        shown.rgb = mix(shown.rgb, SELECTED, on_edge(selection, place, threshold) ? 1.0 : SELECTED_OPACITY);
     picture = vec4(clamp(shown.rgb, 0.0, 1.0), transparent ? shown.a : 1.0);
 }

@@ -13,6 +13,8 @@ from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import (
     COLOUR_MAPS,
+    EDGE_PX,
+    HEAT_BASE,
     HEAT_EDGE,
     HEAT_FADE,
     HEAT_LIGHTNESS,
@@ -20,6 +22,9 @@ from langsplat_core.display.displays import (
     NODES,
     QUERY_COLOURS,
     SEGMENT_OPACITY,
+    SELECTED,
+    SELECTED_OPACITY,
+    STRIPE_PX,
     Channels,
     Drawing,
     Ranges,
@@ -79,6 +84,14 @@ def compose_upwards(channels: Channels, picture: PictureConfig, ranges: Ranges =
     height, width = channels.alpha.shape
     image = np.empty((height, width, 4), np.uint8)
     shared_workers().run(_rows, height, image, planes, style)
+    # In passes of their own: they ask for other pixels, and would keep the one above from its speed.
+    if hot:
+        mark = np.float32(HEAT_EDGE), style.gate, np.ones(3, np.float32), np.float32(0)
+        shared_workers().run(_mark, height, image, planes[2], planes[1], mark)
+    if channels.selected is not None:
+        selected, colour = np.asarray(channels.selected, np.float32), np.array(SELECTED, np.float32)
+        mark = style.threshold, style.gate, colour, np.float32(SELECTED_OPACITY)
+        shared_workers().run(_mark, height, image, selected, planes[1], mark)
     return image
 
 
@@ -113,56 +126,47 @@ def _shade(shown: Array, base: Array) -> None:
 
 
 @helper
-def _heat(shown: Array, base: Array, mean: Array, style: Style) -> Any:
-    """Draw a pixel; return its heat."""
-    heat = total = red = green = blue = np.float32(0)
+def _query_of(mean: Array, y: int, x: int, least: Any) -> int:
+    """Return the query that a pixel shows.
+
+    Of those with at least so much one after another, in stripes; else the one with the most.
+    """
+    count = found = 0
     for j in range(len(mean)):
-        low, high, tint = style.limits[j, 0], style.limits[j, 1], style.tints[j]
-        own = _clip((mean[j] - low) / (high - low))
-        heat, total = max(heat, own), total + own
-        red, green, blue = red + own * tint[0], green + own * tint[1], blue + own * tint[2]
+        count += mean[j] >= least
+        if abs(mean[j]) > abs(mean[found]):
+            found = j
+    left = (x + y) // STRIPE_PX % count if count > 1 else -1
+    for j in range(len(mean)):
+        if mean[j] >= least:
+            if left == 0:
+                found = j
+            left -= 1
+    return found
+
+
+@helper
+def _heat(shown: Array, base: Array, mean: Array, y: int, x: int, style: Style) -> None:
+    slot = _query_of(mean, y, x, np.float32(HEAT_EDGE))
+    value, low, high = mean[slot], style.limits[slot, 0], style.limits[slot, 1]
+    heat = _clip((value - low) / (high - low))
+    cover = _clip(heat / np.float32(HEAT_FADE) if value < 0 else value / np.float32(HEAT_BASE))
+    mix = style.heat_opacity * cover * cover * (3 - 2 * cover)  # smoothstep
     if style.own_colours:
-        share = 1 / max(total, np.float32(1e-9))
-        shown[0], shown[1], shown[2] = red * share, green * share, blue * share
-    else:
-        _map(shown, heat, style.table)
-    fade = heat if style.own_colours else _clip(heat / np.float32(HEAT_FADE))
-    mix = style.heat_opacity * fade * fade * (3 - 2 * fade)  # smoothstep
+        mix *= np.float32(0.5) + np.float32(0.5) * heat
+        for k in range(3):
+            shown[k] = style.tints[slot, k]
     if mix > 0:
+        if not style.own_colours:
+            _map(shown, heat, style.table)
         _shade(shown, base)
     for k in range(3):
         shown[k] = base[k] * style.dim * (1 - mix) + shown[k] * mix
-    return heat
 
 
 @helper
-def _near_cold(extra: Array, alphas: Array, y: int, x: int, style: Style) -> bool:
-    """Return True for a pixel near one that is not hot."""
-    least, reach = np.float32(HEAT_EDGE[0]), HEAT_EDGE[1]
-    above, below = max(y - reach, 0), min(y + reach, len(alphas) - 1)
-    left, right = max(x - reach, 0), min(x + reach, alphas.shape[1] - 1)
-    around = _is_hot(extra, alphas, above, x, least, style) and _is_hot(extra, alphas, below, x, least, style)
-    beside = _is_hot(extra, alphas, y, left, least, style) and _is_hot(extra, alphas, y, right, least, style)
-    return not (around and beside)
-
-
-@helper
-def _is_hot(extra: Array, alphas: Array, y: int, x: int, least: Any, style: Style) -> bool:
-    alpha = alphas[y, x]
-    if alpha > style.gate:
-        for j in range(extra.shape[2]):
-            low, high = style.limits[j, 0], style.limits[j, 1]
-            if (extra[y, x, j] / alpha - low) / (high - low) >= least:
-                return True
-    return False
-
-
-@helper
-def _segment(shown: Array, base: Array, mean: Array, style: Style) -> None:
-    winner = 0
-    for j in range(1, len(mean)):
-        if mean[j] > mean[winner]:
-            winner = j
+def _segment(shown: Array, base: Array, mean: Array, y: int, x: int, style: Style) -> None:
+    winner = _query_of(mean, y, x, style.threshold)
     low, high = style.limits[winner, 0], style.limits[winner, 1]
     opacity = np.float32(SEGMENT_OPACITY) * _clip((1 - low) / (high - low))
     inside = mean[winner] > style.threshold
@@ -201,14 +205,56 @@ def _rows(first: int, last: int, image: Array, planes: tuple[Array, Array, Array
                 values[k] = extra[y, x, k] * scale
             opacity = np.float32(1) if style.drawing == Drawing.ALPHA or not style.transparent else alpha
             if style.drawing == Drawing.HEAT:
-                heat = _heat(shown, base, values, style)
-                if heat >= np.float32(HEAT_EDGE[0]) and _near_cold(extra, alphas, y, x, style):
-                    shown[:] = 1
+                _heat(shown, base, values, y, x, style)
             elif style.drawing == Drawing.SEGMENTS:
-                _segment(shown, base, values, style)
+                _segment(shown, base, values, y, x, style)
             elif style.drawing == Drawing.DEPTH:
                 _depth(shown, values[0], is_open, style)
                 opacity = np.float32(is_open or not style.transparent)
             for k in range(3):
                 image[height - 1 - y, x, k] = np.uint8(np.float32(255) * _clip(shown[k]) + np.float32(0.5))
             image[height - 1 - y, x, 3] = np.uint8(np.float32(255) * opacity + np.float32(0.5))
+
+
+@helper
+def _inside(layer: Array, alphas: Array, y: int, x: int, slot: int, least: Any, gate: Any) -> bool:
+    alpha = alphas[y, x]
+    return bool(alpha > gate and layer[y, x, slot] >= least * alpha)
+
+
+@helper
+def _on_edge(layer: Array, alphas: Array, y: int, x: int, least: Any, gate: Any) -> bool:
+    """Return True for a pixel where some component is at least so much, near one where it is not."""
+    for slot in range(layer.shape[2]):
+        if not _inside(layer, alphas, y, x, slot, least, gate):
+            continue
+        above, below = max(y - EDGE_PX, 0), min(y + EDGE_PX, len(alphas) - 1)
+        left, right = max(x - EDGE_PX, 0), min(x + EDGE_PX, alphas.shape[1] - 1)
+        if not (
+            _inside(layer, alphas, above, x, slot, least, gate)
+            and _inside(layer, alphas, below, x, slot, least, gate)
+            and _inside(layer, alphas, y, left, slot, least, gate)
+            and _inside(layer, alphas, y, right, slot, least, gate)
+        ):
+            return True
+    return False
+
+
+@kernel
+def _mark(
+    first: int, last: int, image: Array, layer: Array, alphas: Array, mark: tuple[Any, Any, Array, Any]
+) -> None:
+    """Tint in rows [first, last) what a layer (H, W, C) has at least so much of, and outline it."""
+    least, gate, colour, opacity = mark
+    height, width = alphas.shape
+    for y in range(first, last):
+        for x in range(width):
+            mix = opacity
+            if _on_edge(layer, alphas, y, x, least, gate):
+                mix = np.float32(1)
+            elif opacity == 0 or not _inside(layer, alphas, y, x, 0, least, gate):
+                continue
+            for k in range(3):
+                shown = np.float32(image[height - 1 - y, x, k])
+                mixed = shown + mix * (np.float32(255) * colour[k] - shown)
+                image[height - 1 - y, x, k] = np.uint8(mixed + np.float32(0.5))

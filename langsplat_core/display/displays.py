@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from enum import IntEnum
 from importlib.resources import files
 from types import MappingProxyType
-from typing import Literal, Protocol
+from typing import Literal, Protocol, get_args
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import ColourMap, Display
+from langsplat_core.config import ColourMap, Display, HeatOf
 from langsplat_core.io.hostile import opened
 from langsplat_core.scene import NO_NODE, LanguageField
 
@@ -27,14 +27,14 @@ NODES = 256  # of a colour map; looked up with linear interpolation between them
 def _colour_maps() -> dict[ColourMap, Array]:
     """Return (NODES, 3) uint8 by name, in the order of `config.ColourMap`.
 
-    Viridis and magma are by N. Smith and S. van der Walt (2015), cividis by J. Nunez, C. Anderton and
-    R. Renslow (2018), as matplotlib has them, turbo by A. Mikhailov, Google (2019, its polynomial fit): the
-    rows of a small image beside this file.
+    Inferno, viridis and magma are by N. Smith and S. van der Walt (2015), cividis by J. Nunez, C. Anderton
+    and R. Renslow (2018), as matplotlib has them, turbo by A. Mikhailov, Google (2019, its polynomial fit),
+    amber of one hue and even steps of lightness in OKLab: the rows of a small image beside this file.
     """
     with opened(files(__package__).joinpath("colour_maps.png").read_bytes(), "colour_maps.png") as image:
-        viridis, cividis, magma, turbo = np.asarray(image.convert("RGB"))
+        rows = np.asarray(image.convert("RGB"))
     grey = np.repeat(np.arange(NODES, dtype=np.uint8)[:, None], 3, 1)
-    return {"turbo": turbo, "viridis": viridis, "cividis": cividis, "magma": magma, "grey": grey}
+    return dict(zip(get_args(ColourMap), (*rows, grey), strict=True))
 
 
 COLOUR_MAPS: Mapping[ColourMap, Array] = MappingProxyType(_colour_maps())
@@ -43,7 +43,7 @@ QUERY_COLOURS = np.array([[0.98, 0.45, 0.09], [0.13, 0.59, 0.95], [0.30, 0.80, 0
 MAX_QUERIES = len(QUERY_COLOURS)  # shown at a time: one colour each, one channel of a texture each
 
 
-def mapped(t: Array, name: ColourMap = "turbo") -> Array:
+def mapped(t: Array, name: ColourMap) -> Array:
     """(...,) values in [0, 1] -> (..., 3) colours in [0, 1] of a colour map."""
     position = np.clip(t, 0, 1) * (NODES - 1)
     low = np.minimum(position.astype(int), NODES - 2)
@@ -78,6 +78,7 @@ _OKLAB = np.array(
 Ranges = tuple[tuple[float, float], ...]  # per component of a channel, the values drawn as 0 and as 1
 STRENGTH: Mapping[str, float] = MappingProxyType({"found": 1.0, "weak match": 0.5, "not here": 0.0})
 NO_HEAT = (0.5, 1.0)  # range of a slot without heat, whose values are 0
+HEAT_BASE = 0.3  # value of the coldest Gaussian of an answer, see `heats`
 
 
 class Answer(Protocol):
@@ -89,6 +90,10 @@ class Answer(Protocol):
     def level(self) -> int: ...
     @property
     def relevancy(self) -> Array: ...  # (3, N)
+    @property
+    def smooth(self) -> Array: ...  # (N,) that of the level, smoothed along the surface of the answer
+    @property
+    def even(self) -> Array: ...  # (N,) that of the level, the same all over a node
     @property
     def members(self) -> Array: ...  # (N,) bool
     @property
@@ -106,6 +111,7 @@ class Subject:
     language: LanguageField | None = None
     answers: Answers = ()
     level: int | None = None  # index into scene.LEVELS; None: the own level of each answer
+    heat: HeatOf = "smooth"
 
 
 def painted(answers: Answers) -> list[int]:
@@ -113,9 +119,24 @@ def painted(answers: Answers) -> list[int]:
     return [slot for slot, answer in enumerate(answers) if answer is not None and STRENGTH[answer.verdict]]
 
 
-def relevancies(subject: Subject) -> Array | None:
-    """(N, Q) float32 raw relevancy per Gaussian and slot; None where no slot paints anything."""
-    return _by_slot(subject, lambda one: one.relevancy[one.level if subject.level is None else subject.level])
+def heats(subject: Subject) -> Array | None:
+    """(N, Q) float32 heat per Gaussian and slot; None where no slot paints anything.
+
+    One number, as every channel costs time, says where an answer is and how hot: from `HEAT_BASE` to 1, over
+    the answer's own range, for its members, and 0 for all others. "everywhere", and of a level that is asked
+    for, it is minus the relevancy of every Gaussian: below 0 nothing ends in a line.
+    """
+
+    def heat(one: Answer) -> Array:
+        own = one.relevancy[one.level if subject.level is None else subject.level]
+        if subject.heat == "everywhere" or subject.level is not None:
+            return -own
+        values = {"smooth": lambda: one.smooth, "own": lambda: own, "node": lambda: one.even}[subject.heat]()
+        low, high = one.heat_range
+        hot = HEAT_BASE + (1 - HEAT_BASE) * np.clip((values - low) / (high - low), 0, 1)
+        return np.where(one.members, hot, 0)
+
+    return _by_slot(subject, heat)
 
 
 def members(subject: Subject) -> Array | None:
@@ -133,19 +154,36 @@ def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | 
     return values
 
 
-def heat_ranges(answers: Answers, scale: tuple[float, float] | None = None) -> Ranges:
-    """Relevancies of heat 0 and 1 of each slot, by `scale` or its own; weak matches reach half."""
+def heat_ranges(
+    answers: Answers, scale: tuple[float, float] | None = None, everywhere: bool = False
+) -> Ranges:
+    """Values of `heats` at heat 0 and 1 of each slot, by `scale` in relevancies or its own."""
+
+    def ends(answer: Answer) -> tuple[float, float]:
+        (low, high), own = answer.heat_range, scale or answer.heat_range
+        if everywhere:
+            return -own[0], -own[1]
+        first, last = (HEAT_BASE + (1 - HEAT_BASE) * (end - low) / (high - low) for end in own)
+        return first, last
+
+    return _ranges(answers, ends)
+
+
+def member_ranges(
+    answers: Answers, scale: tuple[float, float] | None = None, everywhere: bool = False
+) -> Ranges:
+    """Range of members for each slot, which are 0 or 1; a weak match is half as opaque."""
+    return _ranges(answers, lambda answer: (0.0, 1.0))
+
+
+def _ranges(answers: Answers, ends: Callable[[Answer], tuple[float, float]]) -> Ranges:
+    """Return the range of each slot; weak matches reach half of it."""
     ranges = []
     for answer in answers:
         strength = 0.0 if answer is None else STRENGTH[answer.verdict]
-        low, high = (scale or answer.heat_range) if answer is not None and strength else NO_HEAT
+        low, high = ends(answer) if answer is not None and strength else NO_HEAT
         ranges.append((low, low + (high - low) / (strength or 1.0)))
     return tuple(ranges)
-
-
-def member_ranges(answers: Answers, scale: tuple[float, float] | None = None) -> Ranges:
-    """Range of members for each slot, which are 0 or 1; a weak match is half as opaque."""
-    return heat_ranges(answers, (0.0, 1.0))
 
 
 _LATENT: WeakKeyDictionary[LanguageField, Array] = WeakKeyDictionary()
@@ -193,10 +231,14 @@ def nodes(subject: Subject) -> Array | None:
 
 # From channels to an image: `composing` draws it on the CPU, `compose.frag.glsl` on a graphics device.
 
-HEAT_FADE = 0.35  # heat at which the heat map reaches its full opacity
+HEAT_FADE = 0.35  # heat at which the heat map of everything reaches its full opacity
 HEAT_LIGHTNESS = 0.4  # share of the heat map's own lightness; the rest is the image's, whose shading stays
-HEAT_EDGE = 0.35, 2  # heat at whose border a line is drawn, and the width of that, pixels
+HEAT_EDGE = 0.25  # value of `heats` from which a pixel is in an answer, somewhat less than half of its light
+EDGE_PX = 2  # width of the line around answers and selections, pixels
+STRIPE_PX = 6  # width of the stripes where several answers are, pixels
 SEGMENT_OPACITY = 0.6
+SELECTED = (1.0, 0.15, 0.85)  # unlike the colours of queries and of heat, and rare in photographs
+SELECTED_OPACITY = 0.5  # the rest is what is shown, so that shapes and heat stay readable
 LEAST_ALPHA = 1 / 255  # that colours are divided by; what is less is not seen in an image of bytes
 
 
@@ -207,6 +249,7 @@ class Channels:
     rgb: Array  # (H, W, 3)
     alpha: Array  # (H, W) in [0, 1]
     extra: Array | None = None  # (H, W, C) the display's further channel, C <= 3
+    selected: Array | None = None  # (H, W, 1) 1 for what is selected
 
 
 class Drawing(IntEnum):
@@ -216,8 +259,8 @@ class Drawing(IntEnum):
     SUMS = 1  # the same with the further channel in place of the colours
     DEPTH = 2  # mean of the further channel by the colour map, near to far; the background where alpha is low
     ALPHA = 3  # opaque grey
-    HEAT = 4  # one query by the colour map, several by their own colours
-    SEGMENTS = 5  # the query that has most of a pixel, in its colour
+    HEAT = 4  # one query by the colour map, several by their own colours, striped where they overlap
+    SEGMENTS = 5  # the query that has most of a pixel, in its colour, striped where several have half of it
 
 
 # Each of type vec4 in the variables of `main` in `compose.frag.glsl`; the fourth is a transparent image's.
@@ -226,8 +269,8 @@ _GLSL = {
     Drawing.SUMS: "vec4(sums.rgb / share + uncovered, c.a)",
     Drawing.DEPTH: "depth_map(sums.rg)",
     Drawing.ALPHA: "vec4(vec3(c.a), 1.0)",
-    Drawing.HEAT: "vec4(on_edge(place) ? vec3(1.0) : heat_map(base, mean), c.a)",
-    Drawing.SEGMENTS: "vec4(segments(base, mean), c.a)",
+    Drawing.HEAT: "vec4(on_edge(extra, place, HEAT_EDGE) ? vec3(1.0) : heat_map(base, mean, place), c.a)",
+    Drawing.SEGMENTS: "vec4(segments(base, mean, place), c.a)",
 }
 
 
@@ -253,9 +296,8 @@ class DisplayRow:
     label: str  # on its button
     drawing: Drawing
     channel: Callable[[Subject], Array | None] | Literal["depth"] | None = None  # (N, 1 to 3), or camera z
-    # of the answers, by `PictureConfig.heat_scale`
-    ranges: Callable[[Answers, tuple[float, float] | None], Ranges] = lambda answers, scale: ()
-    is_colour: bool = False  # its channel is colours, tinted where Gaussians are selected
+    # of the answers, by `PictureConfig.heat_scale`; and whether heat is of everything
+    ranges: Callable[[Answers, tuple[float, float] | None, bool], Ranges] = lambda answers, scale, every: ()
     uses_map: bool = False  # it shows numbers by the colour map
     by_level: bool = False  # it has a button for each semantic level
     needs_query: bool = False  # shows answers
@@ -270,12 +312,10 @@ _ROWS = (
     DisplayRow("rgb", "Colours", Drawing.COLOURS),
     DisplayRow("depth", "Depth", Drawing.DEPTH, "depth", uses_map=True),
     DisplayRow("alpha", "Alpha", Drawing.ALPHA),
-    DisplayRow(
-        "relevancy", "Relevancy", Drawing.HEAT, relevancies, heat_ranges, uses_map=True, needs_query=True
-    ),
+    DisplayRow("relevancy", "Relevancy", Drawing.HEAT, heats, heat_ranges, uses_map=True, needs_query=True),
     DisplayRow("segmentation", "Segmentation", Drawing.SEGMENTS, members, member_ranges, needs_query=True),
-    DisplayRow("latent", "Latent", Drawing.SUMS, latents, is_colour=True, by_level=True),
-    DisplayRow("tree", "Tree", Drawing.SUMS, nodes, is_colour=True, by_level=True),
+    DisplayRow("latent", "Latent", Drawing.SUMS, latents, by_level=True),
+    DisplayRow("tree", "Tree", Drawing.SUMS, nodes, by_level=True),
 )
 DISPLAYS: Mapping[Display, DisplayRow] = MappingProxyType({row.name: row for row in _ROWS})
 
@@ -292,8 +332,12 @@ def shader_defines() -> dict[str, int | float | str]:
     return {
         "HEAT_FADE": HEAT_FADE,
         "HEAT_LIGHTNESS": HEAT_LIGHTNESS,
-        "HEAT_EDGE": HEAT_EDGE[0],
-        "EDGE_PX": HEAT_EDGE[1],
+        "HEAT_BASE": HEAT_BASE,
+        "HEAT_EDGE": HEAT_EDGE,
+        "EDGE_PX": EDGE_PX,
+        "STRIPE_PX": STRIPE_PX,
+        "SELECTED": f"vec3{SELECTED}",
+        "SELECTED_OPACITY": SELECTED_OPACITY,
         "SEGMENT_OPACITY": SEGMENT_OPACITY,
         "LEAST_ALPHA": LEAST_ALPHA,
         "MAX_QUERIES": MAX_QUERIES,

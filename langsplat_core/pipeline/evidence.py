@@ -173,6 +173,15 @@ def kept_features(path: Path, scene: Scene, work: Path | None = None) -> StoredF
     return StoredFeatures(store, [camera.name for camera in scene.cameras])
 
 
+def is_kept(path: Path, scene: Scene) -> bool:
+    """Return whether masks of all photographs of a scene are beside it."""
+    try:
+        kept_features(path, scene)
+    except InputError:
+        return False
+    return True
+
+
 def kept_photographs(
     path: Path,
     scene: Scene,

@@ -25,7 +25,14 @@ from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, QUERY_COLOURS, STRENGTH, shader_defines
+from langsplat_core.display.displays import (
+    COLOUR_MAPS,
+    DISPLAYS,
+    HEAT_BASE,
+    QUERY_COLOURS,
+    STRENGTH,
+    shader_defines,
+)
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.quantised import to_bytes
@@ -88,11 +95,13 @@ def write_page(
             **asdict(PictureConfig()),
             "displays": {name: row.drawing for name, row in DISPLAYS.items()},
             "strength": dict(STRENGTH),
+            "heat_base": HEAT_BASE,
+            "maps": list(COLOUR_MAPS),
         },
         "query_colours": QUERY_COLOURS.tolist(),
         "shaders": page_shaders(),
     }
-    tensors["colour_map"] = COLOUR_MAPS["turbo"]
+    tensors["colour_maps"] = np.stack(list(COLOUR_MAPS.values()))
     why_not, language = no_field(scene) if engine is None else unsearchable(engine), dict[str, Any]()
     if engine is not None and not why_not:
         language, own = language_tables(engine, rows, progress)

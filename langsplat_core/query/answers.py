@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -26,7 +27,7 @@ from langsplat_core.query.rule import (
     triple,
 )
 from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Tree
-from langsplat_core.scene.surface import Surface
+from langsplat_core.scene.surface import NEIGHBOURS, Surface
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale, relevancy_of
 
 AnswerRule = Literal["regions", "peak"]  # by `rule.decide`, or as published
@@ -62,6 +63,7 @@ class QueryResult(Judged):
     judgement: Verdict
     place: Array | None  # (3,) world units
     box: Array | None  # (2, 3) corners, world units
+    points: Array  # (N, 3) means of the Gaussians
     relevancy: Deferred = Deferred()  # (3, N) float32 in [0, 1] per level and Gaussian
     even: Deferred = Deferred()  # (N,) float32 relevancy at the level, the same all over a region
     members: Deferred = Deferred()  # (N,) bool: the Gaussians that answer, wherever they are
@@ -83,11 +85,48 @@ class QueryResult(Judged):
     @property
     def heat_range(self) -> tuple[float, float]:
         """The relevancies at which a heat map of this answer is coldest and hottest."""
+        high = max(self.peak, float(self.smooth[self.members].max(initial=0)))
         if self.own_cut is not None:
-            return min(self.own_cut, self.peak - MIN_HEAT_SPAN), self.peak
+            return min(self.own_cut, self.peak - MIN_HEAT_SPAN), high
         if self.found and self.peak < FLOOR + MIN_HEAT_SPAN:  # best on its thing, not against all phrases
-            return self.peak - MIN_HEAT_SPAN, self.peak
-        return FLOOR, max(self.peak, FLOOR + MIN_HEAT_SPAN)
+            return self.peak - MIN_HEAT_SPAN, high
+        return FLOOR, max(high, FLOOR + MIN_HEAT_SPAN)
+
+    @cached_property
+    def smooth(self) -> Array:
+        """(N,) float32 relevancy at the level: of members the mean over members around each."""
+        values = self.relevancy[self.level].copy()
+        values[self.members] = smoothed(self.points[self.members], values[self.members])
+        return values
+
+
+MOST_CELLS = 64  # along a side of the grid that relevancies are smoothed on
+SIDE = 5.0  # of that grid, in standard deviations of the points along the axis on which they lie widest
+
+
+def smoothed(points: Array, values: Array) -> Array:
+    """(K,) means of `values` (K,) around (K, 3) points, over about as many as a surface has neighbours.
+
+    Values are shared among the corners of the cells of a grid, which grows with the answer, and read there
+    again, in the exported page, too: no neighbours need to be looked for.
+    """
+    if len(points) == 0:
+        return values
+    places = np.nan_to_num(points.astype(np.float64))
+    side = int(np.clip(np.sqrt(len(points) / NEIGHBOURS), 2, MOST_CELLS))
+    step = max(SIDE * float(places.std(0).max()) / side, 1e-30)
+    at = np.clip((places - places.mean(0)) / step + side / 2, 0, side)
+    low = np.minimum(at.astype(np.int64), side - 1)
+    corners = []
+    for corner in product((0, 1), repeat=3):
+        share = np.abs(1 - np.array(corner) - (at - low)).prod(1)
+        corners.append((((low + corner) @ ((side + 1) ** np.arange(3))), share))
+    sums = np.zeros((2, (side + 1) ** 3))
+    for cell, share in corners:
+        for row, weights in zip(sums, (share, share * values), strict=True):
+            row += np.bincount(cell, weights, len(row))
+    weights, totals = (sum(share * row[cell] for cell, share in corners) for row in sums)
+    return np.asarray(totals / weights, np.float32)
 
 
 def recut(result: QueryResult, cut: float) -> QueryResult:
@@ -291,6 +330,7 @@ def by_regions(
         members=lambda: regions.spread(chosen, decision.inside, np.zeros(len(means), bool)),
         place=place,
         box=box,
+        points=means,
     )
 
 
@@ -308,9 +348,18 @@ SPAN = 0.02  # the least distance between the floor and the peak that is divided
 
 
 def by_peak(
-    phrase: str, relevancy: Array, surface: Surface, scale: Scale, found: float, level: LevelChoice
+    phrase: str,
+    relevancy: Array,
+    means: Array,
+    surface: Surface,
+    scale: Scale,
+    found: float,
+    level: LevelChoice,
 ) -> QueryResult:
-    """Return the published answer: highest peak, cut half way to the floor; found: from which relevancy."""
+    """Return the published answer: highest peak, cut half way to the floor; found: from which relevancy.
+
+    relevancy: (3, N); means: (N, 3) of the Gaussians.
+    """
     smoothed = np.stack([surface.smooth(values) for values in relevancy])
     scores = triple(smoothed.max(1, initial=0))
     chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
@@ -329,6 +378,7 @@ def by_peak(
         members=relevancy[chosen] > FLOOR + 0.5 * max(peak - FLOOR, SPAN),
         place=place,
         box=box,
+        points=means,
     )
 
 

@@ -168,10 +168,11 @@ class QueryEngine:
     def _answer(
         self, phrase: str, relevancy: Relevancy, level: LevelChoice, thing: Array | None
     ) -> QueryResult:
+        means = self.scene.gaussians.means
         if self.bars is None:
-            return by_peak(phrase, relevancy(), self.surface, self.scale, self.field.found, level)
+            return by_peak(phrase, relevancy(), means, self.surface, self.scale, self.field.found, level)
         fits = self._own_fits(relevancy), thing
-        means, judged = self.scene.gaussians.means, (self.bars, self.calibration, level)
+        judged = self.bars, self.calibration, level
         return by_regions(phrase, relevancy, fits, means, self.regions, *judged)
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:

@@ -266,13 +266,13 @@ class Judged:
 
     @property
     def said(self) -> str:
-        """The verdict with the percentage behind it, such as "found (83 %)" or "found (by chance 2 %)"."""
+        """The verdict with the percentage behind it, such as "found, 83 %" or "found, by chance 2 %"."""
         if self.probability is not None:
-            return f"{self.verdict} ({100 * self.probability:.0f} %)"
+            return f"{self.verdict}, {100 * self.probability:.0f} %"
         if self.by_chance is None:
             return self.verdict
         share = 100 * max(self.by_chance, 0.001)  # never none
-        return f"{self.verdict} (by chance {share:.{0 if share >= 1 else 1}f} %)"
+        return f"{self.verdict}, by chance {share:.{0 if share >= 1 else 1}f} %"
 
     @property
     def by_chance(self) -> float | None:

@@ -162,4 +162,5 @@ def by_showing(
         members=regions.spread(chosen, inside, nothing > 0),
         place=place,
         box=box,
+        points=means,
     )

@@ -81,12 +81,12 @@ class Painter {
     this.projected = this.target(this.columns, this.rows, Array(3).fill(gl.RGBA32F));
     this.extra = this.texture(gl.RGBA32F, this.columns, this.rows);
     this.values = new Float32Array(4 * texels);
-    this.colourMap = this.texture(gl.RGBA8, 256, 1);
-    const map = tensors.colour_map.values;
-    const rgba = Uint8Array.from({ length: 1024 }, (_, i) =>
-      i % 4 === 3 ? 255 : map[3 * (i >> 2) + (i % 4)],
+    const maps = tensors.colour_maps.values;
+    this.colourMaps = this.texture(gl.RGBA8, 256, maps.length / 768);
+    const rgba = Uint8Array.from({ length: (4 * maps.length) / 3 }, (_, i) =>
+      i % 4 === 3 ? 255 : maps[3 * (i >> 2) + (i % 4)],
     );
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 256, maps.length / 768, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
     this.programs = Object.fromEntries(
       Object.entries(meta.shaders).map(([name, pair]) => [name, this.program(...pair)]),
     );
@@ -262,7 +262,7 @@ class Painter {
     this.onorder?.();
   }
 
-  // Draw into the canvas, which gets the camera's size. appearance: { display, ranges, dim }.
+  // Draw into the canvas, which gets the camera's size. appearance: { display, map, ranges, dim }.
   paint(camera, appearance) {
     this.resize(camera);
     this.project(camera);
@@ -344,10 +344,12 @@ class Painter {
       colours: 0,
       extra: 1,
       colour_maps: 2,
-      colour_map: 0,
+      colour_map: appearance.map,
       query_colours: meta.query_colours.flat(),
       display: picture.displays[appearance.display],
       ranges: appearance.ranges.flat(),
+      has_selection: 0,
+      selection: 3,
       own_colours: 0,
       heat_opacity: picture.heat_opacity,
       dim: appearance.dim ?? picture.dim,
@@ -356,7 +358,8 @@ class Painter {
       background: picture.background,
       transparent: 0,
     });
-    this.bound(...[...this.image.textures, this.colourMap].map((texture) => [gl.TEXTURE_2D, texture]));
+    const textures = [...this.image.textures, this.colourMaps, this.colourMaps]; // nothing is selected
+    this.bound(...textures.map((texture) => [gl.TEXTURE_2D, texture]));
     this.pass({ framebuffer: null, width, height }, null);
   }
 

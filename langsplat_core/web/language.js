@@ -2,16 +2,59 @@
 // the fields of Python's QueryResult.
 
 import { ClipText, PhraseError, dot } from "./encoder.js";
-import { decide, fitOf, heatRange, levelRange, sigmoid, verdict } from "./rule.js";
+import { decide, fitOf, heatRange, levelRange, regionRelevancies, sigmoid, verdict } from "./rule.js";
 import { namedBy, phraseKey, thingOf, tidy } from "./words.js";
 
 // [page]
 const LISTS = ["articles", "stop_words", "adjectives", "parts"];
+const GRID = { neighbours: 16, most: 64, side: 5 }; // as of query/answers.py, smoothed
+
+// Means of values (K) around points (3 K), smoothed on a grid that grows with them.
+function smoothed(points, values) {
+  const count = values.length;
+  const axes = [0, 1, 2];
+  const middle = axes.map((axis) => values.reduce((sum, _, i) => sum + points[3 * i + axis], 0) / count);
+  const spreads = axes.map((axis) => {
+    const squares = values.reduce((sum, _, i) => sum + (points[3 * i + axis] - middle[axis]) ** 2, 0);
+    return Math.sqrt(squares / count);
+  });
+  const side = Math.trunc(Math.min(Math.max(Math.sqrt(count / GRID.neighbours), 2), GRID.most));
+  const step = Math.max((GRID.side * Math.max(...spreads)) / side, 1e-30);
+  const weights = new Float64Array((side + 1) ** 3);
+  const totals = new Float64Array((side + 1) ** 3);
+  const eachCorner = (i, visit) => {
+    const at = axes.map((k) =>
+      Math.min(Math.max((points[3 * i + k] - middle[k]) / step + side / 2, 0), side),
+    );
+    const low = at.map((place) => Math.min(Math.trunc(place), side - 1));
+    for (let corner = 0; corner < 8; ++corner) {
+      const bits = axes.map((k) => (corner >> k) & 1);
+      const share = bits.reduce((product, bit, k) => product * Math.abs(1 - bit - (at[k] - low[k])), 1);
+      const cell = bits.reduceRight((number, bit, k) => number * (side + 1) + low[k] + bit, 0);
+      visit(cell, share);
+    }
+  };
+  values.forEach((value, i) =>
+    eachCorner(i, (cell, share) => {
+      weights[cell] += share;
+      totals[cell] += share * value;
+    }),
+  );
+  return values.map((_, i) => {
+    let [weight, total] = [0, 0];
+    eachCorner(i, (cell, share) => {
+      weight += share * weights[cell];
+      total += share * totals[cell];
+    });
+    return total / weight;
+  });
+}
 
 class Language {
-  // meta: what pipeline/webpage.py says of the language field; tensors: { values, shape } by name.
-  constructor(meta, tensors) {
-    this.meta = meta;
+  // meta: what pipeline/webpage.py says of the language field; tensors: { values, shape } by name; places: mean and
+  // opacity of each Gaussian.
+  constructor(meta, tensors, places) {
+    Object.assign(this, { meta, places });
     this.tensors = Object.fromEntries(Object.entries(tensors).map(([name, { values }]) => [name, values]));
     [this.codewords, this.dim] = tensors.codebook.shape;
     this.gaussians = tensors.codes.shape[1];
@@ -139,12 +182,24 @@ class Language {
     const { places, boxes } = this.tensors;
     const { best } = decision;
     const peak = decision.scores[decision.level];
+    const { values, members } = this.spread({ ...decision, codes }, decision.level);
+    const rows = Uint32Array.from(members.keys()).filter((row) => members[row]);
+    const points = Float32Array.from({ length: 3 * rows.length }, (_, i) => {
+      return this.places[4 * rows[Math.trunc(i / 3)] + (i % 3)];
+    });
+    const smooth = smoothed(
+      points,
+      Float32Array.from(rows, (row) => values[row]),
+    );
+    const hottest = smooth.reduce((most, value) => Math.max(most, value), 0);
     return {
       ...decision,
       phrase,
       codes,
       peak,
-      heat: heatRange(this.meta.rule, peak, decision.verdict.found),
+      rows,
+      smooth,
+      heat: heatRange(this.meta.rule, peak, decision.verdict.found, hottest),
       place: best < 0 ? null : Array.from(places.subarray(3 * best, 3 * best + 3)),
       box: best < 0 ? null : Array.from(boxes.subarray(6 * best, 6 * best + 6)),
     };
@@ -175,6 +230,30 @@ class Language {
       }
     }
     return { values, members };
+  }
+
+  // Values of the Gaussians as display/displays.py has them (heats): of an answer from `base` to 1 by what heat is
+  // of, and 0 for all others; "everywhere" minus the relevancy of each.
+  heats(answer, of, base) {
+    const { values } = this.spread(answer, answer.level);
+    if (of === "everywhere") {
+      return values.map((value) => -value);
+    }
+    const [low, high] = answer.heat;
+    const even = of === "node" ? regionRelevancies(this.meta.rule, answer.regionFits) : null;
+    const heats = new Float32Array(this.gaussians);
+    answer.rows.forEach((row, i) => {
+      const node = even ? even[this.regionOf(row, answer.level)] : values[row];
+      const value = of === "smooth" ? answer.smooth[i] : node;
+      heats[row] = base + (1 - base) * Math.min(Math.max((value - low) / (high - low), 0), 1);
+    });
+    return heats;
+  }
+
+  // The least relevancy of what is in an answer.
+  cut(answer) {
+    const even = regionRelevancies(this.meta.rule, answer.regionFits);
+    return answer.inside.reduce((least, region) => Math.min(least, even[region]), answer.peak);
   }
 
   // (M, 3) colours in [0, 1] of the language features at a level; grey where nothing was observed.

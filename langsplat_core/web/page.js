@@ -12,11 +12,8 @@ const element = (tag, text, properties = {}) =>
 const LEVELS = { auto: "Auto", subpart: "Subpart", part: "Part", whole: "Whole" };
 const DISPLAYS = { rgb: "Colours", relevancy: "Relevancy", segmentation: "Found", latent: "Latent" };
 const OF_ANSWERS = ["relevancy", "segmentation"]; // displays that need one
-const OUTCOMES = {
-  found: ["found", "Found"],
-  "weak match": ["weak", "Weak match"],
-  "not here": ["none", "Not here"],
-};
+const HEATS = { smooth: "Smoothed", own: "Each Gaussian", node: "Each node", everywhere: "Everywhere" };
+const OUTCOMES = { found: "found", "weak match": "weak", "not here": "none" }; // their styles
 const KEYS = { c: "rgb", r: "relevancy", s: "segmentation", l: "latent" };
 const SLOW = 60; // ms of an image while the camera moves, above which fewer pixels are drawn until it rests
 const COARSEST = 0.3;
@@ -42,7 +39,7 @@ class Page {
     });
     this.painter = new Painter(byId("scene"), meta, tensors);
     this.painter.onorder = () => this.redraw();
-    this.language = meta.language && new Language(meta.language, tensors);
+    this.language = meta.language && new Language(meta.language, tensors, this.painter.places);
     const canvas = byId("scene");
     this.controls = new Controls(
       canvas,
@@ -67,12 +64,15 @@ class Page {
     for (const id of ["before", "after", "views"]) {
       byId(id).hidden = this.meta.views.length < 2;
     }
-    const map = byId("legend").querySelector("canvas").getContext("2d");
-    const row = map.createImageData(256, 1);
-    for (let i = 0; i < 256; ++i) {
-      row.data.set([...this.meta.map.subarray(3 * i, 3 * i + 3), 255], 4 * i);
+    const { maps, colour_map, heat } = this.meta.picture;
+    for (const [id, texts, chosen] of [
+      ["heat", Object.entries(HEATS), heat],
+      ["map", maps.map((name) => [name, name]), colour_map],
+    ]) {
+      byId(id).append(...texts.map(([value, text]) => element("option", text, { value })));
+      byId(id).value = chosen;
+      byId(id).addEventListener("change", () => this.update());
     }
-    map.putImageData(row, 0, 0);
     const gaussians = `${this.painter.count.toLocaleString("en")} Gaussians`;
     const { language } = this.meta;
     let about = `Nothing can be searched: ${this.meta.why_not}.`;
@@ -292,7 +292,8 @@ class Page {
     }
     said.replaceChildren();
     said.className = "";
-    byId("answer").hidden = !answer || answer.best < 0;
+    byId("answer").hidden = !answer || answer.best < 0 || answer.verdict.outcome === "not here";
+    byId("looks").hidden = byId("answer").hidden || this.display !== "relevancy";
     if (answer) {
       this.say(answer, said);
     } else if (this.problem) {
@@ -301,8 +302,9 @@ class Page {
     if (this.display === "latent") {
       this.painter.show(this.language.latents(this.level === "auto" ? 2 : levels.indexOf(this.level)), 3);
     } else if (answer && this.display !== "rgb") {
-      const { values, members } = this.language.spread(answer, answer.level);
-      const shown = this.display === "segmentation" ? members : values;
+      const { members } = this.language.spread(answer, answer.level);
+      const hot = () => this.language.heats(answer, byId("heat").value, this.meta.picture.heat_base);
+      const shown = this.display === "segmentation" ? members : hot();
       this.painter.show(this.appearance().strength === 0 ? shown.fill(0) : shown, 1);
     }
     this.redraw();
@@ -312,7 +314,6 @@ class Page {
   say(answer, said) {
     const { outcome, probability, byChance } = answer.verdict;
     const { levels, guess } = this.meta.language;
-    const [style, word] = OUTCOMES[outcome];
     const share = 100 * Math.max(byChance ?? 0, 0.001); // never none
     const chance = byChance === null ? "" : `, by chance ${share.toFixed(share >= 1 ? 0 : 1)} %`;
     const sure = probability === null ? chance : `, ${Math.round(100 * probability)} %`;
@@ -323,24 +324,42 @@ class Page {
     const places = `${count} ${count > 1 ? "places" : "place"}`;
     const where = `${places}, level ${levels[answer.level]}; at ${place}${unit}`;
     const detail = outcome === "not here" ? answer.phrase : where;
-    said.className = style;
-    said.append(element("b", word + sure), element("small", detail), element("small", guess));
-    const ends = byId("legend").querySelectorAll("span");
-    this.appearance().ranges[0].forEach((relevancy, i) => {
-      ends[i].textContent = relevancy.toFixed(2);
-    });
-    byId("face").hidden = outcome === "not here";
+    said.className = OUTCOMES[outcome];
+    said.append(element("b", outcome + sure), element("small", detail), element("small", guess));
+    this.legend(answer);
   }
 
-  // What the composing shader is told, as display/displays.py has it: a weak match is half as hot.
+  // The colours between the ends of the heat, to half of them for a weak match, and a tick at the threshold.
+  legend({ heat, verdict, ...answer }) {
+    const [low, high] = byId("legend").querySelectorAll("span");
+    [low.textContent, high.textContent] = heat.map((relevancy) => relevancy.toFixed(2));
+    const map = byId("legend").querySelector("canvas").getContext("2d");
+    const first = 768 * byId("map").selectedIndex;
+    const row = map.createImageData(256, 1);
+    for (let i = 0; i < 256; ++i) {
+      const at = first + 3 * Math.trunc(i * this.meta.picture.strength[verdict.outcome]);
+      row.data.set([...this.meta.maps.subarray(at, at + 3), 255], 4 * i);
+    }
+    map.putImageData(row, 0, 0);
+    const tick = Math.round((255 * (this.language.cut(answer) - heat[0])) / (heat[1] - heat[0]));
+    map.fillStyle = "#fff";
+    map.fillRect(Math.min(Math.max(tick, 0), 254), 0, 2, 1);
+  }
+
+  // What the composing shader is told, as display/displays.py has it: a weak match is half as hot. "not here" shows
+  // what it would without a phrase.
   appearance() {
     const nothing = [0.5, 1];
     const { answer, display } = this;
-    const strength = answer ? this.meta.picture.strength[answer.verdict.outcome] : 0;
-    const own = display === "segmentation" ? [0, 1] : answer?.heat;
+    const { picture } = this.meta;
+    const strength = answer ? picture.strength[answer.verdict.outcome] : 0;
+    const hot =
+      byId("heat").value === "everywhere" ? answer?.heat.map((end) => -end) : [picture.heat_base, 1];
+    const own = display === "segmentation" ? [0, 1] : hot;
     const [low, high] = strength ? own : nothing;
     return {
-      display: answer || !OF_ANSWERS.includes(display) ? display : "rgb",
+      display: strength || !OF_ANSWERS.includes(display) ? display : "rgb",
+      map: byId("map").selectedIndex,
       strength,
       ranges: [[low, low + (high - low) / (strength || 1)], nothing, nothing],
     };
@@ -506,7 +525,7 @@ class Page {
 globalThis.langsplat = (async () => {
   const { tensors, meta } = await readPage(byId("data").textContent);
   byId("data").remove();
-  meta.map = tensors.colour_map.values;
+  meta.maps = tensors.colour_maps.values;
   byId("panel").hidden = false;
   const page = new Page(meta, tensors);
   byId("loading").remove();

@@ -156,13 +156,14 @@ function decide(rule, regions, own, named, level, evidence, thing = null) {
   };
 }
 
-// Relevancies at which a heat map of an answer is coldest and hottest.
-function heatRange(rule, peak, found) {
+// Relevancies at which a heat map of an answer is coldest and hottest. best: the highest of its members.
+function heatRange(rule, peak, found, best) {
+  const high = Math.max(peak, best);
   if (found && peak < rule.floor + rule.heat_span) {
-    return [peak - rule.heat_span, peak];
+    return [peak - rule.heat_span, high];
   }
-  return [rule.floor, Math.max(peak, rule.floor + rule.heat_span)];
+  return [rule.floor, Math.max(high, rule.floor + rule.heat_span)];
 }
 // [/page]
 
-export { decide, fitOf, heatRange, levelRange, sigmoid, verdict };
+export { decide, fitOf, heatRange, levelRange, regionRelevancies, sigmoid, verdict };

@@ -196,7 +196,7 @@ def test_query_prints_the_probability(folder, capsys, logit, verdict, probabilit
     (answer,) = answers(capsys, "query", "b.ply", "book")
     assert answer["probability"] == pytest.approx(probability, abs=0.01)
     percent = f"{100 * answer['probability']:.0f}"
-    assert lines(capsys, "query", "b.ply", "book")[0].startswith(f"book: {verdict} ({percent} %), score ")
+    assert lines(capsys, "query", "b.ply", "book")[0].startswith(f"book: {verdict}, {percent} %, score ")
     assert (answer["verdict"], answer["found"]) == (verdict, verdict == "found")
     assert (answer["instances"] == []) == (verdict != "found")
 
@@ -206,7 +206,7 @@ def test_query_prints_chance_without_calibration(folder, capsys):
     (answer,) = answers(capsys, "query", "b.ply", "book")
     assert (answer["probability"], answer["encoder"], answer["calibration"]) == (None, "fake", None)
     said = lines(capsys, "query", "b.ply", "book")
-    assert said[0].startswith("book: found (by chance ")
+    assert said[0].startswith("book: found, by chance ")
     assert said[0].startswith(f"book: {answer['said']}, score ")
     save_fake(encoder_id="demo")
     *said, last = lines(capsys, "query", "b.ply", "book", "book")

@@ -12,21 +12,26 @@ from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import (
     COLOUR_MAPS,
     DISPLAYS,
+    EDGE_PX,
+    HEAT_BASE,
     HEAT_LIGHTNESS,
     NO_HEAT,
     NODES,
     QUERY_COLOURS,
     SEGMENT_OPACITY,
+    SELECTED,
+    SELECTED_OPACITY,
+    STRIPE_PX,
     Channels,
     Subject,
     heat_ranges,
+    heats,
     latent_colours,
     mapped,
     member_ranges,
     members,
     nodes,
     painted,
-    relevancies,
 )
 from langsplat_core.scene import LanguageField, LinearCodec
 from tests.support.file_samples import random_field
@@ -52,7 +57,7 @@ def test_displays_are_those_of_the_settings():
     assert len({row.label for row in DISPLAYS.values()}) == len(DISPLAYS)
 
 
-@pytest.mark.parametrize(("channel", "ranges"), [(relevancies, heat_ranges), (members, member_ranges)])
+@pytest.mark.parametrize(("channel", "ranges"), [(heats, heat_ranges), (members, member_ranges)])
 def test_absent_answers_paint_nothing(channel, ranges):
     assert channel(Subject(360, answers=(ABSENT,))) is None
     values = channel(Subject(360, answers=(ABSENT, FOUND)))
@@ -64,16 +69,41 @@ def test_absent_answers_paint_nothing(channel, ranges):
 
 def test_a_weak_match_is_never_hotter_than_half():
     (low, high), (weak_low, weak_high) = heat_ranges((FOUND, WEAK))
-    assert (low, high) == FOUND.heat_range
+    assert (low, high) == pytest.approx((HEAT_BASE, 1))
     assert (high - weak_low) / (weak_high - weak_low) == pytest.approx(0.5)
     assert member_ranges((FOUND, WEAK)) == ((0.0, 1.0), (0.0, 2.0))
 
 
-def test_heat_shows_relevancy_and_segments_show_members():
+def heat_of(values: np.ndarray, ranges) -> np.ndarray:
+    ((low, high),) = ranges
+    return np.clip((values[:, 0] - low) / (high - low), 0, 1)
+
+
+@pytest.mark.parametrize("of", ["smooth", "own", "node"])
+@pytest.mark.parametrize("scale", [None, (0.4, 0.95)])
+def test_heat_is_of_the_members_by_what_is_chosen(of, scale):
+    shown = {"smooth": FOUND.smooth, "own": FOUND.relevancy[2], "node": FOUND.even}[of]
+    values, ranges = heats(Subject(360, answers=(FOUND,), heat=of)), heat_ranges((FOUND,), scale)
+    low, high = scale or FOUND.heat_range
+    inside = FOUND.members
+    assert (values[inside] >= np.float32(HEAT_BASE)).all()
+    assert not values[~inside].any()
+    wanted = (np.clip(shown, *FOUND.heat_range) - low) / (high - low)
+    assert_allclose(heat_of(values, ranges)[inside], np.clip(wanted, 0, 1)[inside], atol=1e-5)
+
+
+@pytest.mark.parametrize(("level", "of"), [(0, "smooth"), (1, "node"), (None, "everywhere")])
+def test_heat_of_a_level_and_of_everything_is_of_every_gaussian(level, of):
+    values = heats(Subject(360, answers=(FOUND,), level=level, heat=of))
+    low, high = FOUND.heat_range
+    own = FOUND.relevancy[2 if level is None else level]
+    heat = heat_of(values, heat_ranges((FOUND,), everywhere=True))
+    assert_allclose(heat, np.clip((own - low) / (high - low), 0, 1), atol=1e-5)
+    assert (values <= 0).all()  # no pixel is inside of anything
+
+
+def test_segments_show_members():
     assert_allclose(members(Subject(360, answers=(FOUND,)))[:, 0], FOUND.members)
-    for level, shown in ((None, 2), (0, 0), (1, 1)):
-        got = relevancies(Subject(360, answers=(FOUND,), level=level))
-        assert_allclose(got[:, 0], FOUND.relevancy[shown])
 
 
 # To the cube roots of cones' answers, and from them to lightness, a and b (Ottosson 2020).
@@ -107,38 +137,69 @@ def shaded(lab, base) -> np.ndarray:
 BASE = np.array([0.2, 0.5, 0.7])
 
 
-def pixel(values: tuple[float, ...]) -> np.ndarray:
-    """(3,) colour in [0, 1] of one opaque pixel of the colour `BASE`, heat in the queries' own colours."""
-    shown = Channels(np.full((1, 1, 3), BASE), np.ones((1, 1)), np.array([[values]]))
-    return compose(shown, replace(HEAT, own_colours=True), ((0.0, 1.0),) * len(values))[0, 0] / 255
+def patch(*values: float, **picture) -> np.ndarray:
+    """(24, 24, 3) colours in [0, 1] of opaque pixels over `BASE`, heat in the queries' own colours."""
+    shown = Channels(np.full((24, 24, 3), BASE), np.ones((24, 24)), np.full((24, 24, len(values)), values))
+    return compose(shown, replace(HEAT, own_colours=True, **picture), ((0.0, 1.0),) * len(values)) / 255
 
 
-def test_heats_that_overlap_mix_their_colours_by_heat():
-    one, two, _ = map(lab_of, QUERY_COLOURS)
-    assert_allclose(pixel((1.0, 0.0)), shaded(one, BASE), atol=0.003)
-    assert_allclose(pixel((0.0, 1.0, 0.0)), shaded(two, BASE), atol=0.003)
-    assert_allclose(pixel((1.0, 1.0)), shaded((one + two) / 2, BASE), atol=0.003)
-    assert_allclose(pixel((1.0, 0.5)), shaded(2 / 3 * one + 1 / 3 * two, BASE), atol=0.003)
-    half = 0.5 * shaded(one, BASE) + 0.5 * PICTURE.dim * BASE  # smoothstep of 1/2
-    assert_allclose(pixel((0.5, 0.0)), half, atol=0.003)
-    assert_allclose(pixel((0.0, 0.0)), PICTURE.dim * BASE, atol=0.003)
+def test_answers_have_their_own_colours_and_overlap_in_stripes():
+    hot = [shaded(lab_of(colour), BASE) for colour in QUERY_COLOURS]
+    assert_allclose(patch(1.0, 0.0)[3, 3], hot[0], atol=0.003)
+    assert_allclose(patch(0.1, 1.0, 0.0)[3, 3], hot[1], atol=0.003)
+    rows, columns = np.mgrid[:24, :24]
+    for values in ((1.0, 1.0), (1.0, 0.0, 1.0), (1.0, 1.0, 1.0)):
+        there = np.flatnonzero(values)
+        stripe = there[(rows + columns) // STRIPE_PX % len(there)]
+        assert_allclose(patch(*values), np.array(hot)[stripe], atol=0.003)
+        flat = (1 - SEGMENT_OPACITY) * BASE + SEGMENT_OPACITY * QUERY_COLOURS[stripe]
+        assert_allclose(patch(*values, display="segmentation"), flat, atol=0.003)
+    half = 0.75 * hot[0] + 0.25 * PICTURE.dim * BASE
+    assert_allclose(patch(0.5)[3, 3], half, atol=0.003)
+    assert_allclose(patch(0.0)[3, 3], PICTURE.dim * BASE, atol=0.003)
+
+
+SQUARE = np.s_[10:30, 8:22]
+
+
+def framed() -> tuple[np.ndarray, np.ndarray]:
+    """(40, 30, 1) values of a square, and (40, 30) bool its edge."""
+    values, edge = np.zeros((40, 30, 1)), np.zeros((40, 30), bool)
+    values[SQUARE] = edge[SQUARE] = 1
+    edge[10 + EDGE_PX : 30 - EDGE_PX, 8 + EDGE_PX : 22 - EDGE_PX] = False
+    return values, edge
 
 
 def test_heat_keeps_the_shading_of_the_image_and_ends_in_a_line():
     grey = np.tile(np.linspace(0.2, 0.9, 40)[:, None, None], (1, 30, 3))
-    values = np.zeros((40, 30, 1))
-    values[10:30, 8:22] = 1
+    values, edge = framed()
     image = compose(Channels(grey, np.ones((40, 30)), values), HEAT, ((0.0, 1.0),)) / 255
-    line = (image == 1).all(2)
-    edge = np.zeros((40, 30), bool)
-    edge[10:30, 8:22] = True
-    edge[12:28, 10:20] = False
-    np.testing.assert_array_equal(line, edge)
+    np.testing.assert_array_equal((image == 1).all(2), edge)
     inside = image[12:28, 15] @ (0.3, 0.6, 0.1)
     assert (np.diff(inside) > 0).all()
-    hot = lab_of(mapped(np.array(1.0)))
+    hot = lab_of(mapped(np.array(1.0), HEAT.colour_map))
     assert_allclose(image[20, 15], shaded(hot, grey[20, 15]), atol=0.003)
     assert_allclose(image[5, 5], PICTURE.dim * grey[5, 5], atol=0.003)
+    raw = compose(Channels(grey, np.ones((40, 30)), -values), HEAT, ((0.0, -1.0),)) / 255
+    assert_allclose(raw[20, 15], image[20, 15], atol=0.003)
+    assert not (raw == 1).all(2).any()  # of everything
+
+
+@pytest.mark.parametrize("display", DISPLAYS)
+def test_a_selection_is_outlined_and_tinted_in_every_display(display):
+    selected, edge = framed()
+    count = 3 if display in ("latent", "tree") else 1
+    extra = None if DISPLAYS[display].channel is None else np.full((40, 30, count), 0.8)
+    plain = Channels(np.full((40, 30, 3), 0.4), np.ones((40, 30)), extra)
+    before, after = (
+        compose(shown, replace(HEAT, display=display), RANGES) / 255
+        for shown in (plain, replace(plain, selected=selected))
+    )
+    assert_allclose(after[edge], np.tile(SELECTED, (edge.sum(), 1)), atol=0.003)
+    inside = (selected[..., 0] > 0) & ~edge
+    tinted = before + SELECTED_OPACITY * (np.array(SELECTED) - before)
+    assert_allclose(after[inside], tinted[inside], atol=0.005)
+    np.testing.assert_array_equal(after[selected[..., 0] == 0], before[selected[..., 0] == 0])
 
 
 def test_a_weak_segment_is_half_as_opaque():
@@ -159,15 +220,16 @@ def test_uncovered_pixels_are_never_relevant():
 
 def test_heat_spans_its_range():
     below = compose(channels("relevancy", 0.49), HEAT, RANGES)
-    assert_allclose(below[0, 0], 255 * 0.5 * PICTURE.dim, atol=0.5)
-    hottest = shaded(lab_of(COLOUR_MAPS["turbo"][255] / 255), [0.5] * 3)
+    coldest = shaded(lab_of(COLOUR_MAPS[HEAT.colour_map][0] / 255), [0.5] * 3)
+    assert_allclose(below[0, 0] / 255, coldest, atol=0.003)
+    hottest = shaded(lab_of(COLOUR_MAPS[HEAT.colour_map][255] / 255), [0.5] * 3)
     assert_allclose(compose(channels("relevancy", 0.9), HEAT, RANGES)[0, 0] / 255, hottest, atol=0.003)
     for value in (0.0, 0.3, 1.0):  # without a range it is hot over all of 0 to 1
         shown = channels("relevancy", value)
         assert (compose(shown, HEAT) == compose(shown, HEAT, ((0.0, 1.0),))).all()
 
 
-@pytest.mark.parametrize("name", ["viridis", "cividis", "magma"])
+@pytest.mark.parametrize("name", ["inferno", "viridis", "cividis", "magma"])
 def test_published_colour_maps_are_as_published(name):
     colormaps = pytest.importorskip("matplotlib").colormaps
     expected = np.rint(255 * colormaps[name](np.arange(256))[:, :3])
@@ -181,7 +243,7 @@ def test_every_colour_map_that_can_be_chosen_has_a_table():
     assert mapped(np.array(2.0), "magma").tolist() == (COLOUR_MAPS["magma"][-1] / 255).tolist()
 
 
-@pytest.mark.parametrize("name", ["viridis", "cividis", "magma", "grey"])
+@pytest.mark.parametrize("name", ["inferno", "viridis", "amber", "cividis", "magma", "grey"])
 def test_colour_maps_for_the_colour_blind_brighten(name):
     luminance = COLOUR_MAPS[name] / 255.0 @ (0.2126, 0.7152, 0.0722)
     assert (np.diff(luminance[::8]) > 0).all()

@@ -17,7 +17,7 @@ from langsplat_core.cli.app import parse
 from langsplat_core.cli.export import Export
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
-from langsplat_core.display.displays import Channels, heat_ranges, latent_colours
+from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats, latent_colours
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.webpage import write_page
@@ -122,7 +122,7 @@ def test_page_draws_heat_and_latents_as_opengl_does(tab, demo, engine, gl, measu
     assert demo.language is not None
     answer = engine.run("teddy bear")
     ours = tab.image(camera, origin, "relevancy", "teddy bear")
-    values, ranges = answer.relevancy[answer.level][:, None], heat_ranges([answer])
+    values, ranges = heats(Subject(len(demo.gaussians), answers=[answer])), heat_ranges([answer])
     compare(measured, "demo, heat", ours, drawn(gl, demo, camera, values, display="relevancy", ranges=ranges))
     ours = tab.image(camera, origin, "latent")
     compare(
@@ -307,7 +307,7 @@ def test_page_is_small_and_requests_nothing(browser: Any, page: Path, tmp_path: 
     with open_tab(browser, alone) as tab:
         tab.page.fill("#phrase", "laptop")
         tab.page.press("#phrase", "Enter")
-        assert tab.page.inner_text("#verdict").startswith("Found")
+        assert tab.page.inner_text("#verdict").startswith("found")
         assert [url for url in tab.requests if not url.startswith("blob:")] == [alone.as_uri()]
         assert tab.faults == []
 
@@ -335,7 +335,7 @@ def test_keyboard_alone_searches_and_moves(browser: Any, thin: Path) -> None:
         marked = tab.page.locator(f"#{box.get_attribute('aria-activedescendant')}")
         assert (marked.get_attribute("aria-selected"), marked.inner_text()) == ("true", "teddy bear")
         keys.press("Enter")
-        assert tab.page.inner_text("#verdict").startswith("Found")
+        assert tab.page.inner_text("#verdict").startswith("found")
         assert tab.run(STATE)["display"] == "relevancy"
         tab.page.focus("#scene")
         before = tab.run(STATE)

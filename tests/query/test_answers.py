@@ -259,10 +259,10 @@ def test_verdicts_by_chance_say_how_often_chance_fits_as_well(margin, said):
     verdict = Verdict(margin >= 0, "chance", margin)
     assert verdict.by_chance == pytest.approx(1 / (1 + 19 * np.exp(2 * margin)))
     answer = replace(calibrated(None).run("book"), judgement=verdict)
-    assert answer.said == f"{verdict.outcome} (by chance {said})"
+    assert answer.said == f"{verdict.outcome}, by chance {said}"
     assert verdict.absent.by_chance == 1
     for other, told in (
-        (Verdict(True, "calibration", 1.0, 0.83), "found (83 %)"),
+        (Verdict(True, "calibration", 1.0, 0.83), "found, 83 %"),
         (Verdict(True, "example", 1.0), "found"),
     ):
         assert (other.by_chance, replace(answer, judgement=other).said) == (None, told)

@@ -205,7 +205,8 @@ class Tab:
               const sum = (numbers) => numbers.reduce((a, b) => a + b, 0);
               return { ...answer, ...answer.verdict, verdict: answer.verdict.outcome,
                        by_chance: answer.verdict.byChance, regionFits: null,
-                       codes: null, members: sum(members), mean: sum(values) / values.length };
+                       codes: null, rows: null, smooth: null, members: sum(members),
+                       mean: sum(values) / values.length };
             }""",
             [phrase, level],
         )

@@ -140,6 +140,14 @@ class Answer:
     verdict: Literal["found", "weak match", "not here"] = "found"
     heat_range: tuple[float, float] = (0.5, 0.9)
 
+    @property
+    def smooth(self) -> Array:
+        return (self.relevancy[self.level] + self.even) / 2
+
+    @property
+    def even(self) -> Array:
+        return np.where(self.members, np.float32(0.75), np.float32(0.3))
+
 
 def tree_of(scene: Scene, surface: Surface | None = None) -> Tree:
     """The tree that is built of a scene with a field."""

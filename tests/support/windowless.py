@@ -122,7 +122,8 @@ def open_scene(viewer: Viewer, path: Path | str) -> None:
 
 
 def ask(viewer: Viewer, *phrases: str) -> None:
-    """Search for phrases, and wait for the answers."""
+    """Search for phrases, and wait for the answers; several are shown together."""
+    viewer.put(adds=viewer.state.session.adds or len(phrases) > 1)
     for phrase in phrases:
         queries.ask(viewer, phrase)
     settle(viewer)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from langsplat_core.display.displays import SELECTED
 from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.inventory import Suggestions
@@ -20,7 +21,6 @@ from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.menus import button_label
 from langsplat_viewer.panels.ui import scene_area
 from langsplat_viewer.projects import thumbnail_of
-from langsplat_viewer.rendering.request import TINT
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
 from tests.support.windowless import answer, marked, result
 
@@ -200,7 +200,7 @@ def around(s: Any, centre: np.ndarray) -> tuple[tuple[float, float], tuple[float
 
 def looks_selected(colour: np.ndarray) -> bool:
     """Whether a colour of the picture, 0 to 255, has the tint."""
-    return bool(np.abs(colour - 255 * TINT).max() < 0.55 * 255 and colour[2] > colour[1] + 60)
+    return bool(np.abs(colour - 255 * np.array(SELECTED)).max() < 0.55 * 255 and colour[2] > colour[1] + 60)
 
 
 def select_with_the_mouse(s: Any) -> None:
@@ -449,7 +449,7 @@ LONG = "mugg or boook or plent or mugg or boook or plent or mugg or boook or ple
 def large_letters(s: Any) -> None:
     """At twice the size, in a small window: the column grows, and no widget of any panel is cut off."""
     for phrase in ("mug or plant", LONG):
-        s.search(phrase)
+        s.search(phrase, stay=True)
     assert answer(s, -1).meant  # a long one, and so is the button for it
     narrow = scene_area().left
     settings.prefer(s.viewer, ui_scale=2.0)

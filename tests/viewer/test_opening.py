@@ -373,6 +373,7 @@ def test_second_scene_follows_view_and_queries(two):
     assert [(query.phrase, query.slot) for query in other.session.queries] == [("mug", 0)]
     assert result(two.beside).found
     assert other.view is two.state.view
+    two.put(adds=True)
     for phrase in ("book", "nothing like this"):
         queries.ask(two, phrase)
     queries.set_level(two, "whole")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
+from langsplat_core.display.displays import HEAT_BASE, NO_HEAT, Subject, heats
 from langsplat_core.errors import EncoderError
 from langsplat_core.query.describe import Word
 from langsplat_core.query.inventory import Outline
@@ -47,10 +47,11 @@ def test_query_is_answered_and_shown(opened):
     assert_allclose(result(opened).place, CENTRES[0], atol=0.25)
     assert opened.state.session.picture.display == "relevancy"
     (pane,) = opened.state.panes()
-    columns = relevancies(Subject(360, answers=pane.answers))
+    columns = heats(Subject(360, answers=pane.answers))
     assert columns.shape == (360, 1)
-    assert columns[:120].mean() > 0.9 > 0.6 > columns[120:].mean()
-    assert pane.ranges == (result(opened).heat_range,)
+    assert columns[:120].mean() > 0.9
+    assert not columns[120:].any()
+    assert pane.ranges == ((HEAT_BASE, 1.0),)
 
 
 def test_correction_replaces_the_typo(opened):
@@ -107,10 +108,10 @@ def test_fourth_query_takes_the_colour_of_the_oldest(opened):
     ask(opened, "mug", "book")
     queries.hide(opened, "mug")
     (pane,) = opened.state.panes()
-    columns = relevancies(Subject(360, answers=pane.answers))
+    columns = heats(Subject(360, answers=pane.answers))
     assert columns.shape == (360, 2)
     assert not columns[:, 0].any()
-    assert pane.ranges == (NO_HEAT, result(opened, 1).heat_range)
+    assert pane.ranges == (NO_HEAT, (HEAT_BASE, 1.0))
     assert columns[120:240, 1].mean() > 0.9
     queries.show(opened, "mug")
     assert [query.slot for query in opened.state.session.queries] == [0, 1]
@@ -122,6 +123,44 @@ def test_fourth_query_takes_the_colour_of_the_oldest(opened):
     assert (opened.state.session.queries, opened.state.session.chosen, opened.state.answers) == ((), "", {})
     editing.undo(opened)
     assert phrases(opened) == ["book", "plant", "mug or book"]
+
+
+def test_new_answer_replaces_the_picture_of_the_one_before(opened):
+    ask(opened, "mug")
+    ask(opened, "book")
+    assert [query.slot for query in opened.state.session.queries] == [None, 0]
+    act(queries.ask, opened, "plant; mug")  # together
+    assert {q.phrase: q.slot for q in opened.state.session.queries} == {"book": None, "plant": 0, "mug": 1}
+    ask(opened, "zebra")
+    assert opened.state.shown() == []  # nothing that was not asked
+    editing.undo(opened)
+    assert len(opened.state.shown()) == 2
+    opened.change(adds=True)
+    ask(opened, "book")
+    assert sorted(q.slot for q in opened.state.session.queries) == [0, 1, 2]
+
+
+def test_escape_takes_failed_queries_off_the_list(opened):
+    ask(opened, "mug")
+    ask(opened, "zebra")
+    assert phrases(opened) == ["mug", "zebra"]
+    settings.escape(opened)
+    assert phrases(opened) == ["mug"]
+    assert opened.state.session.chosen == "mug"
+    settings.escape(opened)
+    assert phrases(opened) == ["mug"]
+
+
+def test_name_finds_what_was_given_it_and_others_on_request(opened):
+    half = blob("mug") & (np.arange(360) % 2 == 0)
+    take(opened, half)
+    act(editing.name_selection, opened, "bruno")
+    np.testing.assert_array_equal(result(opened).members, half)
+    assert result(opened).found
+    assert_allclose(result(opened).place, CENTRES[0], atol=0.3)
+    act(queries.show_alike, opened, opened.state.session.queries[0])
+    np.testing.assert_array_equal(result(opened).members, blob("mug"))
+    assert answer(opened).like is None
 
 
 def test_letters_for_a_box_that_is_not_there_are_no_keys(viewer):
@@ -140,8 +179,8 @@ def test_calibrated_scene_gives_probabilities(viewer, monkeypatch, logit, verdic
     found = result(viewer)
     assert (found.verdict, found.found) == (verdict, verdict == "found")
     assert (viewer.state.session.queries[0].slot is None) == (verdict == "not here")
-    said = f"'mug': {verdict} ({100 * found.probability:.0f} %), score "
-    assert answer_line(found).startswith(said)
+    assert found.said == f"{verdict}, {100 * found.probability:.0f} %"
+    assert answer_line(found).startswith(f"'mug': {found.said}, score ")
 
 
 # Thresholds of one's own.

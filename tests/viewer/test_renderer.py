@@ -12,7 +12,7 @@ import pytest
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
-from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, Channels
+from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, HEAT_BASE, Channels, Subject, heats
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.protocol import farthest
@@ -20,6 +20,7 @@ from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from langsplat_viewer.actions import editing, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera
+from langsplat_viewer.marks import Marks
 from langsplat_viewer.rendering import renderer as renderers
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer, renderer_for
 from langsplat_viewer.rendering.request import (
@@ -27,6 +28,7 @@ from langsplat_viewer.rendering.request import (
     RenderRequest,
     Split,
     depth_range,
+    edited_scene,
     image_formation,
     plain_request,
     why_nothing,
@@ -144,10 +146,17 @@ def test_the_shader_composes_as_the_kernel_does(gl, display, queries, more):
 
 
 @pytest.mark.parametrize("display", DISPLAYS)
-def test_the_image_is_that_of_the_reference(renderer, display):
+@pytest.mark.parametrize("split", [Split(), Split("levels")])
+@pytest.mark.parametrize("selects", [False, True])
+def test_the_image_is_that_of_the_reference(renderer, display, split, selects):
     """Either backend against float64 channels composed on the CPU. Pixels at a threshold or at a cut-off
     of image formation may flip; all others agree to 2/255."""
-    request = request_for(display)
+    request = request_for(display, split=split).seen_by(CAMERA)
+    if selects:
+        nothing = np.zeros(COUNT, bool)
+        marks = Marks(np.arange(COUNT) % 2 == 0, nothing, nothing)
+        plain, request = request, replace(request, scene=edited_scene(SCENE, marks))
+        assert largest_difference(renderer.read(request), renderer.read(plain)) > 60
     got = renderer.read(request)
     assert got.shape == (CAMERA.height, CAMERA.width, 3)
     expected = ArrayRenderer(ReferenceRasterizer()).read(request)
@@ -158,10 +167,10 @@ def test_the_reference_image_is_composed_of_float64_channels():
     """Apart from the renderers: colours, depths and relevancies splatted one by one."""
     gaussians = SCENE.gaussians
     view = ReferenceRasterizer().view(gaussians, CAMERA)
-    values = np.stack([answer.relevancy[2] for answer in ANSWERS[:2]], 1)
+    values = heats(Subject(COUNT, answers=ANSWERS[:2]))
     rgb = colours(gaussians.sh, gaussians.means, CAMERA.position)
     image, alpha = view.splat(np.concatenate([rgb, values, view.footprints.depths[:, None]], 1))
-    ranges = {"relevancy": ((0.5, 0.9), (0.5, 0.6)), "depth": (depth_range(gaussians, CAMERA),)}
+    ranges = {"relevancy": ((HEAT_BASE, 1.0),) * 2, "depth": (depth_range(gaussians, CAMERA),)}
     for display, extra in (("relevancy", image[..., 3:5]), ("depth", image[..., 5:])):
         picture = replace(PICTURE, display=display, own_colours=True)
         expected = compose(Channels(image[..., :3], alpha, extra), picture, ranges[display])

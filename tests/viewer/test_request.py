@@ -9,7 +9,6 @@ from PIL import Image
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
 from langsplat_viewer.actions import editing, queries, saving, settings, viewpoint
@@ -22,8 +21,6 @@ from langsplat_viewer.projects import load_preferences, save_preferences
 from langsplat_viewer.rendering.renderer import ArrayRenderer, Inputs, renderer_for
 from langsplat_viewer.rendering.request import (
     AT_RANGE,
-    TINT,
-    TINT_STRENGTH,
     Clip,
     RenderRequest,
     Splats,
@@ -34,7 +31,7 @@ from langsplat_viewer.rendering.request import (
 )
 from langsplat_viewer.session import OVERLAYS, Ruler
 from langsplat_viewer.viewer import Viewer
-from tests.support.fakes import blob_scene, cameras
+from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
 from tests.support.windowless import (
     CHANGES,
@@ -66,7 +63,7 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     mark(viewer, marks)
     viewer.change(splats=Splats(0.8, 0))
     settings.set_clip(viewer, Clip(0.5, 6.5))
-    heat = {"heat_opacity": 0.6, "dim": 0.7, "threshold": 0.3, "heat_scale": (0.1, 0.8)}
+    heat = {"heat_opacity": 0.6, "dim": 0.5, "heat": "own", "threshold": 0.3, "heat_scale": (0.1, 0.8)}
     settings.set_picture(viewer, PictureConfig(**heat, alpha_gate=0.2, background=(0.1, 0.6, 0.3)))
     settings.set_picture(viewer, replace(viewer.state.session.picture, colour_map="viridis"))
     settings.set_display(viewer, "relevancy", 1)
@@ -200,8 +197,8 @@ def test_three_levels_of_latents_or_of_answers(opened):
     relevancy = result(opened).relevancy
     panes, found = opened.state.panes(), Inputs().channels(opened.state.request())
     assert [pane.picture.display for pane in panes] == ["relevancy"] * 3
-    for level, channel in enumerate(found):
-        np.testing.assert_array_equal(channel[:, 0], relevancy[level])
+    for level, channel in enumerate(found[:3]):
+        np.testing.assert_array_equal(channel[:, 0], -relevancy[level])  # of everything
     assert len({pane.ranges for pane in panes}) == 1  # they share one scale
     settings.toggle_levels(opened)
     assert [pane.label for pane in opened.state.panes()] == ["Segmentation"]
@@ -249,45 +246,14 @@ def test_hidden_and_deleted_gaussians_are_left_out():
         assert edited_scene(SCENE, Marks(other, other, other)).scene is SCENE
 
 
-def test_the_selection_is_tinted_from_every_side():
-    source = replace(SCENE, gaussians=random_gaussians(360, sh_degree=2), language=None)
-    # Far from black, where colours are clamped and no longer linear.
-    source.gaussians.sh[:, 0] = np.abs(source.gaussians.sh[:, 0]) + 1
-    selected = blob("mug")
-    tinted = edited_scene(source, Marks(selected, NOTHING, NOTHING)).scene
-    for name in ("means", "log_scales", "quats_wxyz", "opacity_logits"):
-        np.testing.assert_array_equal(getattr(tinted.gaussians, name), getattr(source.gaussians, name))
-    np.testing.assert_array_equal(tinted.gaussians.sh[~selected], source.gaussians.sh[~selected])
-    assert tinted.antialiased == source.antialiased
-    for camera in cameras():
-        before, after = (
-            splat_colours(ReferenceRasterizer().view(gaussians, camera), gaussians)
-            for gaussians in (source.gaussians.take(selected), tinted.gaussians.take(selected))
-        )
-        wanted = (1 - TINT_STRENGTH) * before.colours + TINT_STRENGTH * before.alpha[..., None] * TINT
-        np.testing.assert_allclose(after.colours, wanted, atol=2e-5)
-
-
-def test_channels_of_colours_are_tinted_and_others_not():
-    edited = edited_scene(SCENE, Marks(blob("book"), blob("mug"), NOTHING))
-    colours = np.full((360, 3), 0.5, np.float32)
-    mixed = edited.values(colours, is_colour=True)
-    wanted = np.tile((1 - TINT_STRENGTH) * 0.5 + TINT_STRENGTH * TINT, (120, 1))
-    np.testing.assert_allclose(mixed[:120], wanted, rtol=1e-6)
-    np.testing.assert_array_equal(mixed[120:], 0.5)
-    np.testing.assert_array_equal(colours, 0.5)
-    np.testing.assert_array_equal(edited.values(colours), colours[:240])
-
-
 def test_edited_scenes_share_what_did_not_change():
     marks = Marks(NOTHING, blob("mug"), NOTHING)
     first = edited_scene(SCENE, marks)
     assert edited_scene(SCENE, marks, first) is first
     selected = edited_scene(SCENE, replace(marks, selected=blob("book")), first)
-    assert selected.untinted is first.scene
-    assert selected.scene is not first.scene
-    back = edited_scene(SCENE, replace(marks, selected=NOTHING), selected)
-    assert back.scene is first.scene
+    assert selected.scene is first.scene  # so that nothing is projected anew
+    assert (selected != first, first.selected) == (True, None)
+    np.testing.assert_array_equal(selected.selected[:, 0], blob("book")[first.rows])
     other = edited_scene(blob_scene(), marks, first)
     assert other.source is not SCENE
     assert other.scene is not first.scene

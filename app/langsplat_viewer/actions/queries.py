@@ -1,20 +1,27 @@
 """Searching: the box, the list of queries, their colours, thresholds and level."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError, UnknownWordError
-from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
+from langsplat_core.pipeline.evidence import (
+    draw_evidence,
+    find_evidence,
+    is_kept,
+    kept_features,
+    kept_photographs,
+)
 from langsplat_core.progress import Progress
-from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import run_phrase
+from langsplat_core.query.answers import QueryResult, place_of
+from langsplat_core.query.compose import ComposedResult, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.inventory import Suggestions, combined, completions, corrected, suggest
+from langsplat_core.query.rule import Verdict
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
@@ -30,58 +37,56 @@ SIMPLE = 3  # examples without structure
 def ask(viewer: Viewer, text: str) -> None:
     """Search the scene for a phrase, or for several between commas, and show where each is true."""
     phrases = split_phrases(text)
-    for phrase in phrases:
-        ask_one(viewer, phrase)
+    ask_together(viewer, phrases)
     if text.strip() and not phrases:
         viewer.say_error(f"'{text.strip()[:40]}' has no word to look for")
 
 
-def ask_one(viewer: Viewer, phrase: str) -> None:
-    """Search the scene for one phrase, and give it a colour if it may be there."""
-    state, key = viewer.state, phrase_key(phrase)
-    if viewer.searchable() is None:
-        return
-    viewer.remember()
-    queries = state.session.queries
-    query = next((query for query in queries if phrase_key(query.phrase) == key), Query(phrase))
-    others = (other for other in queries if other is not query)
-    viewer.put(queries=(*others, replace(query, cut=None)), chosen=query.phrase)  # in the order of asking
-    state.asked = [*(earlier for earlier in state.asked if phrase_key(earlier) != key), phrase]
-    state.recalled = len(state.asked)
-    answer(viewer, query.phrase, then_show=True)
+def ask_together(viewer: Viewer, phrases: Sequence[str]) -> None:
+    """Search the scene for phrases, and give a colour to each that may be there."""
+    state, listed = viewer.state, list[str]()
+    for phrase in phrases if viewer.searchable() is not None else ():
+        viewer.remember()
+        queries, key = state.session.queries, phrase_key(phrase)
+        query = next((query for query in queries if phrase_key(query.phrase) == key), Query(phrase))
+        others = (other for other in queries if other is not query)
+        viewer.put(queries=(*others, replace(query, cut=None)), chosen=query.phrase)  # in the order of asking
+        state.asked = [*(earlier for earlier in state.asked if phrase_key(earlier) != key), phrase]
+        state.recalled = len(state.asked)
+        listed.append(query.phrase)
+    for phrase in listed:
+        answer(viewer, phrase, shown_with=listed)
 
 
-def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
+def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = ()) -> None:
     """Have the worker answer a query of the list; only what may be there takes a colour.
 
-    Its instances come later: the surface that they are told apart on takes seconds where there are a million
-    Gaussians.
+    shown_with: the phrases that were asked together, it too; without, what is shown stays. Its instances come
+    later: the surface that they are told apart on takes seconds where there are a million Gaussians.
     """
     state, engine, level = viewer.state, viewer.engine, viewer.state.session.level
     if engine is None:
         return
     viewpoint = None if state.view is None else state.view.camera(*state.size)
+    path, members = state.path, state.named.get(phrase_key(phrase))
 
     def work(progress: Progress) -> QueryAnswer:
         try:
             composed = run_phrase(engine, phrase, level, viewpoint, progress)
         except UnknownWordError as error:
             return QueryAnswer(problem=str(error), meant=corrected(phrase, error.near) or "")
-        # A copy has its arrays: they are made here, and not by the thread that draws.
-        found = replace(composed.answer)
-        reading = "" if isinstance(composed.tree, Atom) else composed.reading
-        return QueryAnswer(found, (), reading, heads(composed.tree))
+        return _answer_of(composed, members, path is not None and is_kept(path, engine.scene))
 
     def done(found: QueryAnswer) -> None:
         if phrase not in state.answers:  # it was taken off meanwhile
             return
         state.answers[phrase] = found
+        if shown_with:
+            painted = found.result is not None and found.result.verdict != "not here"
+            state.session = state.session.answering(phrase, painted, shown_with)
         if found.result is None:
             viewer.say_error(found.problem)
-            return
-        if then_show:
-            state.session = state.session.answering(phrase, painted=found.result.verdict != "not here")
-        if found.result.found:
+        elif found.result.found:
             _tell_apart(viewer, engine, phrase, found.result)
 
     def failed(reason: str) -> None:
@@ -89,6 +94,37 @@ def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
 
     state.answers[phrase] = replace(state.answers.get(phrase, QueryAnswer()), pending=True)
     viewer.run(f"searching '{phrase}'", work, done, failed)
+
+
+def _answer_of(composed: ComposedResult, members: Array | None, has_evidence: bool) -> QueryAnswer:
+    """Return the answer with what is shown of it; members: (N,) bool of what was given it as a name."""
+    # A copy has its arrays: they are made here, and not by the thread that draws.
+    found = like = replace(composed.answer)
+    if members is not None:
+        found = _alone(like, members)
+    if found.verdict != "not here":
+        _ = found.smooth  # kept with it, for the first image that shows it
+    return QueryAnswer(
+        found,
+        reading="" if isinstance(composed.tree, Atom) else composed.reading,
+        asked_for=heads(composed.tree),
+        has_evidence=has_evidence,
+        like=like if members is not None and (like.members & ~members).any() else None,
+    )
+
+
+def _alone(like: QueryResult, members: Array) -> QueryResult:
+    """Return the answer to a name that is the thing which was given it, and not all that is like it."""
+    place, box = place_of(like.points[members])
+    judgement = Verdict(True, like.judgement.reached, max(like.judgement.margin, 0.0))
+    return replace(like, members=members, place=place, box=box, judgement=judgement)
+
+
+def show_alike(viewer: Viewer, query: Query) -> None:
+    """Show of a name, which finds what was given it, all that is like that."""
+    state = viewer.state
+    state.named = {key: members for key, members in state.named.items() if key != phrase_key(query.phrase)}
+    answer(viewer, query.phrase, shown_with=[query.phrase])
 
 
 def _tell_apart(viewer: Viewer, engine: QueryEngine, phrase: str, result: QueryResult) -> None:
@@ -131,7 +167,7 @@ def focus_search(viewer: Viewer) -> None:
 
 
 def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None] = lambda name: None) -> None:
-    """Have the worker teach a name by the language of (N,) bool, and search for it.
+    """Have the worker teach a name by the language of (N,) bool, and search for it: it finds just these.
 
     What is saved from now on keeps it. `done` gets the name, if the scene is still there.
     """
@@ -139,7 +175,8 @@ def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None]
     def taught(word: TaughtWord) -> None:
         done(word.name)
         viewer.state.say(f"taught '{word.name}'; to keep it, save the scene")
-        ask_one(viewer, word.name)
+        viewer.state.named = {**viewer.state.named, word.key: members}
+        ask_together(viewer, [word.name])
 
     viewer.ask_engine(f"teaching '{name}'", lambda engine, _: engine.teach(name, members), taught)
 

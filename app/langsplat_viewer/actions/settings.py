@@ -210,7 +210,10 @@ def toggle_palette(viewer: Viewer) -> None:
 
 
 def escape(viewer: Viewer) -> None:
-    """Close what lies over the scene; where nothing does leave the stroke, else the tool."""
+    """Close what lies over the scene; where nothing does leave the stroke, else the tool.
+
+    Queries that failed leave the list.
+    """
     state, tools = viewer.state, viewer.state.tools
     lay_over = state.show_help or state.show_palette or state.browser or state.leaving or state.show_start
     state.show_start &= state.scene is None
@@ -218,5 +221,9 @@ def escape(viewer: Viewer) -> None:
     state.browser = state.leaving = None
     if state.session.ruler.measures:
         toggle_measuring(viewer)
+    failed = {query.phrase for query in state.session.queries if state.answer(query).problem}
+    if failed:
+        left = tuple(query for query in state.session.queries if query.phrase not in failed)
+        viewer.change(queries=left, chosen=left[-1].phrase if left else "")
     if not lay_over:
         state.tools = replace(tools, stroke=None, tool=tools.tool if tools.stroke else None)

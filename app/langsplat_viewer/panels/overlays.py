@@ -11,6 +11,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_core.arrays import Array, length_text
 from langsplat_core.config import ColourMap
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, Drawing, mapped, painted
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import LevelWords
 from langsplat_core.scene import LEVELS, NO_ORIGIN, Camera
 from langsplat_viewer.actions import saving, settings, viewpoint
@@ -368,9 +369,15 @@ def draw_legends(viewer: Viewer, area: ui.Area) -> None:
     if viewer.beside is None:
         draw_legend(viewer, area)
         return
-    at = viewer.state.session.split.at
-    draw_legend(viewer, replace(area, width=at * area.width))
-    draw_legend(viewer.beside, area, "relevancy beside")
+    at = viewer.state.session.split.at * area.width
+    left = replace(area, width=at)
+    right = replace(area, left=area.left + at, width=area.width - at)
+    for side, part, name in ((viewer, left, "left"), (viewer.beside, right, "right")):
+        draw_legend(side, part, f"relevancy {name}")
+        query = side.state.session.query(viewer.state.session.chosen)
+        result = None if query is None else side.state.result(query)
+        if result is not None and result.verdict == "not here":
+            say(f"'{result.phrase}': {result.said}", part, f"{name} side")
 
 
 def draw_legend(viewer: Viewer, area: ui.Area, name: str = "relevancy") -> None:
@@ -385,9 +392,10 @@ def draw_legend(viewer: Viewer, area: ui.Area, name: str = "relevancy") -> None:
     for slot in slots:
         result = shown[slot]
         if result is not None:
-            strength = STRENGTH[result.verdict]
-            colours = bar_colours(slot, strength, len(slots) == 1, state.session.picture.colour_map)
-            _bar(result.phrase, colours, state.session.picture.heat_scale or result.heat_range)
+            colours = bar_colours(
+                STRENGTH[result.verdict], state.session.picture.colour_map if len(slots) == 1 else slot
+            )
+            _bar(result, colours, state.session.picture.heat_scale or result.heat_range)
     imgui.end()
 
 
@@ -414,25 +422,28 @@ def say(text: str, area: ui.Area, name: str = "said over the scene", top: float 
     imgui.end()
 
 
-def bar_colours(slot: int, strength: float, alone: bool, colour_map: ColourMap = "turbo") -> Array:
+def bar_colours(strength: float, by: ColourMap | int) -> Array:
     """Return the (STEPS, 3) colours of a bar from its coldest to its hottest end, as the image has them.
 
-    That is the colour map for a query that is painted alone, else black to its own colour; what is half as
-    strong ends there.
+    by: the colour map, or the slot of a query among several, which has its own colour. What is half as strong
+    ends in the middle.
     """
     heat = np.linspace(0, strength, STEPS)
-    if alone:
-        return mapped(heat, colour_map)
-    return (heat * heat * (3 - 2 * heat))[:, None] * QUERY_COLOURS[slot]
+    return (0.5 + 0.5 * heat)[:, None] * QUERY_COLOURS[by] if isinstance(by, int) else mapped(heat, by)
 
 
-def _bar(phrase: str, colours: Array, ends: tuple[float, float]) -> None:
-    """Phrase, bar, and the relevancies at its ends and in its middle."""
+def _bar(result: QueryResult, colours: Array, ends: tuple[float, float]) -> None:
+    """Phrase, bar with a tick at the threshold, and the relevancies at its ends and in its middle."""
     width, height = hello_imgui.em_size(BAR_EM), hello_imgui.em_size(BAR_HEIGHT_EM)
-    imgui.text_unformatted(ui.elided(phrase, width))
-    draw_bar(imgui.get_cursor_screen_pos(), width, height, colours)
+    imgui.text_unformatted(ui.elided(result.phrase, width))
+    start, (low, high) = imgui.get_cursor_screen_pos(), ends
+    draw_bar(start, width, height, colours)
+    x = start.x + width * min(max((result.cut - low) / (high - low), 0.0), 1.0)
+    for colour, thick in ((SHADE, 4.0), (WHITE, 2.0)):
+        imgui.get_window_draw_list().add_line(
+            ImVec2(x, start.y - 2), ImVec2(x, start.y + height), colour, thick
+        )
     imgui.dummy(ImVec2(width, height))
-    low, high = ends
     x = imgui.get_cursor_pos_x()
     for place, value in ((0.0, low), (0.5, (low + high) / 2), (1.0, high)):
         text = f"{value:.2f}"

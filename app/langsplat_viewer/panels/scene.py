@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_core.config import TrainPreset
-from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow
+from langsplat_core.config import HeatOf, TrainPreset
+from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow, Drawing
 from langsplat_core.query.answers import FLOOR
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import opening, settings
@@ -60,6 +60,14 @@ LEAST_SPAN = 1e-3  # of a heat scale
 BACKDROPS = {(grey, grey, grey): name for name, grey in (("Black", 0.0), ("Grey", 0.5), ("White", 1.0))}
 
 
+HEAT_TIPS: dict[HeatOf, str] = {
+    "smooth": "Relevancy within the answer, smoothed along its surface",
+    "own": "Each Gaussian's own relevancy within the answer",
+    "node": "The mean of each thing or part of the answer",
+    "everywhere": "Each Gaussian's own relevancy, in the answer or not",
+}
+
+
 def draw_display(viewer: Viewer) -> None:
     """Draw the panel "Display": what is shown, and how."""
     for _, group in groupby(DISPLAYS.values(), lambda row: row.name if row.by_level else row.needs_query):
@@ -69,7 +77,8 @@ def draw_display(viewer: Viewer) -> None:
     needs_query = DISPLAYS[picture.display].needs_query
     if needs_query and not viewer.state.shown():
         ui.small_wrapped("search for something to see where it is", ui.muted())
-    if picture.display == "relevancy":
+    if any(pane.row.drawing is Drawing.HEAT for pane in viewer.state.panes()):
+        picture = replace(picture, heat=ui.radio({of: of for of in HEAT_TIPS}, picture.heat, HEAT_TIPS))
         picture = replace(picture, heat_opacity=ui.slider("Heat opacity", picture.heat_opacity, (0.0, 1.0)))
         picture = replace(picture, heat_scale=_heat_scale(viewer))
     if needs_query:

@@ -148,7 +148,7 @@ def _answers(viewer: Viewer) -> None:
 def _line(viewer: Viewer, query: Query) -> None:
     """Colour, phrase, verdict and a button to take it off; the phrase gets what the others leave."""
     spacing, side = imgui.get_style().item_spacing.x, imgui.get_frame_height()
-    verdict_width = ui.width_of("weak match")
+    verdict_width = ui.width_of("found, by chance 5 %")
     left, right = imgui.get_cursor_pos_x(), imgui.get_content_region_avail().x
     room = right - 2 * side - verdict_width - 3 * spacing
     _swatch(viewer, query, side)
@@ -160,7 +160,7 @@ def _line(viewer: Viewer, query: Query) -> None:
     ui.tip(query.phrase if name != query.phrase else "")
     imgui.same_line(left + right - side - spacing - verdict_width)
     imgui.align_text_to_frame_padding()
-    _verdict(viewer, query)
+    _verdict(viewer, query, verdict_width)
     imgui.same_line(left + right - side)
     if imgui.button("x", ImVec2(side, 0)):
         queries.remove(viewer, query.phrase)
@@ -177,53 +177,60 @@ def _swatch(viewer: Viewer, query: Query, side: float) -> None:
     state, result = viewer.state, viewer.state.result(query)
     alone = state.session.picture.display == "relevancy" and len(painted(state.shown_results())) == 1
     if shown and alone and result is not None:  # painted by the colour map
-        colours = bar_colours(0, STRENGTH[result.verdict], True, state.session.picture.colour_map)
+        colours = bar_colours(STRENGTH[result.verdict], state.session.picture.colour_map)
         draw_bar(imgui.get_item_rect_min(), side, side, colours)
 
 
-def _verdict(viewer: Viewer, query: Query) -> None:
+def _verdict(viewer: Viewer, query: Query, width: float) -> None:
     answer, result = viewer.state.answer(query), viewer.state.result(query)
     if answer.pending:
         imgui.text_colored(ui.muted(), "...")
     elif answer.problem:
         imgui.text_colored(ui.bad(), "unknown")
     elif result is not None:
-        imgui.text_colored(ui.good() if result.found else ui.muted(), result.verdict)
-        ui.tip(result.said)
+        imgui.text_colored(ui.good() if result.found else ui.muted(), ui.elided(result.said, width))
+        ui.tip(f"{result.phrase}: {result.said}")
 
 
 def _details(viewer: Viewer, query: Query) -> None:
-    """Place and a button to go there, scores per level, how it was read or why it was not answered."""
+    """How it was read or why it was not answered; of what may be here place, scores and threshold."""
     answer, result = viewer.state.answer(query), viewer.state.result(query)
-    place = None if result is None or result.verdict == "not here" else result.place
-    if ui.button("Focus", enabled=place is not None):
-        viewpoint.focus_result(viewer, query)
-    imgui.same_line()
-    if ui.button(
-        "Why?",
-        "The photographs and masks that the answer stands on, the best and the worst",
-        enabled=result is not None,
-    ):
-        queries.explain(viewer, query)
-    if place is not None:
-        imgui.text_colored(ui.muted(), "at " + length_text(place, "  ", 2, viewer.state.origin))
-        ui.tip("Where it is relevant most; world units")
     if answer.problem:
         ui.small_wrapped(answer.problem, ui.bad())
     if answer.reading:
         ui.small_wrapped(f"read as: {answer.reading}", ui.muted())
-    if result is not None:
-        for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
-            if index:
-                imgui.same_line()
-            plain = imgui.get_style_color_vec4(imgui.Col_.text)
-            imgui.text_colored(plain if index == result.level else ui.muted(), f"{name} {score:.2f}")
-            ui.tip(f"The best relevancy at the level '{name}'; the brighter one answers")
-        _cut(viewer, query, result)
+    if result is None or result.verdict == "not here":
+        return
+    if ui.button("Focus", enabled=result.place is not None):
+        viewpoint.focus_result(viewer, query)
+    if answer.has_evidence and ui.next_button(
+        "Why?", "The photographs and masks that the answer stands on, the best and the worst"
+    ):
+        queries.explain(viewer, query)
+    if answer.like is not None and ui.next_button("Like it", "Find what is like it, too"):
+        queries.show_alike(viewer, query)
+    if result.place is not None:
+        imgui.text_colored(ui.muted(), "at " + length_text(result.place, "  ", 2, viewer.state.origin))
+        ui.tip("Where it is relevant most; world units")
+    if not answer.has_evidence:
+        ui.small_wrapped(NO_EVIDENCE, ui.muted())
+    _scores(result)
+    _cut(viewer, query, result)
+
+
+def _scores(result: QueryResult) -> None:
+    for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
+        if index:
+            imgui.same_line()
+        plain = imgui.get_style_color_vec4(imgui.Col_.text)
+        imgui.text_colored(plain if index == result.level else ui.muted(), f"{name} {score:.2f}")
+        ui.tip(f"The best relevancy at the level '{name}'; the brighter one answers")
 
 
 # The panel.
 
+NO_EVIDENCE = "Why? needs the masks that Train keeps beside a scene"
+NEW = {False: "replace", True: "add"}  # what a new answer does to those that are shown
 LEVEL_TIPS: dict[LevelChoice, str] = {
     name: "The level that answers best" if name == "auto" else "How finely things are divided"
     for name in get_args(LevelChoice)
@@ -256,3 +263,8 @@ def _level(viewer: Viewer) -> None:
     queries.set_level(
         viewer, ui.radio({name: name for name in LEVEL_TIPS}, viewer.state.session.level, LEVEL_TIPS)
     )
+    imgui.align_text_to_frame_padding()
+    imgui.text("New answers")
+    ui.beside_boxed(NEW[False])
+    viewer.change("adds", adds=ui.radio(NEW, viewer.state.session.adds))
+    ui.tip("Whether the picture of the answer before goes; its row stays in the list")

@@ -8,6 +8,7 @@ import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui, imguizmo
 
 from langsplat_core.arrays import Array
+from langsplat_core.display.displays import SELECTED
 from langsplat_core.errors import LangSplatError
 from langsplat_core.scene import Camera
 from langsplat_core.scene.transform import Similarity, moving, scaling, similarity
@@ -16,7 +17,6 @@ from langsplat_viewer.actions import editing, settings
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import say
-from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.session import Point
 from langsplat_viewer.state import Gizmo
 from langsplat_viewer.viewer import Viewer
@@ -116,7 +116,7 @@ HINTS: dict[Tool, str] = {
 }
 TOOL_KEYS = "Shift adds, Ctrl removes, both intersect; Esc leaves"
 LIGHT, DARK = (1.0, 1.0, 1.0, 0.95), (0.0, 0.0, 0.0, 0.6)  # a line in two colours is seen on every image
-PAINT = (float(TINT[0]), float(TINT[1]), float(TINT[2]), 0.35)
+PAINT = (*SELECTED, 0.35)
 
 
 def handle_stroke(viewer: Viewer, area: ui.Area) -> None:

@@ -70,7 +70,7 @@ class Inputs:
 
     def scene(self, request: RenderRequest) -> Scene:
         """Return the Gaussians that are projected, as a scene."""
-        of = (request.scene, request.splats, request.merged)
+        of = (request.scene.scene, request.splats, request.merged)
         if self._scene is None or self._scene[0] != of:
             scene = request.scene.scene
             if request.merged is not None:
@@ -79,25 +79,34 @@ class Inputs:
         return self._scene[1]
 
     def channels(self, request: RenderRequest) -> list[Channel]:
-        """Return the further channel of each pane."""
+        """Return the further channel of each pane, then that of what is selected."""
         if self._of != (request.scene, request.answers):
             self._of, self._channels = (request.scene, request.answers), {}
-        wanted = [(pane, (pane.row.channel, pane.level, request.merged)) for pane in request.panes]
+        wanted = [
+            (pane, (pane.row.channel, pane.level, pane.picture.heat, request.merged))
+            for pane in request.panes
+        ]
         for pane, key in wanted:
             if key not in self._channels:
                 self._channels[key] = _channel(request, pane)
-        return [self._channels[key] for _, key in wanted]
+        selected = "selected", request.merged
+        if selected not in self._channels:
+            self._channels[selected] = _merged(request, request.scene.selected)
+        return [self._channels[key] for key in (*(key for _, key in wanted), selected)]
 
 
 def _channel(request: RenderRequest, pane: Pane) -> Channel:
     make, source = pane.row.channel, request.scene.source
     if make is None or make == "depth":
         return make
-    values = make(Subject(len(source.gaussians), source.language, pane.answers, pane.level))
-    if values is None:
-        return None
-    values = request.scene.values(values, pane.row.is_colour)
-    return values if request.merged is None else request.merged.values(values)
+    subject = Subject(len(source.gaussians), source.language, pane.answers, pane.level, pane.picture.heat)
+    values = make(subject)
+    return _merged(request, None if values is None else request.scene.values(values))
+
+
+def _merged(request: RenderRequest, values: Array | None) -> Array | None:
+    """Return values of the Gaussians that are drawn for those of the edited scene's."""
+    return values if values is None or request.merged is None else request.merged.values(values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +150,7 @@ class Renderer(ABC, Generic[L]):
 
     @abstractmethod
     def _splat(self, view: View, scene: Scene, channels: tuple[Channel, ...]) -> tuple[L, ...]:
-        """Return colours with alpha, then the layer of each channel: at most three, none of them twice."""
+        """Return colours with alpha, then the layer of each channel: at most four, none of them twice."""
 
     @abstractmethod
     def _alpha(self, layer: L) -> Array:
@@ -198,7 +207,10 @@ class Renderer(ABC, Generic[L]):
         return self._layers
 
     def _rasterized(self, request: RenderRequest) -> tuple[Layers[L], list[Channel]]:
-        """Return the layers of all panes and the channel of each; what is missing of them is rasterized."""
+        """Return the layers of all panes, their channels and that of the selection.
+
+        What is missing of them is rasterized.
+        """
         layers, wanted = self._projected(request), self._inputs.channels(request)
         if not layers.have(wanted):
             layers = self._layers = replace(layers, channels=_distinct(wanted), images=())
@@ -241,9 +253,10 @@ class ArrayRenderer(Renderer[Channels]):
         return request.split.joined(self._composed(request, compose), request.width)
 
     def _composed(self, request: RenderRequest, composer: Callable[..., Array]) -> list[Array]:
-        layers, channels = self._rasterized(request)
+        layers, (*channels, selected) = self._rasterized(request)
+        marked = None if selected is None else layers.of(selected).extra
         return [
-            composer(layers.of(channel), pane.picture, _ranges(request, pane))
+            composer(replace(layers.of(channel), selected=marked), pane.picture, _ranges(request, pane))
             for pane, channel in zip(request.panes, channels, strict=True)
         ]
 
@@ -292,19 +305,19 @@ class GlRenderer(Renderer[moderngl.Texture]):
         self._of: Scene | None = None  # whose Gaussians have them
 
     def draw(self, request: RenderRequest, targets: Sequence[moderngl.Texture]) -> None:
-        layers, channels = self._rasterized(request)
+        layers, (*channels, selected) = self._rasterized(request)
         for pane, channel, texture in zip(request.panes, channels, targets, strict=True):
             target = self._ctx.framebuffer([texture])
-            self._compose(request, pane, layers, channel, target)
+            self._compose(request, pane, layers, (channel, selected), target)
             target.release()
 
     def read(self, request: RenderRequest) -> Array:
         camera, components = request.camera, 4 if request.picture.transparent else 3
-        (layers, channels), images = self._rasterized(request), []
+        (layers, (*channels, selected)), images = self._rasterized(request), []
         target = self._ctx.framebuffer([self._ctx.renderbuffer((camera.width, camera.height), 4)])
         try:
             for pane, channel in zip(request.panes, channels, strict=True):
-                self._compose(request, pane, layers, channel, target)
+                self._compose(request, pane, layers, (channel, selected), target)
                 pixels = np.frombuffer(target.read(components=components, alignment=1), np.uint8)
                 images.append(pixels.reshape(camera.height, camera.width, components)[::-1].copy())
         finally:
@@ -334,14 +347,16 @@ class GlRenderer(Renderer[moderngl.Texture]):
         request: RenderRequest,
         pane: Pane,
         layers: Layers[moderngl.Texture],
-        channel: Channel,
+        channels: tuple[Channel, Channel],  # the pane's, and that of the selection
         target: moderngl.Framebuffer,
     ) -> None:
-        picture = pane.picture
+        picture, (channel, selected) = pane.picture, channels
         uniforms: dict[str, object] = {
             "colours": 0,
             "extra": 1,
             "colour_maps": 2,
+            "selection": 3,
+            "has_selection": selected is not None,
             "colour_map": list(COLOUR_MAPS).index(picture.colour_map),
             "transparent": picture.transparent,
             "display": int(drawing_of(picture.display, channel is not None)),
@@ -355,7 +370,9 @@ class GlRenderer(Renderer[moderngl.Texture]):
             "background": picture.background,
         }
         set_uniforms(self._program, uniforms)
-        for unit, texture in enumerate((layers.images[0], layers.of(channel), self._maps)):
+        for unit, texture in enumerate(
+            (layers.images[0], layers.of(channel), self._maps, layers.of(selected))
+        ):
             texture.use(unit)
         with drawing(self._ctx, target, moderngl.NOTHING):
             self._vao.render(moderngl.TRIANGLES, vertices=3)

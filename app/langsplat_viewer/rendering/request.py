@@ -17,7 +17,6 @@ from langsplat_core.config import Display, PictureConfig, RasterSettings
 from langsplat_core.display.displays import DISPLAYS, Answers, DisplayRow, Ranges, painted
 from langsplat_core.scene import LEVELS, SH_COUNTS, Camera, Gaussians, Scene, near_plane
 from langsplat_core.scene.gaussians import Merged
-from langsplat_core.scene.transform import C0
 from langsplat_viewer.marks import Marks
 
 # View settings that a request has.
@@ -98,11 +97,7 @@ class Split:
         return np.pad(whole, ((0, 0), (0, max(width - whole.shape[1], 0)), (0, 0)), "edge")
 
 
-# The edited scene: without what is hidden or deleted, and with the selection in its own colour. A renderer
-# draws it as it draws any other scene.
-
-TINT = np.array([1.0, 0.15, 0.85], np.float32)  # unlike the colours of queries, and rare in photographs
-TINT_STRENGTH = 0.6  # the rest is the Gaussian's own colour, so that shapes stay readable
+# The edited scene: without what is hidden or deleted. A renderer draws it as it draws any other scene.
 
 
 @dataclass(frozen=True)
@@ -113,46 +108,35 @@ class EditedScene:
     marks: Marks | None
     scene: Scene = field(compare=False)  # M Gaussians
     rows: Array | None = field(compare=False)  # (M,) int64 which of the source's they are; None: all
-    selected: Array | None = field(compare=False)  # (M,) bool; None: nothing
-    untinted: Scene = field(compare=False)  # of the same Gaussians, in their own colours
+    selected: Array | None = field(compare=False)  # (M, 1) float32, 1 for what is selected; None: nothing
 
-    def values(self, values: Array, is_colour: bool = False) -> Array:
-        """Return (M, C) values of those drawn for (N, C) of the source's; colours are tinted as theirs."""
+    def values(self, values: Array) -> Array:
+        """Return (M, C) values of those drawn for (N, C) of the source's."""
         taken: Array = values if self.rows is None else values[self.rows]
-        if not is_colour or self.selected is None:
-            return taken
-        mixed = np.array(taken, np.float32)
-        mixed[self.selected] += TINT_STRENGTH * (TINT - mixed[self.selected])
-        return mixed
+        return taken
 
 
 def edited_scene(source: Scene, marks: Marks | None = None, before: EditedScene | None = None) -> EditedScene:
     """Return `source` with its edits; marks for another number of Gaussians count as none.
 
-    The last one made, `before`, is used as far as it fits: where only the selection changed, only colours are
-    made anew.
+    The last one made, `before`, is used as far as it fits: where only the selection changed, the scene stays.
     """
     if before is not None and before.source is source and before.marks is marks:
         return before
     if marks is None or len(marks.selected) != len(source.gaussians):
-        return EditedScene(source, marks, source, None, None, source)
+        return EditedScene(source, marks, source, None, None)
     old = before.marks if before is not None and before.source is source else None
     if before is not None and old is not None and old.hidden is marks.hidden and old.deleted is marks.deleted:
-        rows, untinted = before.rows, before.untinted
+        rows, scene = before.rows, before.scene
     elif marks.shown.all():
-        rows, untinted = None, source
+        rows, scene = None, source
     else:  # images need neither the language field nor what else a file holds
         rows = np.flatnonzero(marks.shown)
-        untinted = replace(source, gaussians=source.gaussians.take(rows), language=None, extras={})
+        scene = replace(source, gaussians=source.gaussians.take(rows), language=None, extras={})
     selected = marks.selected if rows is None else marks.selected[rows]
-    if not selected.any():
-        return EditedScene(source, marks, untinted, rows, None, untinted)
-    # A colour is linear in its coefficients: mixing these mixes it from every side, but for what is clamped.
-    sh = untinted.gaussians.sh.copy()
-    sh[selected] *= 1 - TINT_STRENGTH
-    sh[selected, 0] += TINT_STRENGTH * (TINT - 0.5) / C0
-    tinted = untinted.recoloured(replace(untinted.gaussians, sh=sh))
-    return EditedScene(source, marks, tinted, rows, selected, untinted)
+    return EditedScene(
+        source, marks, scene, rows, selected[:, None].astype(np.float32) if selected.any() else None
+    )
 
 
 # The request.
@@ -174,7 +158,8 @@ class Pane:
     @property
     def ranges(self) -> Ranges:
         """Values of its channel that are drawn as 0 and as 1, as far as they follow from the answers."""
-        return self.row.ranges(self.answers, self.picture.heat_scale)
+        everywhere = self.picture.heat == "everywhere" or self.level is not None
+        return self.row.ranges(self.answers, self.picture.heat_scale, everywhere)
 
     @property
     def label(self) -> str:
@@ -246,7 +231,7 @@ class RenderRequest:
     @property
     def projection(self) -> tuple[object, ...]:
         """Equal where one projection of the Gaussians serves both requests."""
-        return self.scene, self.merged, self.splats, self.clip, self.pose
+        return self.scene.scene, self.merged, self.splats, self.clip, self.pose
 
     def seen_by(self, camera: Camera) -> "RenderRequest":
         """Return the request by another camera of the image's size, which is fitted into each pane."""

@@ -32,7 +32,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
-from langsplat_core.display.displays import Channels
+from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats
 from langsplat_core.errors import EncoderError, FormatError, InputError, LangSplatError, printable_line
 from langsplat_core.io.files import atomic_path, is_utf8, locked, shown
 from langsplat_core.io.hostile import FromFile, exists, open_for_reading
@@ -598,9 +598,9 @@ def draw(scene: Scene, size: tuple[int, int], answer: QueryResult | None = None)
         return compose(Channels(drawn.colours, drawn.alpha), PictureConfig())
     if answer.place is not None:
         camera = min(fitted, key=partial(_away, place=answer.place), default=camera)
-    drawn = render(scene, camera, (answer.even * answer.members)[:, None])
+    drawn = render(scene, camera, heats(Subject(len(scene.gaussians), answers=[answer])))
     heat = Channels(drawn.colours, drawn.alpha, drawn.values)
-    return compose(heat, PictureConfig(display="relevancy"), (answer.heat_range,))
+    return compose(heat, PictureConfig(display="relevancy"), heat_ranges([answer]))
 
 
 def _away(camera: Camera, place: Array) -> float:

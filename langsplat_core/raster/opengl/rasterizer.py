@@ -197,7 +197,7 @@ class SceneTextures:
 
 # Drawing.
 
-MAX_TARGETS = 4  # colour attachments of one pass, three values each
+MAX_TARGETS = 4  # colour attachments of one pass that is measured, three values each
 NOT_CURRENT = "its context is not current in this thread: render inside `with ctx:`"
 Source = moderngl.Texture | Literal["colour"]  # what a target shows
 
@@ -265,7 +265,7 @@ class GlRasterizer:
     def draw(
         self, view: "GlView", sources: Sequence[Source], with_depth: bool = False
     ) -> tuple[moderngl.Texture, ...]:
-        """Splat one image per source, at most four with depth, in one pass.
+        """Splat one image per source, at most five with depth, in one pass.
 
         A texture comes from `SceneTextures.upload`; "colour" is the view-dependent colour. Images are
         RGBA, premultiplied, row 0 on top. Depth comes last, as (sum of weight * camera z, alpha) in
