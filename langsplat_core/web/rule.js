@@ -58,7 +58,10 @@ function bestRelevancy(rule, regions, relevancies, level) {
 // Where parts of a thing may be: in and below the wholes that fit it nearly as well as the best one does.
 function onThings(rule, regions, thing) {
   const [first, last] = levelRange(regions, regions.counts.length - 1);
-  const best = fitOf(rule, bestRelevancy(rule, regions, regionRelevancies(rule, thing), regions.counts.length - 1));
+  const best = fitOf(
+    rule,
+    bestRelevancy(rule, regions, regionRelevancies(rule, thing), regions.counts.length - 1),
+  );
   const least = leastFit(rule, best, rule.around);
   const on = Array.from(thing, (fit, region) => region >= first && region < last && fit >= least);
   for (let region = first - 1; region >= 0; --region) {
@@ -122,7 +125,8 @@ function decide(rule, regions, own, named, level, evidence, thing = null) {
   const anywhere = regionFits(rule, regions, own);
   const on = thing && onThings(rule, regions, regionFits(rule, regions, thing));
   const every = anywhere.map((fit, region) => (!on || on[region] ? fit : rule.nothing));
-  const bestOf = (relevancies) => regions.counts.map((_, at) => bestRelevancy(rule, regions, relevancies, at));
+  const bestOf = (relevancies) =>
+    regions.counts.map((_, at) => bestRelevancy(rule, regions, relevancies, at));
   const fits = bestOf(regionRelevancies(rule, anywhere)).map((score) => fitOf(rule, score));
   const relevancies = regionRelevancies(rule, every);
   const scores = bestOf(relevancies);

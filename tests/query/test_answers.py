@@ -17,6 +17,7 @@ from langsplat_core.query.answers import (
     by_regions,
     chance_in,
     own_fits,
+    smoothed,
 )
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
@@ -70,7 +71,7 @@ def asked(
     surface = build_surface(gaussians)
     scale = Scale(field.canonical, field.everyday, field.temperature)
     if rule == "peak":
-        return by_peak(phrase, relevancy, surface, scale, field.found, level)
+        return by_peak(phrase, relevancy, gaussians.means, surface, scale, field.found, level)
     regions, calibration = regions_of(Scene(gaussians, field), surface), field.calibration
     by_chance = bars_of(regions.table, chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
     fits, judged = (own_fits(regions, scale, relevancy), None), (by_chance, calibration, level)
@@ -419,6 +420,21 @@ def row_of(things: list[int], seed: int) -> Scene:
         tree=tree_of_wholes(np.where(of < len(things) - PIECES, of, NO_NODE)),
     )
     return Scene(unturned_gaussians(places, np.log(0.08), 2.0), field)
+
+
+def test_smoothing_follows_what_varies_slowly_and_evens_out_noise():
+    rng = np.random.default_rng(3)
+    points = rng.uniform(size=(4000, 3)).astype(np.float32) * (4, 2, 0.01) + 100
+    slow = 0.5 + 0.1 * (points[:, 0] - 102)
+    noisy = (slow + rng.normal(scale=0.1, size=4000)).astype(np.float32)
+    found = smoothed(points, noisy)
+    assert found.dtype == np.float32
+    assert np.sqrt(np.mean((found - slow) ** 2)) < 0.04
+    np.testing.assert_allclose(smoothed(1e-3 * points, noisy), found, atol=1e-3)  # lengths have no unit
+    for alike in (points[:1], np.tile(points[:1], (50, 1)), np.full((3, 3), np.nan)):
+        values = np.linspace(0, 1, len(alike), dtype=np.float32)
+        np.testing.assert_allclose(smoothed(alike, values), values.mean(), atol=1e-6)
+    assert smoothed(points[:0], noisy[:0]).shape == (0,)
 
 
 def members(place: int, count: int) -> Array:

@@ -234,6 +234,10 @@ def select_with_the_mouse(s: Any) -> None:
     assert s.state.tools.tool is None
     s.drag((600, 300), (656, 279))
     assert not np.array_equal(before.rotation, s.state.view.rotation)  # the drag turns again
+    s.search("plant")
+    for display in ("relevancy", "segmentation", "depth", "alpha", "latent"):
+        settings.set_display(s.viewer, display)
+        assert np.abs(s.at(s.shot(display), PLANT) - 255 * np.array(SELECTED)).max() < 0.55 * 255, display
 
 
 def outline_and_rest(s: Any) -> None:
@@ -363,6 +367,32 @@ def compare_two_scenes(s: Any) -> None:
     settings.set_split(viewer, "off")
     assert (s.shot("alone again") == alone)[100:450, 450:].all()
     assert viewer.beside is None
+
+
+def say_what_is_not_here(s: Any) -> None:
+    """Nothing is painted and nothing of it is told; beside another scene, on the side that it is not on."""
+    viewer, there = s.viewer, s.folder / "mugs.ply"
+    mugs = named_scene().take(np.arange(3 * PER_BLOB) < PER_BLOB)
+    save_scene(there, replace(mugs, path=None))
+    s.search("plant")
+    assert s.ctx.item_exists("//Search/Focus")
+    assert not s.ctx.item_exists("//Search/Why?")  # nothing was trained here
+    opening.open_beside(viewer, there)
+    s.wait(lambda: len(viewer.beside.state.session.queries) == 1 and viewer.beside.worker.current is None)
+    area = scene_area()
+    settings.move_line(viewer, 0.5)
+    middle = int(area.top + area.height / 2)
+    said = s.shot("beside")[middle - 8 : middle + 8, int(area.left + 0.6 * area.width) : -60]
+    assert (said.min(-1) > 200).sum() > 50  # words
+    settings.set_split(viewer, "off")
+    s.drop("mugs.ply")
+    s.shows("mugs.ply")
+    plain = s.shot("plain")
+    s.search("plant")
+    assert result(s, -1).verdict == "not here"
+    assert not any(map(s.ctx.item_exists, ("//Search/Focus", "//Search/Why?")))
+    clear = np.s_[int(area.top) + 60 :, int(area.left) + 60 :]
+    np.testing.assert_array_equal(s.shot("not here")[clear], plain[clear])
 
 
 def pin_a_note(s: Any) -> None:
