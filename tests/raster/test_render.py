@@ -1,10 +1,9 @@
-"""The reference against closed forms and gsplat's plain functions; the front door against the reference."""
+"""The reference against closed forms and images of gsplat; the front door against the reference."""
 
 import doctest
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,15 +11,14 @@ from safetensors.numpy import load_file
 
 import langsplat_core
 from langsplat_core import Scene, render
-from langsplat_core.arrays import Array, unit
+from langsplat_core.arrays import Array
 from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, protocol, reference
 from langsplat_core.raster import render as front_door
-from langsplat_core.raster.cpu import projection
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.raster.reference import ReferenceRasterizer, colours, project
+from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.raster.render import colours_seen, pixel_weights, splat_colours, view_of
 from langsplat_core.scene import Camera, Gaussians, look_at
 from tests.support.backends import BAND
@@ -173,74 +171,6 @@ def test_the_band_finds_a_pixel_on_the_contour():
     assert band[10, 14]
     assert band[6, 10]
     assert band.sum() == 4
-
-
-# A second opinion on projection and colours: gsplat's plain PyTorch functions, written by others
-# from the same papers. gsplat's own rasterizer needs CUDA; these do not. All of their names are private.
-
-
-@pytest.fixture(scope="module")
-def oracle() -> Any:
-    return pytest.importorskip("gsplat.cuda._torch_impl")
-
-
-def double(array: Array) -> Any:
-    import torch
-
-    return torch.tensor(np.asarray(array, np.float64))
-
-
-def gsplat_covariances(oracle: Any, gaussians: Gaussians) -> Any:
-    """(N, 3, 3) covariances and their inverses, float64 tensors."""
-    quats = unit(gaussians.quats_wxyz.astype(np.float64))
-    return oracle._quat_scale_to_covar_preci(double(quats), double(gaussians.log_scales).exp())  # noqa: SLF001
-
-
-def gsplat_projection(oracle: Any, gaussians: Gaussians, camera: Camera) -> tuple[Array, ...]:
-    """gsplat's radii, means2d, depths, conics and compensations, in float64."""
-    intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    found = oracle._fully_fused_projection(  # noqa: SLF001
-        double(gaussians.means), gsplat_covariances(oracle, gaussians)[0],
-        double(camera.world_to_camera)[None], double(intrinsics)[None], camera.width, camera.height,
-        eps2d=GSPLAT.dilation, near_plane=GSPLAT.near, calc_compensations=True,
-    )  # fmt: skip
-    return tuple(part[0].numpy() for part in found)
-
-
-@pytest.mark.parametrize(("seed", "distance"), [*enumerate((3.0, 3.0, 1.2, 0.5, 8.0))])
-def test_projection_is_that_of_gsplat(oracle: Any, seed: int, distance: float) -> None:
-    """Before the camera and around it; gsplat bounds a footprint by 3.33 standard deviations, opacity 1 at
-    alpha 1/255, the CPU's kernels exactly."""
-    gaussians = random_gaussians(300, seed, scale_range=(0.002, 0.3))
-    camera = random_camera(seed, distance=distance)
-    radii, means_px, depths, conics, compensations = gsplat_projection(oracle, gaussians, camera)
-    ours = project(gaussians, camera, GSPLAT)
-    drawn = depths > GSPLAT.near
-    assert drawn.sum() > 100
-    np.testing.assert_array_equal(ours.opacities[~drawn], 0)
-    np.testing.assert_allclose(ours.depths[drawn], depths[drawn], rtol=1e-12)
-    np.testing.assert_allclose(ours.means_px[drawn], means_px[drawn], rtol=1e-10, atol=1e-9)
-    # gsplat forms the 3D covariance first and so loses digits where a footprint is long and thin.
-    np.testing.assert_allclose(ours.conics[drawn], conics[drawn], rtol=1e-6, atol=1e-9)
-    sharp = project(gaussians, camera, replace(GSPLAT, antialiased=True))
-    both = drawn & (sharp.opacities > 0)
-    floored = np.maximum(compensations, 0.005)  # as INRIA's code floors it; gsplat 1.5.3 does not
-    np.testing.assert_allclose(sharp.opacities[both] / ours.opacities[both], floored[both], rtol=1e-5)
-    exact = CpuRasterizer().view(gaussians, camera, GSPLAT).radii
-    assert (exact > 0).sum() > 10
-    assert (exact <= radii.max(1) + 1e-3).all()
-
-
-@pytest.mark.parametrize("degree", range(4))
-def test_spherical_harmonics_are_those_of_gsplat(oracle: Any, degree: int) -> None:
-    """float64 to 1e-6 (gsplat types its constants to 7 to 16 digits), the compiled float32 twin to 2e-6."""
-    gaussians, eye = random_gaussians(300, 7, degree), np.array([0.4, -2.5, 0.7])
-    sh, directions = 2.5 * gaussians.sh, double(gaussians.means.astype(np.float64) - eye)
-    want = oracle._spherical_harmonics(degree, directions, double(sh)).numpy() + 0.5  # noqa: SLF001
-    want = np.maximum(want, 0)
-    assert (want == 0).any()
-    np.testing.assert_allclose(colours(sh, gaussians.means, eye), want, atol=1e-6)
-    np.testing.assert_allclose(projection.colours(sh, gaussians.means, eye), want, atol=2e-6)
 
 
 # The front door: one call from a scene and a camera to a picture.

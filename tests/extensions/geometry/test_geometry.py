@@ -325,6 +325,7 @@ def test_a_mesh_of_a_room_is_written(tmp_path, capsys):
     [
         ("mesh a.ply a.ply", "would replace the original"),
         ("mesh a.ply m.ply --phrase mug", "no language field"),
+        ("map a.ply m", "nobody said how long a unit"),
         ("merge a.ply b.ply --out m.ply --transform bad.json", "bad.json: no transform"),
         ("merge a.ply b.ply --out m.ply --as-is --transform bad.json", "give one of them"),
     ],
@@ -496,12 +497,6 @@ def test_the_command_writes_what_nav2_reads(tmp_path, capsys):
     voxels = np.load(tmp_path / "map" / "voxels.npz", allow_pickle=False)
     assert len(voxels["cells"]) == len(voxels["words"]) == len(voxels["nodes"])
     assert (tmp_path / "map" / "collider.obj").read_text().startswith("v ")
-
-
-def test_a_map_without_a_scale_is_refused(tmp_path, capsys):
-    save_scene(tmp_path / "room.ply", Scene(box_room().gaussians, cameras=box_room().cameras))
-    assert "nobody said how long a unit" in refusal(capsys, "map", tmp_path / "room.ply", tmp_path / "map")
-    assert not (tmp_path / "map" / "map.pgm").exists()
 
 
 def test_goals_by_phrase_and_what_has_none(tmp_path, capsys):
