@@ -7,13 +7,15 @@ may be missing.
 
 from contextlib import suppress
 from itertools import takewhile
+from os.path import exists
 from pathlib import Path
 
 import moderngl
 import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
-from PIL import Image
 
+from langsplat_core.errors import LangSplatError
+from langsplat_core.io.hostile import opened
 from langsplat_viewer.actions import editing, opening, saving, settings
 from langsplat_viewer.disk import FolderEntry, Listing
 from langsplat_viewer.panels import ui
@@ -37,12 +39,10 @@ class StartPage:
 
     def _look_up(self, viewer: Viewer) -> None:
         """List the bundled scene and the recent files that are there, each with its thumbnail."""
-        recent = [path for path in map(Path, viewer.state.preferences.recent) if path.exists()]
-        self._cards = []
-        for path in dict.fromkeys((BUNDLED, *recent)):
+        for path in dict.fromkeys((BUNDLED, *map(Path, filter(exists, viewer.state.preferences.recent)))):
             kept, image = thumbnail_of(self._folder, path), None
-            if kept is not None and kept.is_file():
-                with suppress(OSError), Image.open(kept) as file:
+            if kept is not None:
+                with suppress(LangSplatError), opened(kept) as file:
                     image = np.asarray(file.convert("RGB"))
             self._cards.append((path, ui.Picture(), image))
 
@@ -80,12 +80,12 @@ class StartPage:
                 opening.open_file(viewer, path)
             imgui.pop_id()
         imgui.dummy(ImVec2(0, hello_imgui.em_size(0.4)))
-        opened = viewer.state.opening
-        text = "Drop a scene, a project or a folder of photographs here"
-        imgui.begin_disabled()  # it takes no click; files are taken all over the window
-        imgui.button(
-            f"Opening {opened.name} ..." if opened else text, ImVec2(width, hello_imgui.em_size(DROP_EM))
+        path = viewer.state.opening
+        text = (
+            f"Opening {path.name} ..." if path else "Drop a scene, a project or a folder of photographs here"
         )
+        imgui.begin_disabled()  # it takes no click; files are taken all over the window
+        imgui.button(text, ImVec2(width, hello_imgui.em_size(DROP_EM)))
         imgui.end_disabled()
         imgui.end()
 
