@@ -80,10 +80,8 @@ class StartPage:
                 opening.open_file(viewer, path)
             imgui.pop_id()
         imgui.dummy(ImVec2(0, hello_imgui.em_size(0.4)))
-        path = viewer.state.opening
-        text = (
-            f"Opening {path.name} ..." if path else "Drop a scene, a project or a folder of photographs here"
-        )
+        reading, text = viewer.state.opening, "Drop a scene, a project or a folder of photographs here"
+        text = f"Opening {reading.name} ..." if reading else text
         imgui.begin_disabled()  # it takes no click; files are taken all over the window
         imgui.button(text, ImVec2(width, hello_imgui.em_size(DROP_EM)))
         imgui.end_disabled()
