@@ -93,10 +93,10 @@ class Capture:
         """Return the photographs at `indices`, at most `longer_side` pixels long, with the points of all."""
         views: list[View] = []
         for index in indices:
-            camera, share = self.cameras[index], longer_side / max(self.images[index].shape)
-            size = max(round(camera.width * share), 1), max(round(camera.height * share), 1)
-            view = camera, self.images[index], self.mask(index)
-            views.append(view if share >= 1 else shrunk_view(*view, size))
+            camera = self.cameras[index]
+            small, view = camera.within(longer_side), (camera, self.images[index], self.mask(index))
+            whole = small.width == camera.width and small.height == camera.height
+            views.append(view if whole else shrunk_view(*view, (small.width, small.height)))
         return self._of(views)
 
     def read_at(self, indices: Sequence[int], longer_side: int) -> "Capture":
@@ -152,15 +152,7 @@ def centred(capture: Capture) -> Capture:
 
 def capture_of(views: Developed, points: Array, colours: Array) -> Capture:
     """Return the capture of developed photographs, with (M, 3) points and (M, 3) uint8 colours."""
-    return Capture(
-        views.cameras,
-        views.images,
-        points,
-        colours,
-        photos=views.photos,
-        masks=views.masks,
-        cut_out=views.cut_out,
-    )
+    return Capture(points=points, colours=colours, **vars(views))
 
 
 def shrunk_view(camera: Camera, image: Array, mask: Array | None, size: tuple[int, int]) -> View:

@@ -6,7 +6,7 @@ at +0.5. Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fish
 Everything here is float64; it is the reference that resampling follows.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from PIL import Image
@@ -87,8 +87,7 @@ class PhotoIntrinsics(Intrinsics):
 
     def regridded(self, width: int, height: int) -> "PhotoIntrinsics":
         """Return the same lens on another pixel grid over the same image."""
-        inner = self.resized(width, height)
-        return PhotoIntrinsics(width, height, inner.fx, inner.fy, inner.cx, inner.cy, self.distortion)
+        return replace(self, **vars(self.resized(width, height)))
 
     def pixels(self, xy: Array) -> Array:
         """(N, 2) normalised coordinates -> (N, 2) pixel positions in the photograph."""
@@ -161,8 +160,7 @@ def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
     if intrinsics.distortion is None:
         scale = min(1.0, max_side / max(intrinsics.width, intrinsics.height))
         size = max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale))
-        lens = intrinsics.resized(*size)
-        return Camera(*size, lens.fx, lens.fy, lens.cx, lens.cy, np.eye(4))
+        return Camera(**vars(intrinsics.resized(*size)), world_to_camera=np.eye(4))
     left, top, right, bottom = _inner_rectangle(intrinsics)
     wide, high = intrinsics.fx * (right - left), intrinsics.fy * (bottom - top)
     if not (wide >= 1 and high >= 1):

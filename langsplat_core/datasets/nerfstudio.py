@@ -10,6 +10,7 @@ import os
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -115,13 +116,8 @@ def _without_camera(photos: Mapping[str, Photo], frames: Sequence[Json]) -> set[
     known |= {photo.path.stem for photo in photos.values()}
     folders = {photo.path.parent for photo in photos.values()}
     beside = (path for folder in folders for path in find_photos(folder))
-    return {path.name for path in beside if not known & _stems(path.stem)}
-
-
-def _stems(name: str) -> set[str]:
-    """Return a name and what it begins with: r_1_depth_0001 is made of the photograph r_1."""
-    parts = name.split("_")
-    return {"_".join(parts[:count]) for count in range(1, len(parts) + 1)}
+    # r_1_depth_0001 is made of the photograph r_1.
+    return {p.name for p in beside if known.isdisjoint(accumulate(p.stem.split("_"), "{}_{}".format))}
 
 
 TOGETHER = (("fl_x", "fl_y"), ("cx", "cy"), ("w", "h"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3", "k4"))

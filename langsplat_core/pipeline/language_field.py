@@ -51,6 +51,7 @@ from langsplat_core.semantics.features import (
     StoredFeatures,
     embed_regions,
     fingerprint,
+    masked_crop,
 )
 from langsplat_core.semantics.relevancy import NARROWEST, bundled_vocabulary, everyday_vectors
 from langsplat_core.training.language.codec_fit import (
@@ -343,7 +344,7 @@ def kept_mask_weights(
 # photograph, are masks that fit from all sides, and these are shown to the encoder.
 #
 # No cost tells a whole thing from half of one or from two that touch; its name does. Wholes are the nodes
-# that are named best: the sum of what `_named` makes of each is the largest.
+# that are named best: the sum of what `name_scores` makes of each is the largest.
 
 CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
 NAMED = (0.6, 0.9)  # costs between which wholes are those that have a name
@@ -373,14 +374,15 @@ def agreed_features(
     processes = processes or ProcessGroup()
     rasterizer = load_lifting_rasterizer(config.lift.backend)
     formed = _formation(gaussians, views, config.radiance)
-    inputs = digest_of(gaussians), [digest_of(features) for _, features in views], formed
+    facts = ((camera.position, len(seen.vectors), digest_of(seen)) for camera, seen in views)
+    eyes, counts, digests = zip(*facts, strict=True)
+    inputs = digest_of(gaussians), digests, formed
     folder = work / stage_key("rough-memberships", VERSION, *inputs)
     mask_weights = kept_mask_weights(gaussians, views, folder, rasterizer, processes, progress, formed)
-    counts = [len(features.vectors) for _, features in views]
-    eyes = np.stack([camera.position for camera, _ in views])
 
     def make() -> Arrays:
-        return vars(find_tree(gaussians, build_surface(gaussians), mask_weights, counts, eyes, progress))
+        surface = build_surface(gaussians)
+        return vars(find_tree(gaussians, surface, mask_weights, counts, np.stack(eyes), progress))
 
     key = stage_key("tree", VERSION, *inputs)
     tree = MergeTree(**processes.once(lambda: kept(work / f"{key}.npz", make)))
@@ -394,7 +396,7 @@ def agreed_features(
     processes.barrier()
     told = stage_key("alone", VERSION, key, NAMED, VIEWS, LEAST, fingerprint(encoder))
     shown = _alone(tree, drawn, photographs, encoder, work / told, progress, processes)
-    names = _named(tree, surface_areas(gaussians), shown, encoder)
+    names = name_scores(tree, surface_areas(gaussians), shown, encoder)
     wholes = tree.cut(CUTS[2]) if names is None else tree.cut(*NAMED, names)
     cuts = [*(np.minimum(tree.cut(cost), wholes) for cost in CUTS[:2]), wholes]  # later nodes are larger
     store = FeatureStore(work / "features")
@@ -425,35 +427,29 @@ def _alone(
     """
     seen = [open_array(path) for path in drawn]
     counts = np.stack([np.bincount(one[one >= 0], minlength=tree.count) for one in seen], 1)
-    pixels, members = tree.totals(counts).T, tree.totals(np.eye(tree.count, dtype=bool))
+    pixels, members = tree.totals(counts).T, tree.totals(np.eye(tree.count, tree.count + 1, dtype=bool))
     ranks = np.argsort(np.argsort(-pixels, axis=0, kind="stable"), axis=0)
     least = np.array([[max(LEAST * one.size, 1)] for one in seen])
     chosen = tree.between(*NAMED) & (ranks < VIEWS) & (pixels >= least)
     files = [folder / f"{index:05d}.npz" for index in range(len(drawn))]
 
     def look(index: int) -> Arrays:
-        nodes, layers = np.flatnonzero(chosen[index]), np.full((1, tree.count + 1), -1, np.int32)
-        for row, node in enumerate(nodes):  # those that share no patch share a label map
-            own = np.flatnonzero(members[node])
-            free = (layers[:, own] < 0).all(1)
-            if not free.any():
-                layers = np.concatenate([layers, np.full_like(layers[:1], -1)])
-            layers[free.argmax() if free.any() else -1, own] = row
-        vectors = embed_regions(photographs[index][0], layers[:, seen[index]], encoder)
-        return {"nodes": nodes, "vectors": vectors}
+        nodes, image = np.flatnonzero(chosen[index]), photographs[index][0]
+        masks = (members[node][seen[index]] for node in nodes)  # -1, no patch, is the last column
+        crops = [masked_crop(image, mask, encoder.image_size) for mask in masks]
+        return {"nodes": nodes, "vectors": encoder.encode_images(crops)}
 
     for index in processes.share(range(len(drawn))):
         kept(files[index], partial(look, index))
         progress(AGREED, 0.4 + 0.1 * (index + 1) / len(drawn))
     processes.barrier()
-    looks = [read_arrays(path) for path in files]
-    vectors = np.zeros((len(chosen[0]), looks[0]["vectors"].shape[1]), np.float32)
-    for look_at in looks:
-        vectors[look_at["nodes"]] += look_at["vectors"]
+    vectors = np.zeros((len(members), encoder.dim), np.float32)
+    for found in map(read_arrays, files):
+        vectors[found["nodes"]] += found["vectors"]
     return unit(vectors)
 
 
-def _named(tree: MergeTree, areas: Array, vectors: Array, encoder: PhraseEncoder) -> Array | None:
+def name_scores(tree: MergeTree, areas: Array, vectors: Array, encoder: PhraseEncoder) -> Array | None:
     """Return (P + K,) float64, how well nodes with `vectors` are named; None if the encoder cannot tell.
 
     The nearest name of a thing, in spreads above everyday phrases, times a power of the area.

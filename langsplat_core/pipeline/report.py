@@ -187,11 +187,6 @@ def _section(title: str, content: str) -> str:
     return f"<div><h2>{title}</h2><div class=card>{content}</div></div>"
 
 
-def _table(rows: Mapping[str, object]) -> str:
-    cells = (f"<tr><td>{_text(name, 1000)}<td>{_text(value, 300)}" for name, value in rows.items())
-    return f"<table>{''.join(cells)}</table>"
-
-
 def _warnings(warnings: Iterable[str]) -> Iterator[str]:
     """Yield a card for each warning, in which the remedy stands behind the colon."""
     for warning in warnings:
@@ -216,9 +211,13 @@ def _tiles(report: TrainReport) -> str:
 
 
 def _figures(report: TrainReport, matches: Matches | None) -> str:
+    found = "not sought: cameras were given"
+    if matches is not None:
+        found = f"{len(matches.located)} of {len(matches.names)} photographs are located"
+        found += f"; to join the others, {matches.advice()}" if matches.gaps() else ""
     figures = {name: f"{seconds:.1f} s" for name, seconds in report.seconds.items()}
     figures |= {
-        "matches": "not sought: cameras were given" if matches is None else _located(matches),
+        "matches": found,
         "rehearsed": rehearsals_in_words(report.rehearsed) or "no",
         "masks by": report.masks,
         "encoder": report.encoder,
@@ -226,22 +225,17 @@ def _figures(report: TrainReport, matches: Matches | None) -> str:
         "relevancy error": f"{report.relevancy_error:.4f} (99 % below {report.relevancy_error_p99:.3f})",
         "Gaussians with language features": f"{100 * report.observed:.1f} %",
     }
-    return _section("Stages and figures", _table(figures))
-
-
-def _located(matches: Matches) -> str:
-    text = f"{len(matches.located)} of {len(matches.names)} photographs are located"
-    return f"{text}; to join the others, {matches.advice()}" if matches.gaps() else text
+    cells = (f"<tr><td>{_text(name, 1000)}<td>{_text(value, 300)}" for name, value in figures.items())
+    return _section("Stages and figures", f"<table>{''.join(cells)}</table>")
 
 
 def _view(capture: Capture, scene: Scene, index: int, score: ViewScore, held: bool) -> str:
     camera, photo, mask = capture.cameras[index], capture.images[index], capture.mask(index)
-    scale = min(1.0, SIDE / max(camera.width, camera.height))
-    size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    small = camera.within(SIDE)
     if mask is not None:  # what does not count is faint
         photo = np.where(mask[..., None], photo, 200 + photo // 5).astype(np.uint8)
-    drawn = render(scene, camera.resized(*size)).colours.clip(0, 1)
-    photograph = Image.fromarray(np.ascontiguousarray(photo)).resize(size)
+    drawn = render(scene, small).colours.clip(0, 1)
+    photograph = Image.fromarray(np.ascontiguousarray(photo)).resize((small.width, small.height))
     badge = " <span class=badge>held out</span>" if held else ""
     return (
         f"<div class='card{' held' if held else ''}'><div class=name><span>{_text(camera.name)}{badge}</span>"

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from safetensors.numpy import save
-from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import PictureConfig
@@ -205,16 +204,16 @@ def language_tables(
     codebook = field.codec.decode(np.arange(field.codec.size)[:, None])
     scale = engine.scale
     zero, rate = scale.of(codebook @ scale.texts.T)
-    codes = np.where(field.known, field.latents[..., 0], len(codebook))[:, rows]
+    codes = np.where(field.known, field.latents[..., 0], len(codebook))
     palette = field.codec.colours(np.arange(len(codebook), dtype=np.uint16)[:, None], np.ones(len(codebook)))
     tensors: dict[str, Array] = {
         "codebook": codebook.astype(np.float16),
         "zero": zero,
         "rate": rate,
-        "codes": codes.astype(np.uint16),
+        "codes": codes[:, rows].astype(np.uint16),
         "regions": regions.everywhere[:, rows],
         "palette": to_bytes(255 * palette),
-        **_region_tables(engine),
+        **_region_tables(engine, codes),
     }
     bars = [asdict(bar) for bar in engine.bars or ()]
     progress("choosing phrases", 0.3)
@@ -241,36 +240,28 @@ def language_tables(
     return numbers | words, tensors | own
 
 
-def _region_tables(engine: QueryEngine) -> dict[str, Array]:
-    """Return tensors of all regions, those of subparts first.
+def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
+    """Return tensors of all regions, those of subparts first; codes: (3, N), the last for no codeword.
 
     `share_of`, `share_code` and `share` are a sparse matrix that takes relevancies of codewords to means of
     regions; beside it sizes, parents, places and boxes in the world, corners relative to the page's origin.
     """
-    field, regions = engine.field, engine.regions
-    scene, means, (centre, _) = engine.scene, engine.scene.gaussians.means, engine.scene.bounds()
-    firsts = np.cumsum([0, *map(len, regions.nodes)])
-    shares, places, boxes, corners = [], [], [], []
-    for level, (first, total) in enumerate(zip(firsts, regions.totals, strict=False)):
-        counted = np.flatnonzero(regions.weights > 0)
-        order = counted[np.argsort(regions.everywhere[level, counted], kind="stable")]
-        each = np.split(order, np.cumsum(regions.sizes[level])[:-1]) if len(total) else []
+    regions, scene, (centre, _) = engine.regions, engine.scene, engine.scene.bounds()
+    means, count = scene.gaussians.means, sum(map(len, regions.nodes))
+    places, boxes, corners = [], [], []
+    for level, sizes in enumerate(regions.sizes):
+        order = regions.counts[np.argsort(regions.everywhere[level, regions.counts], kind="stable")]
+        each = np.split(order, np.cumsum(sizes)[:-1]) if len(sizes) else []
         found = [place_of(means[own]) for own in each]
         places += [place for place, _ in found]
         boxes += [box.ravel() for _, box in found]
         around = [oriented_box(means[own[:: -(-len(own) // BOXED)]]).corners for own in each]
         corners += [(eight - centre).ravel() for eight in around]
-        own = counted[field.known[level, counted]]
-        where = regions.everywhere[level, own], field.latents[level, own, 0]
-        shape = len(total), field.codec.size
-        matrix = csr_matrix((regions.weights[own].astype(np.float64), where), shape=shape).tocoo()
-        shares.append((matrix.row + first, matrix.col, matrix.data / total[matrix.row]))
-    of, code, share = (np.concatenate(parts) for parts in zip(*shares, strict=True))
-    count = int(firsts[-1])
+    share = regions.mixtures(codes, engine.field.codec.size + 1)[:, :-1].tocoo()
     return {
-        "share_of": of.astype(np.uint32),
-        "share_code": code.astype(np.uint16),
-        "share": share.astype(np.float32),
+        "share_of": share.row.astype(np.uint32),
+        "share_code": share.col.astype(np.uint16),
+        "share": share.data.astype(np.float32),
         "sizes": np.concatenate(regions.sizes).astype(np.uint32),
         "parents": regions.table.parents.astype(np.int32),
         "places": scene.in_world(np.reshape(places, (count, 3))),

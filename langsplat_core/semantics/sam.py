@@ -290,10 +290,8 @@ class SamMasks(MaskSource):
             for proposals, more in zip(levels, found, strict=True):
                 proposals += more
         progress("finding masks", 1.0)
-        return partial(self._finish, levels, image.shape[:2])
-
-    def _finish(self, levels: list[list[Proposal]], shape: tuple[int, int]) -> LevelMasks:
-        return LevelMasks(*zip(*(filter_level(level, shape, self._config) for level in levels), strict=True))
+        rest = [partial(filter_level, level, image.shape[:2], self._config) for level in levels]
+        return lambda: LevelMasks(*zip(*(kept() for kept in rest), strict=True))
 
     def _in_crop(
         self, image: Array, crop: Array, progress: Progress, half_on: str | None

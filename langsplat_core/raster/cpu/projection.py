@@ -95,15 +95,11 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
     reach = np.sqrt(-2 * np.log(min(settings.alpha_min, 1.0)))
     wide, high = (0.0, 0.0) if camera.orthographic else (max(left, right), max(top, bottom))
     most = 1.001 * reach * np.linalg.norm(camera.rotation, 2)  # 1.001: room for rounding
+    plane = {name: float(value) for name, value in vars(camera.intrinsics).items()}
     return KernelCamera(
         rotation=np.ascontiguousarray(camera.rotation),
         translation=np.ascontiguousarray(camera.world_to_camera[:3, 3]),
-        fx=float(camera.fx),
-        fy=float(camera.fy),
-        cx=float(camera.cx),
-        cy=float(camera.cy),
-        width=float(camera.width),
-        height=float(camera.height),
+        **plane,
         left=float(left),
         right=float(right),
         top=float(top),

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from langsplat_core.arrays import unit
+from langsplat_core.pipeline.language_field import AREA, name_scores
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import view_of
@@ -25,7 +27,7 @@ from langsplat_core.training.language.merge_tree import (
     merge,
     nested_maps,
 )
-from tests.support.fakes import PER_BLOB, blob_scene, cameras
+from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, cameras
 from tests.support.scenes import find_mask_weights, make_views, random_camera, random_gaussians
 
 
@@ -193,6 +195,33 @@ def test_valued_cut_has_the_largest_sum_of_all_partitions():
     assert len(sums) > 3
     assert values[found].sum() == pytest.approx(max(sums))
     assert tree.cut(low).tolist() == tree.cut(low, high, np.zeros(len(values))).tolist()
+
+
+class OpenEncoder(FakeEncoder):
+    """Was taught every word; a text is a random direction of 64 dimensions, and none of the 65th."""
+
+    def vector(self, text: str) -> np.ndarray:
+        direction = unit(np.random.default_rng(list(text.encode())).normal(size=64))
+        return np.append(direction, 0).astype(np.float32)
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        return ()
+
+
+def test_names_count_by_fit_and_area():
+    tree = MergeTree(np.array([0, 1, 1, 2, -1], np.int32), np.array([[0, 1]], np.int32), np.array([0.7]))
+    areas, sofa, nameless = np.array([1.0, 2, 3, 1, 9]), OpenEncoder().vector("sofa"), np.eye(65)[64]
+    scores = name_scores(tree, areas, np.stack([sofa, sofa, nameless, 0 * sofa]), OpenEncoder())
+    assert scores[0] > 0
+    assert scores[1] == pytest.approx(5**AREA * scores[0])
+    assert scores[2:].tolist() == [0, 0]
+
+
+def test_names_decide_nothing_where_encoders_cannot_tell():
+    tree = MergeTree(np.array([0, 1], np.int32), np.zeros((0, 2), np.int32), np.zeros(0))
+    sofa = OpenEncoder().vector("sofa")
+    assert name_scores(tree, np.ones(2), np.stack([sofa, sofa]), OpenEncoder()) is None
+    assert name_scores(tree, np.ones(2), np.eye(2, 8, dtype=np.float32), FakeEncoder()) is None
 
 
 @pytest.mark.parametrize("scale", [1, 0.01])
