@@ -190,12 +190,10 @@ RADIAN = 2.0  # typical steps between cameras that a turn by a radian counts for
 
 def split_views(capture: Capture, config: DatasetConfig) -> tuple[list[int], list[int]]:
     """Return indices of (training, held-out) views, about one in ``config.test_every``."""
-    stated = [index for index, photo in enumerate(capture.photos) if photo.held_out]
-    if stated and config.test_every > 1:
-        return [index for index in range(len(capture)) if index not in stated], stated
-    if config.hold_out == "every":
+    held_out = [i for i, photo in enumerate(capture.photos) if photo.held_out and config.test_every > 1]
+    if not held_out and config.hold_out == "every":
         return capture.split(config.test_every)
-    held_out = surrounded_views(capture.cameras, config.test_every)
+    held_out = held_out or surrounded_views(capture.cameras, config.test_every)
     return [index for index in range(len(capture)) if index not in held_out], held_out
 
 

@@ -35,13 +35,18 @@ class Codec(ABC):
 
     @property
     @abstractmethod
-    def latent_dim(self) -> int:
-        """Numbers per latent, d."""
+    def dims(self) -> tuple[int, int]:
+        """Numbers per latent, d, and per vector, D."""
 
     @property
-    @abstractmethod
+    def latent_dim(self) -> int:
+        """Numbers per latent, d."""
+        return self.dims[0]
+
+    @property
     def vector_dim(self) -> int:
         """Numbers per vector, D."""
+        return self.dims[1]
 
     @property
     def size(self) -> int:
@@ -127,12 +132,8 @@ class LinearCodec(Codec):
         check_array("codec basis", self.basis, ("d", "D"), dtype=np.float32)
 
     @property
-    def latent_dim(self) -> int:
-        return int(self.basis.shape[0])
-
-    @property
-    def vector_dim(self) -> int:
-        return int(self.basis.shape[1])
+    def dims(self) -> tuple[int, int]:
+        return self.basis.shape
 
     def encode(self, vectors: Array) -> Array:
         return np.asarray(vectors, np.float32) @ self.basis.T
@@ -176,12 +177,8 @@ class AutoencoderCodec(Codec):
             raise ValueError(f"codec: the weights add up to {largest:.0e}; at most {LARGEST_SUM:.0e} is used")
 
     @property
-    def latent_dim(self) -> int:
-        return int(self.decoder[0][0].shape[1])
-
-    @property
-    def vector_dim(self) -> int:
-        return int(self.encoder[0][0].shape[1])
+    def dims(self) -> tuple[int, int]:
+        return self.decoder[0][0].shape[1], self.encoder[0][0].shape[1]
 
     def encode(self, vectors: Array) -> Array:
         return unit(_run(self.encoder, np.asarray(vectors, np.float32)))
@@ -264,16 +261,12 @@ class CodebookCodec(Codec):
             raise ValueError(f"codec vectors: {dims['K']} codewords; from 1 to {LARGEST} can be numbered")
 
     @property
-    def latent_dim(self) -> int:
-        return 1
+    def dims(self) -> tuple[int, int]:
+        return 1, self.vectors.shape[1]
 
     @property
     def size(self) -> int:
         return len(self.vectors)
-
-    @property
-    def vector_dim(self) -> int:
-        return int(self.vectors.shape[1])
 
     def encode(self, vectors: Array) -> Array:
         nearest = np.empty((len(vectors), 1), np.uint16)

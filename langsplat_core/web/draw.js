@@ -168,31 +168,24 @@ class Painter {
     });
   }
 
-  texture(format, width, height) {
+  // size: width, height, and the number of layers where there are several.
+  texture(format, ...size) {
     const { gl } = this;
+    const [kind, storage] = size[2] ? [gl.TEXTURE_2D_ARRAY, "texStorage3D"] : [gl.TEXTURE_2D, "texStorage2D"];
     const texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
-      gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
-    }
-    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) {
-      gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
+    gl.bindTexture(kind, texture);
+    gl[storage](kind, 1, format, ...size);
+    for (const key of ["MIN_FILTER", "MAG_FILTER", "WRAP_S", "WRAP_T"]) {
+      gl.texParameteri(kind, gl[`TEXTURE_${key}`], key.endsWith("FILTER") ? gl.NEAREST : gl.CLAMP_TO_EDGE);
     }
     return texture;
   }
 
   layers(format, count, values) {
     const { gl } = this;
-    const texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
-    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, format, this.columns, this.rows, count);
-    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
-      gl.texParameteri(gl.TEXTURE_2D_ARRAY, key, gl.NEAREST);
-    }
-    const origin = [0, 0, 0];
     const size = [this.columns, this.rows, count];
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, ...origin, ...size, gl.RGBA, gl.FLOAT, values);
+    const texture = this.texture(format, ...size);
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, ...size, gl.RGBA, gl.FLOAT, values);
     return texture;
   }
 

@@ -21,6 +21,7 @@ import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -233,21 +234,16 @@ class _Merger:
     """The nodes that are not merged yet, with their sums and neighbours."""
 
     def __init__(self, patches: Patches) -> None:
-        count, masses = len(patches.areas), patches.masses
-        most = max(2 * count - 1, 0)
-        self._labelling = patches.labelling
-        spare, ends = most - count, masses.indptr[1:-1]
-        self._columns = [*np.split(masses.indices, ends), *[np.zeros(0, np.int32)] * spare]
-        self._values = [*np.split(masses.data, ends), *[np.zeros(0, np.float32)] * spare]
-        self._pixels = np.zeros((most, int(patches.labelling.max(initial=-1)) + 1), np.float32)
-        columns = patches.labelling[masses.indices]
-        entries = sparse.csr_matrix((masses.data, columns, masses.indptr), (count, self._pixels.shape[1]))
-        self._pixels[:count] = entries.toarray()
-        self._areas = np.concatenate([patches.areas, np.zeros(spare)])
-        self._colours = np.zeros((most, 3))
-        self._colours[:count] = patches.colours * patches.areas[:, None]
+        masses, labelling = patches.masses, patches.labelling
+        self._labelling, ends = labelling, masses.indptr[1:-1]
+        self._columns, self._values = np.split(masses.indices, ends), np.split(masses.data, ends)
+        shape = len(patches.areas), int(labelling.max(initial=-1)) + 1
+        entries = masses.data, labelling[masses.indices], masses.indptr
+        self._pixels: list[Any] = list(sparse.csr_matrix(entries, shape).toarray())
+        self._areas: list[Any] = patches.areas.tolist()
+        self._colours: list[Any] = list(patches.colours * patches.areas[:, None])
         self._plain = PLAIN * float(patches.areas.sum())
-        self.neighbours: list[dict[int, Array]] = [{} for _ in range(most)]
+        self.neighbours: list[dict[int, Array]] = [{} for _ in self._areas]
         for a, b, own in zip(*patches.borders.tolist(), patches.sums, strict=True):
             self.neighbours[a][b] = self.neighbours[b][a] = own
 
@@ -262,22 +258,25 @@ class _Merger:
         between += COLOUR * float(np.sqrt(colours @ colours))
         return float(between * (min(self._areas[a], self._areas[b]) / self._plain) ** SMALL)
 
-    def join(self, a: int, b: int, new: int) -> None:
-        """Merge the nodes a and b into node `new`."""
-        columns = np.concatenate([self._columns[a], self._columns[b]])
-        self._columns[new], place = np.unique(columns, return_inverse=True)
-        values = np.concatenate([self._values[a], self._values[b]])
-        self._values[new] = np.bincount(place, values).astype(np.float32)
+    def join(self, a: int, b: int) -> int:
+        """Merge the nodes a and b; return the number of the new one."""
+        new = len(self.neighbours)
+        columns, place = np.unique(np.concatenate([self._columns[a], self._columns[b]]), return_inverse=True)
+        values = np.bincount(place, np.concatenate([self._values[a], self._values[b]])).astype(np.float32)
+        self._columns.append(columns)
+        self._values.append(values)
         for sums in (self._pixels, self._areas, self._colours):
-            sums[new] = sums[a] + sums[b]
+            sums.append(sums[a] + sums[b])
+        self.neighbours.append({})
         for old in (a, b):
-            self._columns[old] = self._values[old] = self._columns[old][:0]
+            self._columns[old] = self._values[old] = columns[:0]
             for other, own in self.neighbours[old].items():
                 del self.neighbours[other][old]
                 if other not in (a, b):
                     joined = own + self.neighbours[new].get(other, 0)
                     self.neighbours[new][other] = self.neighbours[other][new] = joined
             self.neighbours[old] = {}
+        return new
 
 
 def merge(patches: Patches, progress: Progress = silent) -> tuple[Array, Array]:
@@ -291,8 +290,7 @@ def merge(patches: Patches, progress: Progress = silent) -> tuple[Array, Array]:
         cost, a, b = heapq.heappop(waiting)
         if b not in nodes.neighbours[a]:  # one of them is part of another node by now
             continue
-        new = count + len(children)
-        nodes.join(a, b, new)
+        new = nodes.join(a, b)
         children.append((a, b))
         costs.append(cost)
         for other in nodes.neighbours[new]:
