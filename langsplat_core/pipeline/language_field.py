@@ -6,7 +6,7 @@ memory depends on a block of Gaussians and not on all of them times all photogra
 """
 
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import LiftConfig, RadianceConfig, RasterSettings, TrainConfig
+from langsplat_core.config import LiftConfig, RasterSettings, TrainConfig
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import (
     Arrays,
@@ -202,8 +202,7 @@ class _Stages:
         vectors, inputs = self.inputs
         # Named as in older work folders.
         folder = self.work / stage_key("memberships", 2, *inputs)  # codespell:ignore memberships
-        shared = self.rasterizer(), self.processes, self.progress, self.formation
-        mask_weights = kept_mask_weights(self.gaussians, self.views, folder, *shared)
+        mask_weights = self.weights_in(folder)
 
         def make() -> Arrays:
             groups = group_masks(vectors)
@@ -213,9 +212,28 @@ class _Stages:
         edges = np.cumsum([len(view) for view in vectors])[:-1]
         return mask_weights, MaskGroups(tuple(np.split(made["of_mask"], edges)), made["vectors"])
 
+    def weights_in(self, folder: Path) -> MaskWeights:
+        """Return the mask weights of all views, a file in `folder` each, which is read where it is needed."""
+        files = [folder / f"{index:05d}.npy" for index in range(len(self.views))]
+        drawn = self.rasterizer(), self.gaussians
+        for index in self.each(len(files), "lifting masks onto the Gaussians"):
+            if not files[index].exists():
+                write_array(files[index], view_pairs(*drawn, *self.views[index], self.formation))
+        return MaskWeights([open_array(path) for path in files], len(self.gaussians))
+
+    def each(self, count: int, stage: str, begin: float = 0.0, end: float = 1.0) -> Iterator[int]:
+        """Yield this process's share of `count` items, report each, and wait for all processes."""
+        for index in self.processes.share(range(count)):
+            yield index
+            self.progress(stage, begin + (end - begin) * (index + 1) / count)
+        self.processes.barrier()
+
     @cached_property
     def formation(self) -> RasterSettings:
-        return _formation(self.gaussians, self.views, self.config.radiance)
+        """The image formation of the views; few are read, as their masks come with them."""
+        step = max(-(-len(self.views) // NEAR_CAMERAS), 1)
+        cameras = [self.views[index][0] for index in range(0, len(self.views), step)]
+        return self.config.radiance.formation(near_plane(self.gaussians, cameras))
 
     def rasterizer(self) -> LiftingRasterizer:
         return load_lifting_rasterizer(self.config.lift.backend)
@@ -226,13 +244,10 @@ class _Stages:
         def make() -> Arrays:
             settings, masks = self.config.codec, np.concatenate(self.inputs[0])
             vocabulary = everyday_vocabulary(self.encoder, self.config.phrases)
-            if self.by_weights:
-                fitted, judged = self.lifted_samples()
-                codec = fit_codec(fitted, settings, vocabulary, self.progress, further=masks)
-                report = codec_report(codec, judged if len(judged) else masks, vocabulary)
-            else:
-                codec = fit_codec(masks, settings, vocabulary, self.progress)
-                report = codec_report(codec, masks, vocabulary)
+            fitted, judged = self.lifted_samples() if self.by_weights else (masks, masks)
+            further = masks if self.by_weights else None
+            codec = fit_codec(fitted, settings, vocabulary, self.progress, further)
+            report = codec_report(codec, judged if len(judged) else masks, vocabulary)
             figures = np.array(list(asdict(report).values()))
             return {"kind": np.array(codec.kind), "report": figures, **codec.tensors()}
 
@@ -285,15 +300,12 @@ class _Stages:
             weights = mask_weights.block(number, groups)
             robust = self.lift.mode == "median"
             vectors, confidence = lift_weights(weights, groups.vectors, robust)
-            latents = codec.encode(vectors.reshape(-1, vectors.shape[2]))
-            latents = latents.reshape(*vectors.shape[:2], -1)
+            latents = codec.encode(vectors.reshape(-1, vectors.shape[2])).reshape(*vectors.shape[:2], -1)
             latents = np.where(confidence[..., None] > 0, latents, 0).astype(latents.dtype)
             return {"latents": latents, "confidence": confidence}
 
-        for number in self.processes.share(range(len(mask_weights.blocks))):
+        for number in self.each(len(mask_weights.blocks), "averaging mask vectors"):
             kept(folder / f"{number:05d}.npz", partial(lift, number))
-            self.progress("averaging mask vectors", (number + 1) / len(mask_weights.blocks))
-        self.processes.barrier()
 
     def tree(self, field: LanguageField) -> Tree:
         """Return the scene's tree, without votes where latents are averaged, which needs no mask weights."""
@@ -309,32 +321,6 @@ class _Stages:
             return vars(replace(tree, votes=count_votes(tree, mask_weights, counts)))
 
         return Tree(**self.kept(self.path("nodes", 4, self.lift, self.config.codec), make))
-
-
-def _formation(gaussians: Gaussians, views: Views, config: RadianceConfig) -> RasterSettings:
-    """Return the image formation of the views; few are read, as their masks come with them."""
-    step = max(-(-len(views) // NEAR_CAMERAS), 1)
-    cameras = [views[index][0] for index in range(0, len(views), step)]
-    return config.formation(near_plane(gaussians, cameras))
-
-
-def kept_mask_weights(
-    gaussians: Gaussians,
-    views: Views,
-    folder: Path,
-    rasterizer: LiftingRasterizer,
-    processes: ProcessGroup,
-    progress: Progress,
-    settings: RasterSettings,
-) -> MaskWeights:
-    """Return the mask weights of all views, a file in `folder` each, which is read where it is needed."""
-    files = [folder / f"{index:05d}.npy" for index in range(len(views))]
-    for index in processes.share(range(len(views))):
-        if not files[index].exists():
-            write_array(files[index], view_pairs(rasterizer, gaussians, *views[index], settings))
-        progress("lifting masks onto the Gaussians", (index + 1) / len(views))
-    processes.barrier()
-    return MaskWeights([open_array(path) for path in files], len(gaussians))
 
 
 # Masks that all photographs agree on, in place of those that each photograph was given.
@@ -371,61 +357,53 @@ def agreed_features(
     photographs: (H, W, 3) uint8 of each view, and its (H, W) bool mask of pixels that count (None: all do).
     What is finished is kept in `work`.
     """
-    processes = processes or ProcessGroup()
-    rasterizer = load_lifting_rasterizer(config.lift.backend)
-    formed = _formation(gaussians, views, config.radiance)
+    stages = _Stages(gaussians, views, encoder, config, work, progress, processes or ProcessGroup())
+    rasterizer, formed = stages.rasterizer(), stages.formation
     facts = ((camera.position, len(seen.vectors), digest_of(seen)) for camera, seen in views)
     eyes, counts, digests = zip(*facts, strict=True)
     inputs = digest_of(gaussians), digests, formed
-    folder = work / stage_key("rough-memberships", VERSION, *inputs)
-    mask_weights = kept_mask_weights(gaussians, views, folder, rasterizer, processes, progress, formed)
+    mask_weights = stages.weights_in(work / stage_key("rough-memberships", VERSION, *inputs))
 
     def make() -> Arrays:
         surface = build_surface(gaussians)
         return vars(find_tree(gaussians, surface, mask_weights, counts, np.stack(eyes), progress))
 
     key = stage_key("tree", VERSION, *inputs)
-    tree = MergeTree(**processes.once(lambda: kept(work / f"{key}.npz", make)))
+    tree = MergeTree(**stages.processes.once(lambda: kept(work / f"{key}.npz", make)))
     drawn = [work / key / f"{index:05d}.npy" for index in range(len(views))]
-    for index in processes.share(range(len(views))):
+    for index in stages.each(len(views), AGREED, end=0.4):
         if not drawn[index].exists():
             view, mask = rasterizer.view(gaussians, views[index][0], formed), photographs[index][1]
             patches = draw_patches(view, gaussians, tree.patches, formed)
             write_array(drawn[index], patches if mask is None else np.where(mask, patches, -1))
-        progress(AGREED, 0.4 * (index + 1) / len(views))
-    processes.barrier()
     told = stage_key("alone", VERSION, key, NAMED, VIEWS, LEAST, fingerprint(encoder))
-    shown = _alone(tree, drawn, photographs, encoder, work / told, progress, processes)
+    shown = _alone(stages, tree, drawn, photographs, work / told)
     names = name_scores(tree, surface_areas(gaussians), shown, encoder)
     wholes = tree.cut(CUTS[2]) if names is None else tree.cut(*NAMED, names)
     cuts = [*(np.minimum(tree.cut(cost), wholes) for cost in CUTS[:2]), wholes]  # later nodes are larger
     store = FeatureStore(work / "features")
     made_by = stage_key(told, VERSION, CUTS, UNNAMED, AREA)
-    for index in processes.share(range(len(views))):
+    for index in stages.each(len(views), AGREED, 0.5):
         name = views[index][0].name
         if not store.has(name, made_by):
             maps = nested_maps(open_array(drawn[index]), cuts, LEAST)
             vectors = embed_regions(photographs[index][0], maps, encoder)
             store.save(name, ImageFeatures(maps, vectors), made_by)
-        progress(AGREED, 0.5 + 0.5 * (index + 1) / len(views))
-    processes.barrier()
     return StoredFeatures(store, [camera.name for camera, _ in views])
 
 
 def _alone(
+    stages: _Stages,
     tree: MergeTree,
     drawn: Sequence[Path],
     photographs: Sequence[tuple[Array, Array | None]],
-    encoder: Encoder,
     folder: Path,
-    progress: Progress,
-    processes: ProcessGroup,
 ) -> Array:
     """Return the (P + K, D) unit vectors of nodes that may be wholes, each alone in its `VIEWS`; else 0.
 
     drawn: files of the (H, W) patches of each view.
     """
-    seen = [open_array(path) for path in drawn]
+    encoder, seen = stages.encoder, [open_array(path) for path in drawn]
     counts = np.stack([np.bincount(one[one >= 0], minlength=tree.count) for one in seen], 1)
     pixels, members = tree.totals(counts).T, tree.totals(np.eye(tree.count, tree.count + 1, dtype=bool))
     ranks = np.argsort(np.argsort(-pixels, axis=0, kind="stable"), axis=0)
@@ -439,10 +417,8 @@ def _alone(
         crops = [masked_crop(image, mask, encoder.image_size) for mask in masks]
         return {"nodes": nodes, "vectors": encoder.encode_images(crops)}
 
-    for index in processes.share(range(len(drawn))):
+    for index in stages.each(len(drawn), AGREED, 0.4, 0.5):
         kept(files[index], partial(look, index))
-        progress(AGREED, 0.4 + 0.1 * (index + 1) / len(drawn))
-    processes.barrier()
     vectors = np.zeros((len(members), encoder.dim), np.float32)
     for found in map(read_arrays, files):
         vectors[found["nodes"]] += found["vectors"]

@@ -117,18 +117,14 @@ class Language {
     return found;
   }
 
-  // Mean relevancies of all regions.
-  regionMeans(relevancies) {
+  // Fits of the mean relevancies of all regions.
+  ownFits(relevancies) {
     const { share, share_of: region, share_code: code } = this.tensors;
     const means = new Float64Array(this.regions.sizes.length);
     for (let i = 0; i < share.length; ++i) {
       means[region[i]] += share[i] * relevancies[code[i]];
     }
-    return means;
-  }
-
-  ownFits(relevancies) {
-    return this.regionMeans(relevancies).map((mean) => fitOf(this.meta.rule, mean));
+    return means.map((mean) => fitOf(this.meta.rule, mean));
   }
 
   // Fits of the regions with the thing that a phrase names a part of; null where it cannot be asked.
