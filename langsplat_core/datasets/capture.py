@@ -311,20 +311,15 @@ def look_distance(cameras: Sequence[Camera]) -> float:
 
 
 def random_points(
-    count: int,
-    known: Array,
-    cameras: Sequence[Camera],
-    images: Sequence[Array],
-    rng: np.random.Generator,
-    masks: Sequence[Array | None] = (),
+    count: int, known: Array, capture: Capture, indices: Sequence[int], rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Draw (count, 3) points in the cameras' view volume, with the (count, 3) uint8 colours of their pixels.
+    """Draw (count, 3) points in view of the cameras at `indices`, with (count, 3) uint8 colours of pixels.
 
-    images: (H, W, 3) uint8, one per camera; masks: (H, W) bool each, pixels that count; known: (M, 3) points
-    whose depths tell where the scene is, M may be 0. Depths are uniform in 1/z, so that near and far are
-    equally dense in the images. Twice as many are drawn and those in sight of at least half the cameras
-    preferred: one view alone teaches no depth.
+    known: (M, 3) points whose depths tell where the scene is, M may be 0. Depths are uniform in 1/z, so that
+    near and far are equally dense in the images. Twice as many are drawn and those in sight of at least half
+    the cameras preferred: one view alone teaches no depth.
     """
+    cameras = [capture.cameras[index] for index in indices]
     near, far = 0.3 * look_distance(cameras), 3 * look_distance(cameras)
     if len(known) >= TELLING_POINTS:
         seen = [camera.project(known) for camera in cameras]
@@ -333,17 +328,16 @@ def random_points(
     drawn = np.zeros((2 * count, 3))
     colours = np.zeros((2 * count, 3), np.uint8)
     owner = rng.integers(len(cameras), size=2 * count)
-    for index, camera in enumerate(cameras):
-        rows = np.flatnonzero(owner == index)
+    for number, (index, camera) in enumerate(zip(indices, cameras, strict=True)):
+        rows, mask = np.flatnonzero(owner == number), capture.mask(index)
         x = rng.uniform(0, camera.width, len(rows))
         y = rng.uniform(0, camera.height, len(rows))
-        mask = masks[index] if masks else None
         if mask is not None and mask.any():
             at = np.divmod(rng.choice(np.flatnonzero(mask), len(rows)), camera.width)
             y, x = (whole + part % 1 for whole, part in zip(at, (y, x), strict=True))
         z = 1 / rng.uniform(1 / far, 1 / near, len(rows))
         drawn[rows] = camera.unproject(np.stack([x, y], -1), z)
-        colours[rows] = images[index][y.astype(int), x.astype(int)]
+        colours[rows] = capture.images[index][y.astype(int), x.astype(int)]
     shared = np.sum([camera.in_image(*camera.project(drawn)) for camera in cameras], axis=0)
     best = np.argsort(shared < len(cameras) / 2, kind="stable")[:count]
     return drawn[best], colours[best]

@@ -223,10 +223,7 @@ def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Pro
     points, colours, why = _triangulated(capture, views, work, progress)
     if len(points) < MIN_POINTS:
         report_loss("only %d points could be triangulated%s; %d are random", len(points), why, RANDOM_POINTS)
-        generator = np.random.default_rng(0)
-        cameras, images = [capture.cameras[i] for i in views], [capture.images[i] for i in views]
-        masks = [capture.mask(i) for i in views]
-        points, colours = random_points(RANDOM_POINTS, points, cameras, images, generator, masks)
+        points, colours = random_points(RANDOM_POINTS, points, capture, views, np.random.default_rng(0))
     return replace(capture, points=points, colours=colours)
 
 

@@ -267,8 +267,9 @@ def pictures(count: int) -> list[Array]:
 
 
 def drawn(cameras: list[Camera], known: Array = NONE, seed: int = 0) -> tuple[Array, Array]:
-    generator = np.random.default_rng(seed)
-    return random_points(500, known, cameras, pictures(len(cameras)), generator)
+    count, nothing = len(cameras), (NONE, NONE.astype(np.uint8))
+    capture = Capture(tuple(cameras), tuple(pictures(count)), *nothing)
+    return random_points(500, known, capture, range(count), np.random.default_rng(seed))
 
 
 def test_points_lie_where_half_of_the_cameras_look():

@@ -49,9 +49,7 @@ def initial_gaussians(
     wanted = FEWEST_POINTS if len(points) >= TELLING_POINTS else RANDOM_POINTS
     missing = min(wanted, max_gaussians) - len(points)
     if missing > 0:
-        images = [capture.images[i] for i in train_indices]
-        masks = [capture.mask(i) for i in train_indices]
-        more, colours = random_points(missing, points, cameras, images, rng, masks)
+        more, colours = random_points(missing, points, capture, train_indices, rng)
         points, rgb = np.concatenate([points, more]), np.concatenate([rgb, colours / 255.0])
 
     count = len(points)
