@@ -11,7 +11,6 @@ from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
 from langsplat_core.scene.scene import FARTHEST, Camera, Scene, origin_of
 
 SHEAR = 1e-4  # of a matrix over its scale, against a rotation: more is another shape, not another place
-ASLANT = 0.1  # sine of an angle: axes nearer to the world's are taken for these
 AXES = {name: np.eye(3)[place] for place, name in enumerate("xyz")}
 AXES |= {f"-{name}": -axis for name, axis in AXES.items()}
 
@@ -184,16 +183,6 @@ def transform_scene(scene: Scene, to: Similarity, selected: Array | None = None)
         cameras=tuple(to.camera(camera) for camera in scene.cameras),
         metres_per_unit=None if metres is None else metres / to.scale,
     )
-
-
-def turned_origin(rotation: Array, origin: Array) -> Array:
-    """Return where the `origin` (3,) of a scene comes by a `rotation` (3, 3) that stands it upright.
-
-    Where that is nearly one of the world's axes onto others it is taken for it: estimated from a floor, it is
-    a hair aslant, and about zero would move a far scene by metres.
-    """
-    near = np.rint(rotation)
-    return np.asarray((near if np.abs(rotation - near).max() < ASLANT else rotation) @ origin)
 
 
 def between_worlds(to: Similarity, origin: Array, target: Array) -> Similarity:

@@ -5,7 +5,6 @@ import os
 import pickle
 import re
 import warnings
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
@@ -140,14 +139,6 @@ def weight_files(folder: Path) -> list[Path]:
     """Return the files with a folder's weights: of both kinds the first, which transformers prefers, too."""
     kinds = (sorted(path for pattern in kind for path in folder.glob(pattern)) for kind in (SAFE, PICKLED))
     return next(filter(None, kinds), [])
-
-
-def unpickled(path: Path) -> dict[str, Any]:
-    """Return the tensors of a file of torch, by name, read when they are used where the file allows."""
-    import torch
-
-    mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
-    return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
 
 
 # Building a model: transformers fills with random numbers what its configuration has and its weights lack.

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
 from langsplat_core.io.quantised import read_splat_scene, write_splat
 from langsplat_core.io.scenes import load_scene, save_scene, writable_suffixes
-from langsplat_core.io.shapes import write_mesh, write_points
+from langsplat_core.io.shapes import write_points
 from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.sog import write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
@@ -709,12 +708,7 @@ def test_a_changed_file_gives_the_same_or_a_line(put, kind, caplog):
     assert said > 5
 
 
-# Point clouds and meshes, read back by other programs.
-
-TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
-FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
-SHADES = np.array([[1.0, 0, 0], [0, 0.5, 0], [0, 0, 0], [0, 1, 0]])
-MESH = SimpleNamespace(name="red mug", vertices=TETRAHEDRON, triangles=FACES, colour=SHADES)
+# Point clouds, read back by other programs.
 
 
 def test_points_have_places_and_colours(tmp_path):
@@ -728,23 +722,3 @@ def test_points_have_places_and_colours(tmp_path):
     colours = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
     want = np.clip(0.5 + 0.28209479177 * gaussians.sh[kept, 0].astype(np.float64), 0, 1)
     assert np.abs(colours / 255 - want).max() <= 0.5 / 255 + 1e-9
-
-
-def test_a_ply_holds_a_mesh(tmp_path):
-    write_mesh(tmp_path / "a.ply", MESH, Scene(random_gaussians(3)))
-    data = PlyData.read(tmp_path / "a.ply")
-    np.testing.assert_array_equal(np.stack([data["vertex"][k] for k in "xyz"], 1), TETRAHEDRON)
-    np.testing.assert_array_equal(np.stack(data["face"]["vertex_indices"]), FACES)
-    assert data["vertex"]["red"].tolist() == [255, 0, 0, 0]
-
-
-def test_a_glb_mesh_has_linear_colours_and_y_up(tmp_path):
-    scene = Scene(random_gaussians(3), metres_per_unit=2.0)
-    write_mesh(tmp_path / "a.glb", MESH, scene)
-    content, binary = parts((tmp_path / "a.glb").read_bytes())
-    assert content["buffers"][0]["byteLength"] == len(binary)
-    np.testing.assert_array_equal(np.frombuffer(binary[:48], "<f4").reshape(4, 3), TETRAHEDRON)
-    colours = np.frombuffer(binary[48:80], "<u2").reshape(4, 4) / 65_535
-    np.testing.assert_allclose(colours[:, :3].sum(1), [1, 0.2140, 0, 1], atol=1e-4)
-    matrix = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T
-    np.testing.assert_allclose(matrix @ [*scene.up(), 1], [0, 2, 0, 1], atol=1e-6)  # up, metres

@@ -31,7 +31,6 @@ from langsplat_core.semantics.weights import (
     Weights,
     load_config,
     loading_errors,
-    unpickled,
     weight_files,
 )
 
@@ -152,6 +151,14 @@ def converted(
         return _clip(file, tensors) if "visual.class_embedding" in tensors else None
 
 
+def _unpickled(path: Path) -> dict[str, Any]:
+    """Return the tensors of a file of torch, by name, read when they are used where the file allows."""
+    import torch
+
+    mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
+    return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+
+
 def _read(id: str, file: Path) -> Tensors:
     """Return the tensors of a file, without a checkpoint's wrappings; none of its code is run."""
     import torch
@@ -165,7 +172,7 @@ def _read(id: str, file: Path) -> Tensors:
             f"{id}: a TorchScript archive, whose code would have to be run; pass the same weights in another "
             "layout, such as the hub id openai/clip-vit-base-patch16"
         )
-    found: Any = unpickled(file)
+    found: Any = _unpickled(file)
     found = found.get("state_dict", found.get("model", found)) if isinstance(found, dict) else {}
     if not isinstance(found, dict):
         raise ValueError("it holds no named tensors")
@@ -463,7 +470,7 @@ def _read_scalar(weights: Weights, name: str) -> float:
 
     with loading_errors(weights.id, "readable"):
         for path in weight_files(weights.folder):
-            if path.suffix != ".safetensors" and name in (found := unpickled(path)):
+            if path.suffix != ".safetensors" and name in (found := _unpickled(path)):
                 return float(found[name])
             if path.suffix == ".safetensors":
                 with safe_open(path, framework="pt") as file:

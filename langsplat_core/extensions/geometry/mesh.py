@@ -6,18 +6,23 @@ wherever a large Gaussian is seen aslant.
 """
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from langsplat_core.arrays import Array, rotation_matrices, unit
+from langsplat_core.arrays import Array, linear_light, rotation_matrices, unit
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.geometry.planes import cloud
+from langsplat_core.extensions.geometry.planes import cloud, turned_origin
+from langsplat_core.io.gltf import GltfWriter
+from langsplat_core.io.ply import write_table
+from langsplat_core.io.shapes import check_suffix, coloured_columns
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene.transform import AXES, moving, scaling, turning
 
 SIDE, MOST = 640, 160  # pixels of the longer side of an image, and images, at most
 FINEST = 100  # voxels in the radius of what is fused, unless pixels are larger
@@ -31,6 +36,7 @@ BLOCK = 8  # voxels a side that are kept together
 VIEWS = 48  # of a scene without cameras, from all around it ...
 ELEVATIONS = (-37.0, 64.0)  # ... at these degrees above its horizon: a mesh has an underside
 STAGE = "fusing depth images"
+SUFFIXES = (".ply", ".glb")  # that meshes are written as
 
 Depth = tuple[Camera, Array, Array]  # (H, W) float32 along z, 0 where there is none, and (H, W, 3) uint8
 
@@ -191,3 +197,35 @@ def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
     middles = closed.vertices[closed.triangles].mean(1)
     gaps = cKDTree(mesh.vertices).query(middles, workers=-1)[0]
     return closed, float(closed.areas()[gaps > 2 * resolution].sum())
+
+
+# Files that other programs open.
+
+
+def write_mesh(path: Path | str, mesh: Mesh, scene: Scene) -> None:
+    """Write a mesh of a scene, in the world, as .ply or .glb, atomically. InputError for another suffix.
+
+    A .glb is y up, in metres where the scale is known.
+    """
+    path = check_suffix(path, SUFFIXES)
+    if path.suffix.lower() == ".ply":
+        write_table(path, coloured_columns(scene, mesh.vertices, mesh.colour), mesh.triangles)
+        return
+    # Colours are light as it was photographed, so the material is unlit, and linear.
+    file = GltfWriter("KHR_materials_unlit")
+    light = np.column_stack([linear_light(mesh.colour), np.ones(len(mesh.vertices))])
+    attributes = {
+        "POSITION": file.add(mesh.vertices.astype("<f4"), bounded=True),
+        "COLOR_0": file.add(np.rint(65_535 * light).astype("<u2")),
+    }
+    corners = file.add(mesh.triangles.reshape(-1).astype("<u4"))
+    primitive = {"attributes": attributes, "indices": corners, "material": 0}
+    file.add_mesh(primitive, name=mesh.name, matrix=gltf_axes(scene).T.reshape(-1).tolist())
+    file.write(path, materials=[{"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}])
+
+
+def gltf_axes(scene: Scene) -> Array:
+    """Return (4, 4) from the scene to the axes of glTF: y up, in metres where the scale is known."""
+    upright = turning(scene.up(), AXES["y"])
+    place = moving(turned_origin(upright.rotation, scene.origin))
+    return upright.then(place).then(scaling(scene.metres_per_unit or 1.0)).matrix

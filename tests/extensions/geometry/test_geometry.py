@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from plyfile import PlyData
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.geometry.commands import read_transform
-from langsplat_core.extensions.geometry.mesh import Mesh, close_holes, fuse, surface_depth
+from langsplat_core.extensions.geometry.mesh import Mesh, close_holes, fuse, surface_depth, write_mesh
 from langsplat_core.extensions.geometry.occupancy import (
     FloorMap,
     Occupancy,
@@ -516,3 +517,35 @@ def test_goals_by_phrase_and_what_has_none(tmp_path, capsys):
     assert goal["phrase"] == "mug"
     assert 0.3 <= goal["distance"] < 1.0
     assert np.cos(goal["yaw"]) > 0  # towards the block, which stands at the wall x = 2
+
+
+# Meshes in files, read back by other programs.
+
+TETRAHEDRON = Mesh(
+    np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64),
+    np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32),
+    np.array([[1.0, 0, 0], [0, 0.5, 0], [0, 0, 0], [0, 1, 0]]),
+)
+
+
+def test_a_ply_holds_a_mesh(tmp_path):
+    write_mesh(tmp_path / "a.ply", TETRAHEDRON, Scene(random_gaussians(3)))
+    data = PlyData.read(tmp_path / "a.ply")
+    vertices = np.stack([data["vertex"][k] for k in "xyz"], 1)
+    np.testing.assert_array_equal(vertices, TETRAHEDRON.vertices)
+    np.testing.assert_array_equal(np.stack(data["face"]["vertex_indices"]), TETRAHEDRON.triangles)
+    assert data["vertex"]["red"].tolist() == [255, 0, 0, 0]
+
+
+def test_a_glb_mesh_has_linear_colours_and_y_up(tmp_path):
+    scene = Scene(random_gaussians(3), metres_per_unit=2.0)
+    write_mesh(tmp_path / "a.glb", TETRAHEDRON, scene)
+    data = (tmp_path / "a.glb").read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    content, binary = json.loads(data[20 : 20 + size]), data[28 + size :]
+    assert content["buffers"][0]["byteLength"] == len(binary)
+    np.testing.assert_array_equal(np.frombuffer(binary[:48], "<f4").reshape(4, 3), TETRAHEDRON.vertices)
+    colours = np.frombuffer(binary[48:80], "<u2").reshape(4, 4) / 65_535
+    np.testing.assert_allclose(colours[:, :3].sum(1), [1, 0.2140, 0, 1], atol=1e-4)
+    matrix = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix @ [*scene.up(), 1], [0, 2, 0, 1], atol=1e-6)  # up, metres
