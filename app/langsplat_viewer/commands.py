@@ -30,6 +30,12 @@ class Button:
     display: Display
     latent_level: int | None = None  # index into LEVELS
 
+    @property
+    def name(self) -> str:
+        """Name of the display, and of its level where there are several."""
+        label = DISPLAYS[self.display].label
+        return label if self.latent_level is None else f"{label}, {LEVELS[self.latent_level]}"
+
 
 def buttons_of(row: DisplayRow) -> tuple[Button, ...]:
     """One for the display, but for each level one where it shows latents."""
@@ -63,16 +69,13 @@ class Command:
 
 def is_shown(state: ViewerState, button: Button) -> bool:
     """Return whether the scene is looked at in this way."""
-    return state.session.picture.display == button.display and button.latent_level in (
-        None,
-        state.session.latent_level,
-    )
+    session = state.session
+    return session.picture.display == button.display and button.latent_level in (None, session.latent_level)
 
 
 def _display(button: Button, number: int) -> Command:
-    name = "" if button.latent_level is None else f", {LEVELS[button.latent_level]}"
     return Command(
-        f"show {DISPLAYS[button.display].label.lower()}{name}",
+        f"show {button.name.lower()}",
         lambda viewer: settings.set_display(viewer, button.display, button.latent_level),
         (str(number),) if number < 10 else (),
         is_on=lambda viewer: is_shown(viewer.state, button),

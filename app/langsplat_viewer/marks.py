@@ -1,7 +1,7 @@
 """Marks: which Gaussians are selected, hidden and deleted, and the tools that mark them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
 from typing import Literal, get_args
@@ -58,16 +58,15 @@ def combined(marks: Marks, found: Array, mode: Mode) -> Marks:
 
     What is not shown is not selected.
     """
-    match mode:
-        case "add":
-            selected = marks.selected | found
-        case "remove":
-            selected = marks.selected & ~found
-        case "intersect":
-            selected = marks.selected & found
-        case _:
-            selected = found
-    return replace(marks, selected=selected & marks.shown)
+    return replace(marks, selected=COMBINED[mode](marks.selected, found) & marks.shown)
+
+
+COMBINED: dict[Mode, Callable[[Array, Array], Array]] = {
+    "replace": lambda old, found: found,
+    "add": np.logical_or,
+    "remove": np.greater,  # of booleans: the one and not the other
+    "intersect": np.logical_and,
+}
 
 
 def hiding(marks: Marks) -> Marks:

@@ -89,14 +89,11 @@ class Marked:
         """
         if self == before:
             return marks
-        count, masks = len(marks.selected), []
-        for name in MASKS:
-            bits, old = getattr(self, name), getattr(before, name)
-            if bits == old:
-                masks.append(getattr(marks, name))
-            else:
-                masks.append(np.zeros(count, bool) if bits is None else bits.mask)
-        return Marks(*masks)
+
+        def mask(bits: Bits | None, old: Bits | None, there: Array) -> Array:
+            return there if bits == old else np.zeros_like(there) if bits is None else bits.mask
+
+        return Marks(*(mask(*(getattr(part, name) for part in (self, before, marks))) for name in MASKS))
 
 
 MASKS = ("selected", "hidden", "deleted")

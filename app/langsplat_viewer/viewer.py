@@ -20,11 +20,10 @@ from langsplat_core.semantics.encoders import DEMO
 from langsplat_core.semantics.weights import local_path
 from langsplat_viewer.disk import Stamps, Watch
 from langsplat_viewer.jobs import Job, Worker, one_line
-from langsplat_viewer.marks import Marks
 from langsplat_viewer.projects import Shelf
 from langsplat_viewer.rendering.request import RenderRequest
 from langsplat_viewer.session import Point, Session
-from langsplat_viewer.state import OutlineView, SceneState, TrainingForm, ViewerState
+from langsplat_viewer.state import SceneState, TrainingForm, ViewerState
 
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
 KEPT = 20  # lines of what it says that are kept
@@ -179,8 +178,6 @@ class Viewer:
     history: History = field(default_factory=History)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     describer: Describer | None = None  # of the same scene, once it was needed
-    pivot: tuple[Scene, Array, Array] | None = None  # of what is selected in which scene, a point (3,)
-    out_of_sight: tuple[OutlineView, Marks, Array] | None = None  # nodes with nothing shown, of which
     beside: "Viewer | None" = None  # of a second scene, seen and asked as this one is
     mirrored: Session | None = None  # of the first scene, that this second one was given last
     surface: ShownImage | None = None
@@ -237,12 +234,16 @@ class Viewer:
             report = here(failed) if failed else self.say_error
             self.run(label, lambda progress: work(engine, progress), here(done), report)
 
+    def has_scene(self, then: str) -> bool:
+        """Return whether a scene is open; say that it is opened first where none is."""
+        if self.state.scene is None:
+            self.say_error(f"open a scene first, then {then}")
+        return self.state.scene is not None
+
     def searchable(self) -> QueryEngine | None:
         """Return the engine of a scene that can be searched; where there is none say why."""
         scene = self.state.scene
-        if scene is None:
-            self.say_error("open a scene first, then search it")
-        elif scene.language is None:
+        if self.has_scene("search it") and scene is not None and scene.language is None:
             self.say_error(no_field(scene))
         return self.engine if self.state.has_field else None
 

@@ -121,6 +121,8 @@ def test_fourth_query_takes_the_colour_of_the_oldest(opened):
     assert [result is not None for result in opened.state.shown_results()] == [False, True, True]
     queries.remove_all(opened)
     assert (opened.state.session.queries, opened.state.session.chosen, opened.state.answers) == ((), "", {})
+    queries.remove_all(opened)
+    assert opened.state.messages[-1].undoes is None
     editing.undo(opened)
     assert phrases(opened) == ["book", "plant", "mug or book"]
 

@@ -16,7 +16,6 @@ from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
 from langsplat_viewer.marks import Marks
-from langsplat_viewer.panels.scene import compared_name
 from langsplat_viewer.projects import load_preferences, save_preferences
 from langsplat_viewer.rendering.renderer import ArrayRenderer, Inputs, renderer_for
 from langsplat_viewer.rendering.request import (
@@ -214,7 +213,7 @@ def test_without_a_field_levels_and_latents_are_refused(viewer):
     for mode in ("wipe", "off"):
         wipe.act(viewer)
         assert viewer.state.session.split.mode == mode
-    assert len({compared_name(button) for button in BUTTONS}) == len(BUTTONS)
+    assert len({button.name for button in BUTTONS}) == len(BUTTONS)
 
 
 def test_panes_are_joined_at_the_line(opened):

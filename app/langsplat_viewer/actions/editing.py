@@ -53,18 +53,14 @@ def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
 
 
 def has_scene(viewer: Viewer) -> bool:
-    """Return whether a scene is open; say so where none is."""
-    if viewer.state.scene is None:
-        viewer.say_error("open a scene first, then select in it")
-    return viewer.state.scene is not None
+    """Return whether there is a scene to select in; say so where there is none."""
+    return viewer.has_scene("select in it")
 
 
 def has_selection(viewer: Viewer) -> bool:
     """Return whether something is selected; say so where nothing is."""
-    if not has_scene(viewer):
-        return False
-    some = bool(viewer.state.marks.selected.any())
-    if not some:
+    some = has_scene(viewer) and bool(viewer.state.marks.selected.any())
+    if not some and viewer.state.scene is not None:
         viewer.state.say("nothing is selected: choose a tool, or an answer of the search")
     return some
 
@@ -99,38 +95,32 @@ show_hidden = _verb(lambda marks: replace(marks, hidden=_nothing(marks)), has_sc
 delete_selected = _verb(lambda marks: Marks(_nothing(marks), marks.hidden, marks.deleted | marks.selected))
 
 
-def find(viewer: Viewer, label: str, work: Callable[[QueryEngine], Array], mode: Mode | None) -> None:
-    """Have the worker find (N,) bool with the scene's engine, and take it."""
-    viewer.ask_engine(
-        f"{label} the selection", lambda engine, _: work(engine), lambda found: take(viewer, found, mode)
-    )
-
-
 def reach(viewer: Viewer) -> float:
     """Return how far growing and shrinking go at a time, world units."""
     extent = viewer.state.extent
     return viewer.state.tools.reach * (0.0 if extent is None else extent.radius)
 
 
-def grow_selection(viewer: Viewer) -> None:
-    """Add what is within reach along the surface."""
-    if has_selection(viewer):
-        selected, distance = viewer.state.marks.selected, reach(viewer)
-        find(viewer, "growing", lambda engine: grow(engine.surface, selected, distance), "add")
+def _found(label: str, found: Callable[[QueryEngine, Array, float], Array], mode: Mode) -> Action:
+    """Return the action that takes what `found` makes of the selection, on the worker, within reach."""
+
+    def act(viewer: Viewer) -> None:
+        if has_selection(viewer):
+            selected, distance = viewer.state.marks.selected, reach(viewer)
+            viewer.ask_engine(
+                f"{label} the selection",
+                lambda engine, _: found(engine, selected, distance),
+                lambda members: take(viewer, members, mode),
+            )
+
+    return act
 
 
-def shrink_selection(viewer: Viewer) -> None:
-    """Leave out what is within reach of something else along the surface."""
-    if has_selection(viewer):
-        selected, distance = viewer.state.marks.selected, reach(viewer)
-        find(viewer, "shrinking", lambda engine: shrink(engine.surface, selected, distance), "intersect")
-
-
-def select_alike(viewer: Viewer) -> None:
-    """Select everything that is like what is selected, wherever it is, by `QueryEngine.like`."""
-    if has_selection(viewer):
-        selected = viewer.state.marks.selected
-        find(viewer, "looking for more like", lambda engine: engine.like(selected).members, "replace")
+# Along the surface: what is within reach of the selection, and what is of nothing else.
+grow_selection = _found("growing", lambda engine, old, by: grow(engine.surface, old, by), "add")
+shrink_selection = _found("shrinking", lambda engine, old, by: shrink(engine.surface, old, by), "intersect")
+# Wherever it is, by `QueryEngine.like`.
+select_alike = _found("looking for more like", lambda engine, old, by: engine.like(old).members, "replace")
 
 
 Target = int | Array  # a node of the tree, or a (3,) point on the surface, world units
@@ -280,13 +270,13 @@ def pivot(viewer: Viewer) -> Array | None:
     state = viewer.state
     if state.scene is None or state.extent is None:
         return None
-    selected, kept = state.marks.selected, viewer.pivot
+    selected, kept = state.marks.selected, state.pivot
     if kept is None or kept[0] is not state.scene or kept[1] is not selected:  # asked in every frame
         chosen = selected & state.scene.gaussians.valid()
         middle = state.extent.centre
         if chosen.any():
             middle = np.median(state.scene.gaussians.means[chosen].astype(np.float64), axis=0)
-        kept = viewer.pivot = state.scene, selected, np.asarray(middle)
+        kept = state.pivot = state.scene, selected, np.asarray(middle)
     return kept[2]
 
 
@@ -304,7 +294,7 @@ def preview(viewer: Viewer, to: Similarity) -> None:
 def transform(viewer: Viewer, to: Similarity) -> None:
     """Transform the selection; without one the whole scene with its cameras. Says why where that fails."""
     viewer.state.moving = None
-    if not has_scene(viewer) or to.is_identity:
+    if not viewer.has_scene("transform it") or to.is_identity:
         return
     move, before = _move_of(viewer, to), viewer.state.session
     moves = before.moves
@@ -338,7 +328,7 @@ def apply_form(viewer: Viewer) -> None:
     """Transform by the numbers of the panel: scaled and rotated about the middle, then moved."""
     form, centre = viewer.state.edit_form, pivot(viewer)
     if centre is None:
-        has_scene(viewer)
+        viewer.has_scene("transform it")
         return
     try:
         to = scaling(form.scale)
@@ -384,7 +374,7 @@ def in_crop_box(viewer: Viewer) -> Array:
 def crop(viewer: Viewer) -> None:
     """Delete what lies outside the box of the panel; refused where nothing lies inside."""
     marks = viewer.state.marks
-    if not has_scene(viewer):
+    if not viewer.has_scene("crop it"):
         return
     inside = in_crop_box(viewer)
     if (inside & marks.kept).any():

@@ -87,14 +87,14 @@ def filtered(viewer: Viewer, rows: Iterable[Outline], text: str) -> Iterator[Out
 
 def hidden_nodes(viewer: Viewer) -> Array:
     """(K,) bool: nodes of which nothing is shown."""
-    view, marks = viewer.state.outline, viewer.state.marks
+    state, view, marks = viewer.state, viewer.state.outline, viewer.state.marks
     if view is None or view.tree is None:
         return np.zeros(0, bool)
-    if viewer.out_of_sight is None or viewer.out_of_sight[:2] != (view, marks):
+    if state.out_of_sight is None or state.out_of_sight[:2] != (view, marks):
         gone = view.tree.leaves[~marks.shown & (view.tree.leaves != NO_NODE)]
         counts = view.tree.totals(np.bincount(gone, minlength=view.tree.count))
-        viewer.out_of_sight = view, marks, counts >= np.maximum(view.sizes, 1)
-    return viewer.out_of_sight[2]
+        state.out_of_sight = view, marks, counts >= np.maximum(view.sizes, 1)
+    return state.out_of_sight[2]
 
 
 def colour_of(viewer: Viewer, node: int) -> tuple[float, float, float] | None:

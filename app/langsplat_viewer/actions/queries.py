@@ -205,9 +205,12 @@ def remove(viewer: Viewer, phrase: str) -> None:
 
 def remove_all(viewer: Viewer) -> None:
     """Take all queries off the list; one undo brings them back."""
+    if not viewer.state.session.queries:
+        viewer.state.say("no queries are listed")
+        return
     viewer.change(queries=(), chosen="")
     forget_unlisted(viewer)
-    viewer.state.say("removed all queries", undoes=next(reversed(viewer.history.past), None))
+    viewer.state.say("removed all queries", undoes=viewer.history.past[-1])
 
 
 def set_level(viewer: Viewer, level: LevelChoice) -> None:

@@ -24,7 +24,7 @@ from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
-from langsplat_viewer.actions.editing import adopt, has_scene, has_selection
+from langsplat_viewer.actions.editing import adopt, has_selection
 from langsplat_viewer.actions.viewpoint import path_motion
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.jobs import one_line
@@ -103,7 +103,7 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
 def save_page(viewer: Viewer, folder: Path = Path()) -> None:
     """Have the scene, without what was deleted, written as a web page that can be searched, a new file."""
     state = viewer.state
-    if not has_scene(viewer) or state.scene is None:
+    if not viewer.has_scene("write its web page") or state.scene is None:
         return
     scene, kept = replace(state.scene, language=viewer.language), state.marks.kept
 
@@ -187,7 +187,7 @@ def export(
     then: Callable[[Viewer], None] = lambda viewer: None,
 ) -> None:
     """Have the worker write a part of the scene to a new file in `folder`; `then` runs once it is there."""
-    if not (has_scene(viewer) if part == "edited" else has_selection(viewer)):
+    if not (viewer.has_scene("save it") if part == "edited" else has_selection(viewer)):
         return
     state, marks, session = viewer.state, viewer.state.marks, viewer.state.session
     assert state.scene is not None

@@ -20,6 +20,7 @@ from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import PlacedText, placed
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.panels import ui
+from langsplat_viewer.rendering.request import Split
 from langsplat_viewer.session import Note, Point, Ruler
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
@@ -31,52 +32,34 @@ UNMOVED = ui.OVER | ui.FIXED | imgui.WindowFlags_.no_background | imgui.WindowFl
 
 def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Texture, ...]) -> None:
     """Draw the textures of `Canvas.textures` where they belong, each with its name if there are several."""
-    split = viewer.state.session.split
-    if split.mode in ("wipe", "scenes") and len(textures) > 1:
-        _image(area, textures[0], 0.0, split.at)
-        _image(area, textures[1], split.at, 1.0)
-        _divider(area, split.at)
-    elif split.mode == "levels" and len(textures) > 1:
-        for column, texture in zip(area.columns(len(textures)), textures, strict=True):
-            _image(column, texture, 0.0, 1.0)
-        for place in range(1, len(textures)):
-            _divider(area, place / len(textures))
-    elif textures:
-        _image(area, textures[0], 0.0, 1.0)
-    _titles(viewer, area)
-
-
-def _image(area: ui.Area, texture: moderngl.Texture, start: float, stop: float) -> None:
-    imgui.get_background_draw_list().add_image(
-        imgui.ImTextureRef(texture.glo),
-        ImVec2(area.left + start * area.width, area.top),
-        ImVec2(area.left + stop * area.width, area.top + area.height),
-        ImVec2(start, 1),  # GL's first row is the lowest
-        ImVec2(stop, 0),
-    )
-
-
-def _divider(area: ui.Area, at: float) -> None:
-    x, paint = area.left + at * area.width, imgui.get_background_draw_list()
-    ends = ImVec2(x, area.top), ImVec2(x, area.top + area.height)
-    paint.add_line(*ends, SHADE, 4.0)
-    paint.add_line(*ends, WHITE, 1.5)
-
-
-def _titles(viewer: Viewer, area: ui.Area) -> None:
-    """Write what each image shows at its upper edge: left and right of the line of a wipe."""
-    split, names = viewer.state.session.split, tuple(pane.label for pane in viewer.state.panes())
-    gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
+    split, names = viewer.state.session.split, [pane.label for pane in viewer.state.panes()]
     if split.mode == "scenes":
         there = None if viewer.beside is None else viewer.beside.state.path
-        names = tuple("" if path is None else path.name for path in (viewer.state.path, there))
-    if split.mode in ("wipe", "scenes"):
-        x = area.left + split.at * area.width
-        text_on_shade(names[0], x - gap - ui.width_of(names[0]), top, area)
-        text_on_shade(names[1], x + gap, top, area)
-    elif split.mode == "levels":
-        for column, name in zip(area.columns(len(names)), names, strict=True):
-            text_on_shade(name, column.left + gap, top, area)
+        names = ["" if path is None else path.name for path in (viewer.state.path, there)]
+    parts, paint = parts_of(area, split), imgui.get_background_draw_list()
+    for place, (part, texture) in enumerate(
+        zip(parts if len(textures) > 1 else [area], textures, strict=False)
+    ):
+        whole = area if split.has_line else part  # of which the texture is
+        start = (part.left - whole.left) / whole.width
+        stop = start + part.width / whole.width
+        ends = ImVec2(start, 1), ImVec2(stop, 0)  # GL's first row is the lowest
+        paint.add_image(imgui.ImTextureRef(texture.glo), *part.corners, *ends)
+        if place:
+            paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), SHADE, 4.0)
+            paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), WHITE, 1.5)
+    gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
+    for place, (part, name) in enumerate(zip(parts, names, strict=False) if len(parts) > 1 else ()):
+        is_left = split.has_line and not place  # and ends at the line
+        text_on_shade(name, part.left + (part.width - gap - ui.width_of(name) if is_left else gap), top, area)
+
+
+def parts_of(area: ui.Area, split: Split) -> list[ui.Area]:
+    """Return the parts of the area where its images are seen, from left to right."""
+    if not split.has_line:
+        return area.columns(split.columns)
+    at = split.at * area.width
+    return [replace(area, width=at), replace(area, left=area.left + at, width=area.width - at)]
 
 
 def shade_edge() -> float:
@@ -98,7 +81,7 @@ def text_on_shade(text: str, x: float, y: float, area: ui.Area) -> None:
 def draw_grip(viewer: Viewer, area: ui.Area) -> None:
     """Draw the grip of the line of a wipe; a double click puts it into the middle."""
     split = viewer.state.session.split
-    if split.mode not in ("wipe", "scenes") or viewer.state.scene is None:
+    if not split.has_line or viewer.state.scene is None:
         return
     x = area.left + split.at * area.width
     imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(0, 0))
@@ -369,10 +352,8 @@ def draw_legends(viewer: Viewer, area: ui.Area) -> None:
     if viewer.beside is None:
         draw_legend(viewer, area)
         return
-    at = viewer.state.session.split.at * area.width
-    left = replace(area, width=at)
-    right = replace(area, left=area.left + at, width=area.width - at)
-    for side, part, name in ((viewer, left, "left"), (viewer.beside, right, "right")):
+    sides = ((viewer, "left"), (viewer.beside, "right"))
+    for (side, name), part in zip(sides, parts_of(area, viewer.state.session.split), strict=False):
         draw_legend(side, part, f"relevancy {name}")
         query = side.state.session.query(viewer.state.session.chosen)
         result = None if query is None else side.state.result(query)
@@ -382,8 +363,7 @@ def draw_legends(viewer: Viewer, area: ui.Area) -> None:
 
 def draw_legend(viewer: Viewer, area: ui.Area, name: str = "relevancy") -> None:
     """Draw a colour bar with numbers for every query that is painted."""
-    state = viewer.state
-    shown = state.shown_results()
+    state, picture, shown = viewer.state, viewer.state.session.picture, viewer.state.shown_results()
     slots = painted(shown)
     is_hot = any(pane.row.drawing is Drawing.HEAT for pane in state.panes())
     if state.scene is None or not slots or not is_hot:
@@ -392,10 +372,8 @@ def draw_legend(viewer: Viewer, area: ui.Area, name: str = "relevancy") -> None:
     for slot in slots:
         result = shown[slot]
         if result is not None:
-            colours = bar_colours(
-                STRENGTH[result.verdict], state.session.picture.colour_map if len(slots) == 1 else slot
-            )
-            _bar(result, colours, state.session.picture.heat_scale or result.heat_range)
+            colours = bar_colours(STRENGTH[result.verdict], picture.colour_map if len(slots) == 1 else slot)
+            _bar(result, colours, picture.heat_scale or result.heat_range)
     imgui.end()
 
 

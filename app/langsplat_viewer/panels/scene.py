@@ -10,7 +10,6 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_core.config import HeatOf, TrainPreset
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow, Drawing
 from langsplat_core.query.answers import FLOOR
-from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import opening, settings
 from langsplat_viewer.commands import BUTTONS, Button, buttons_of, is_shown
 from langsplat_viewer.panels import ui
@@ -143,7 +142,7 @@ def _compared(viewer: Viewer) -> None:
     """Draw the choice of what is shown beside it."""
     state, split = viewer.state, viewer.state.session.split
     second = Button("", split.second, split.second_level if DISPLAYS[split.second].by_level else None)
-    shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}.get(split.mode, "")
+    shown = {"off": "nothing", "levels": "three levels", "wipe": second.name}.get(split.mode, "")
     if viewer.beside is not None and viewer.beside.state.path is not None:
         shown = viewer.beside.state.path.name
     ui.leave_room("Compare with", WIDTH_EM)
@@ -153,7 +152,7 @@ def _compared(viewer: Viewer) -> None:
         settings.set_split(viewer, "off")
     for button in BUTTONS:
         imgui.begin_disabled(not state.has_field and DISPLAYS[button.display].needs_field)
-        if imgui.selectable(compared_name(button), shown == compared_name(button))[0]:
+        if imgui.selectable(button.name, shown == button.name)[0]:
             settings.compare_with(viewer, button.display, button.latent_level)
         imgui.end_disabled()
     imgui.begin_disabled(not state.has_field)
@@ -163,12 +162,6 @@ def _compared(viewer: Viewer) -> None:
     if imgui.selectable("another scene ...", split.mode == "scenes")[0]:
         opening.ask_for_beside(viewer)
     imgui.end_combo()
-
-
-def compared_name(button: Button) -> str:
-    """Return the name of a display in the list of those that can be beside another."""
-    row = DISPLAYS[button.display]
-    return row.label if button.latent_level is None else f"{row.label}, {LEVELS[button.latent_level]}"
 
 
 # Training.
@@ -255,6 +248,6 @@ def draw_messages(viewer: Viewer) -> None:
     figures = [viewer.state.backend]
     if stats.width:
         figures += [f"{stats.milliseconds:.0f} ms", f"{stats.width} x {stats.height}"]
-    selected = int(viewer.state.marks.selected.sum())
+    selected = np.count_nonzero(viewer.state.marks.selected)
     figures += [f"{selected:,} selected"] if selected else []
     imgui.text_colored(ui.muted(), "   ".join(part for part in figures if part))

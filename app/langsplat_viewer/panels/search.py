@@ -104,7 +104,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
         imgui.same_line()
         if imgui.button("Auto"):
             queries.set_cut(viewer, query.phrase, None)
-    imgui.text_colored(ui.muted(), f"{int(result.members.sum()):,} Gaussians")
+    imgui.text_colored(ui.muted(), f"{np.count_nonzero(result.members):,} Gaussians")
 
 
 @lru_cache(maxsize=8)

@@ -53,7 +53,7 @@ def draw(viewer: Viewer) -> None:
 
 def counts(marks: Marks) -> str:
     """Return the counts of selected, hidden and deleted Gaussians in words."""
-    selected, hidden, deleted = (int(part.sum()) for part in (marks.selected, marks.hidden, marks.deleted))
+    selected, hidden, deleted = map(np.count_nonzero, (marks.selected, marks.hidden, marks.deleted))
     return f"{selected:,} of {len(marks.selected):,} selected, {hidden:,} hidden, {deleted:,} deleted"
 
 
@@ -202,7 +202,7 @@ def draw_transform(viewer: Viewer) -> None:
     """Draw the panel "Transform": what is transformed, gizmo, numbers, box."""
     state = viewer.state
     imgui.begin_disabled(state.scene is None)
-    chosen = int(state.marks.selected.sum())
+    chosen = np.count_nonzero(state.marks.selected)
     what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
     ui.small_wrapped(what, ui.muted())
     kind = ui.radio(GIZMOS, state.edit_form.gizmo)

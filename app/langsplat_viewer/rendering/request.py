@@ -78,6 +78,11 @@ class Split:
         """Columns that the image is divided into; the two panes of a wipe lie over each other."""
         return len(LEVELS) if self.mode == "levels" else 1
 
+    @property
+    def has_line(self) -> bool:
+        """True where two images lie over each other, left and right of a line."""
+        return self.mode in ("wipe", "scenes")
+
     def pane_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the pixels of each pane of an image of `size` (width, height)."""
         return max(size[0] // self.columns, 1), size[1]
@@ -88,7 +93,7 @@ class Split:
 
     def joined(self, images: Sequence[Array], width: int) -> Array:
         """Join the (H, W, C) images of all panes to one of `width` pixels, filled by its last column."""
-        if self.mode in ("wipe", "scenes") and len(images) > 1:
+        if self.has_line and len(images) > 1:
             line = round(self.at * width)
             return np.concatenate([images[0][:, :line], images[1][:, line:]], 1)
         if len(images) == 1:
