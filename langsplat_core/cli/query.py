@@ -374,46 +374,61 @@ class _Pixels:
         self._engine, self._view, self._paper = engine, view, mode == "paper"
         size = max(view.count, view.camera.height * view.camera.width)
         self._most = max(min(CHANNELS_AT_ONCE, 2**25 // size), 1)  # 128 MB of numbers, twice
-        self._waiting: list[tuple[dict[str, Any], Array]] = []
         self._even: list[tuple[dict[str, Any], Array]] = []  # with relevancies of `engine.alike`
+        self._others: list[tuple[dict[str, Any], Array]] = []  # with those of all Gaussians
 
     def add(self, result: QueryResult, answer: dict[str, Any]) -> None:
         """Take an answer, whose pixel fields are filled sooner or later."""
-        gate = PictureConfig().alpha_gate
         if self._paper:
-            phrase = self._engine.text_vectors([result.phrase])
+            phrase, gate = self._engine.text_vectors([result.phrase]), PictureConfig().alpha_gate
             image = decoded_relevancy(self._view, self._engine.field, result.level, phrase, gate)
-            answer |= _pixel(*peak_pixel(image[..., 0], PAPER_FILTER))
-        elif result.spread is not None and self._peaks is not None:
+            _fill(answer, peak_pixel(image[..., 0], PAPER_FILTER))
+        elif result.spread is not None:
             self._even.append((answer, result.spread.at(self._engine.alike[1])))
+            if len(self._even) == self._most:
+                self._find(self._even, self._engine.alike[0], self._peaks)
         else:
-            self._waiting.append((answer, result.even))
-        if len(self._waiting) == self._most or len(self._even) == CHANNELS_AT_ONCE:
-            self.fill()
+            self._others.append((answer, result.even))
+            if len(self._others) == self._most:
+                self._find(self._others)
 
     @cached_property
     def _peaks(self) -> PeakPixels | None:
+        """Of many answers; None where the sets' shares take too much memory."""
         assert isinstance(self._view, CpuView)
-        shares = self._view.label_shares(self._engine.alike[0], PictureConfig().alpha_gate, PLANES)
-        return None if shares is None else PeakPixels(shares, self._view.camera, PAPER_FILTER)
+        painted, gate = self._view.paint_sets(self._engine.alike[0], PLANES), PictureConfig().alpha_gate
+        if painted is None:
+            return None
+        return PeakPixels(self._view.camera, painted, gate, PAPER_FILTER, self._most)
 
     def fill(self) -> None:
         """Fill the pixel fields of all that was added."""
-        if self._waiting:
-            answers, columns = zip(*self._waiting, strict=True)
-            images = splatted_relevancy(self._view, np.stack(columns, 1), PictureConfig().alpha_gate)
-            for answer, image in zip(answers, np.moveaxis(images, -1, 0), strict=True):
-                answer |= _pixel(*peak_pixel(image, PAPER_FILTER))
-            self._waiting.clear()
-        if self._even and self._peaks is not None:
-            answers, values = zip(*self._even, strict=True)
-            for answer, (column, row, score) in zip(answers, self._peaks.of(np.stack(values)), strict=True):
-                answer |= _pixel(int(column), int(row), float(score))
-            self._even.clear()
+        if self._even:
+            self._find(self._even, self._engine.alike[0], vars(self).get("_peaks"))
+        if self._others:
+            self._find(self._others)
+
+    def _find(
+        self,
+        waiting: list[tuple[dict[str, Any], Array]],
+        sets: Array | slice = slice(None),
+        peaks: PeakPixels | None = None,
+    ) -> None:
+        answers, values = zip(*waiting, strict=True)
+        if peaks is None:
+            columns = np.stack(values, 1)[sets]
+            images = splatted_relevancy(self._view, columns, PictureConfig().alpha_gate)
+            found = [peak_pixel(image, PAPER_FILTER) for image in np.moveaxis(images, -1, 0)]
+        else:
+            found = peaks.of(np.stack(values))
+        for answer, peak in zip(answers, found, strict=True):
+            _fill(answer, peak)
+        waiting.clear()
 
 
-def _pixel(column: int, row: int, score: float) -> dict[str, Any]:
-    return {"pixel": [column, row], "pixel_score": score}
+def _fill(answer: dict[str, Any], peak: tuple[int, int, float]) -> None:
+    column, row, score = peak
+    answer |= {"pixel": [column, row], "pixel_score": score}
 
 
 def _lines(answer: dict[str, Any], unit: Unit) -> list[str]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import product
 from typing import Literal
 
@@ -10,11 +10,11 @@ import numpy as np
 from scipy.sparse import csr_matrix, vstack
 
 from langsplat_core.arrays import Array
-from langsplat_core.compiled import kernel, plain, shared_workers
+from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import named
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.lookup import Relevancy
+from langsplat_core.query.lookup import TOGETHER, Lookup, Relevancy
 from langsplat_core.query.rule import (
     RULE,
     Bars,
@@ -28,7 +28,7 @@ from langsplat_core.query.rule import (
 )
 from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Tree
 from langsplat_core.scene.surface import NEIGHBOURS, Surface
-from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale, relevancy_of
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale
 
 AnswerRule = Literal["regions", "peak"]  # by `rule.decide`, or as published
 
@@ -181,9 +181,8 @@ class Regions:
 
     def spread(self, level: int, values: Array, others: Array) -> Array:
         """Return the (N,) of the (R,) `values` of a level's regions; in none, its own of `others` (N,)."""
-        spread = np.empty_like(others)
-        shared_workers().run(_spread, len(others), self.everywhere[level], values, others, spread)
-        return spread
+        of = self.everywhere[level]
+        return np.where(of >= 0, np.append(values, others.dtype.type(0))[of], others)
 
     def level_of(self, members: Array) -> int:
         """Return the level with the region most like `members` (N,) bool, of equal ones the coarsest."""
@@ -248,14 +247,6 @@ class Spread:
         return spread
 
 
-@partial(kernel, shapes="of N, values R, others N, spread N")
-def _spread(first: int, last: int, of: Array, values: Array, others: Array, spread: Array) -> None:
-    """Fill rows [first, last) of `spread` (N,)."""
-    for i in range(first, last):
-        region = of[i]
-        spread[i] = values[region] if region >= 0 else others[i]
-
-
 def place_of(points: Array) -> tuple[Array, Array]:
     """Return place (3,), at what is nearest to the middle, and box (2, 3) of (K, 3) points, K >= 1."""
     points = points.astype(np.float64)
@@ -275,21 +266,14 @@ def feature_sums(
     return sum((shares[:, part] @ read(latents[part])).astype(np.float64) for part in parts)
 
 
-def chance_in(field: LanguageField, regions: Regions, scale: Scale) -> Array:
-    """Return the (R, V) float32 fits of everyday phrases in the regions of all levels."""
-
-    def everyday(latents: Array) -> Array:
-        cosines = field.codec.cosines(latents, scale.texts)
-        zero, rate = scale.of(cosines)
-        return relevancy_of(cosines[:, len(scale.canonical) :], zero[:, None], rate[:, None])
-
+def chance_in(table: RegionTable, mixtures: csr_matrix, lookup: Lookup, scale: Scale) -> Array:
+    """Return the (R, V) float32 fits of everyday phrases in the regions of all levels; see `mixtures`."""
+    assert scale.everyday is not None
     means = [
-        feature_sums(field, level, of, regions.weights, len(totals), everyday) / totals[:, None]
-        for level, (of, totals) in enumerate(zip(regions.everywhere, regions.totals, strict=True))
+        mixtures @ np.stack([one.values for one in lookup.relevancies(scale.everyday[i : i + TOGETHER])], 1)
+        for i in range(0, len(scale.everyday), TOGETHER)
     ]
-    return region_fits(
-        regions.table, np.concatenate([scale.fit(values).astype(np.float32) for values in means])
-    )
+    return region_fits(table, scale.fit(np.concatenate(means, 1)).astype(np.float32))
 
 
 # The answers.

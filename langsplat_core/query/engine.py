@@ -260,7 +260,9 @@ class QueryEngine:
     @cached_property
     def chance(self) -> Array | None:
         """(R, V) fits of everyday phrases in the regions of all levels; None where there are none."""
-        return None if self.rule == "peak" else chance_in(self.compared, self.regions, self.scale)
+        if self.rule == "peak":
+            return None
+        return chance_in(self.regions.table, self._mixtures, self._lookup, self.scale)
 
     @cached_property
     def bars(self) -> Bars | None:

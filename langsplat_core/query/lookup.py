@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.compiled import kernel, plain, shared_workers
+from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.display.displays import gated_mean
 from langsplat_core.errors import InputError
-from langsplat_core.raster.cpu.rasterizer import TileShares
 from langsplat_core.raster.cpu.tiles import PIXELS, TILE
 from langsplat_core.raster.protocol import View
 from langsplat_core.scene import Camera, CodebookCodec, LanguageField
@@ -165,162 +165,83 @@ def decoded_relevancy(
 
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
     """Return the peak (column, row, value) of a (H, W) map's means over `window` px, edges repeated."""
-    height, width = relevancy.shape
-    window = max(1, min(window, height, width))
-    means = _box_means(plain(relevancy), 0, 0, (height, width), window, (0, height, 0, width))
-    row, column, value = _middle_peak(means)
-    return int(column), int(row), float(value)
+    return _middle_peak(_box_means(relevancy, max(1, min(window, *relevancy.shape))))
 
 
-PLANES = 2**17  # of shares of regions in tiles, at most: 128 MB
+def _box_means(image: Array, window: int) -> Array:
+    from scipy.ndimage import uniform_filter  # here, since the window, which needs none, imports this module
+
+    return np.asarray(uniform_filter(np.asarray(image, np.float64), size=window, mode="nearest"))
+
+
+def _middle_peak(means: Array) -> tuple[int, int, float]:
+    """Return column, row and value of the highest pixel, of those as high the middle one.
+
+    Which is higher by its last digits follows from the unit of lengths.
+    """
+    rows, columns = np.divmod(np.flatnonzero(means >= means.max() - 1e-6), means.shape[1])
+    middle = ((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2).argmin()
+    row, column = int(rows[middle]), int(columns[middle])
+    return column, row, float(means[row, column])
+
+
+PLANES = 2**16  # of weights of sets in tiles, at most: 64 MB, and about three times as much of their means
 ROUNDING = 1e-5  # of means of float32 shares, generously
 
 
 class PeakPixels:
-    """Peak pixels in one view of many answers whose relevancy is even over sets of Gaussians.
+    """Peak pixels, as of `peak_pixel`, in one view of many answers that are even over sets of Gaussians.
 
-    The sets' shares in the pixels are blended once; an answer then costs the tiles where its peak may be. A
-    mean over pixels is at most the largest relevancy in them, so that these are the tiles around those that
-    see a set of at least the peak of any one tile.
+    A mean over pixels is the sum of the answer's relevancies times means of the sets' shares in alpha. These
+    are made once, in tiles; an answer then costs the tiles where its peak may be, by the highest share that
+    each set has there and by the mean of any one tile.
     """
 
-    def __init__(self, shares: TileShares, camera: Camera, window: int) -> None:
-        """window: as of `peak_pixel`."""
-        self._shares, self._averages = shares, shares.shares.mean(1)
-        self._size = camera.height, camera.width
-        self._window = max(1, min(window, *self._size))
+    def __init__(
+        self, camera: Camera, painted: tuple[Array, Array, Array], gate: float, window: int, most: int
+    ) -> None:
+        """painted: of `CpuView.paint_sets`; gate: shares are 0 where alpha is at most this; most: answers."""
+        tiles, labels, planes = painted
+        self._size = height, width = camera.height, camera.width
+        rows, columns = -(-height // TILE), -(-width // TILE)
+        window = max(1, min(window, height, width))
+        there, starts = np.unique(tiles, return_index=True)
+        alpha = np.ones((rows * columns, TILE, TILE))
+        alpha[there] = np.add.reduceat(planes, starts, dtype=np.float64) if len(there) else 1
+        shares = np.where(alpha > gate, 1 / np.maximum(alpha, gate), 0)[tiles] * planes
+        y, x, around = *np.divmod(tiles, columns), -(-(window // 2) // TILE)
+        found = []
+        for label in np.unique(labels):
+            own = np.flatnonzero(labels == label)
+            top, left = max(y[own].min() - around, 0), max(x[own].min() - around, 0)
+            bottom, right = min(y[own].max() + around + 1, rows), min(x[own].max() + around + 1, columns)
+            part = np.zeros((bottom - top, TILE, right - left, TILE))
+            part[y[own] - top, :, x[own] - left] = shares[own]
+            image = part.reshape(TILE * (bottom - top), -1)[: height - TILE * top, : width - TILE * left]
+            image[:] = _box_means(image, window)
+            down, along = np.nonzero(part.max((1, 3)) > 1e-9)
+            at = (down + top) * columns + along + left
+            found.append((at, np.full(len(at), label), part[down, :, along].reshape(-1, PIXELS)))
+        tiles, self._labels, self._means = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.argsort(tiles, kind="stable")
+        self._labels, self._means = self._labels[order], self._means[order]
+        self._starts = np.searchsorted(tiles[order], np.arange(rows * columns + 1))
+        shape = rows * columns, int(labels.max(initial=-1)) + 1
+        each = self._means.max(1), self._means.mean(1)
+        self._highest, self._typical = (csr_matrix((of, self._labels, self._starts), shape) for of in each)
+        self._images = np.empty((most, rows, TILE, columns, TILE))  # again and again: new pages take longer
 
-    def of(self, values: Array) -> Array:
-        """(Q, L) float32 relevancies >= 0 of the sets -> (Q, 3) float64 columns, rows and values."""
-        peaks = np.empty((len(values), 3))
-        arguments = self._shares, self._averages, self._size, self._window, plain(values), peaks
-        shared_workers().run(_find_peaks, len(values), *arguments)
-        return peaks
-
-
-@kernel
-def _find_peaks(
-    first: int,
-    last: int,
-    shares: TileShares,
-    averages: Array,
-    size: tuple[int, int],
-    window: int,
-    values: Array,
-    peaks: Array,
-) -> None:
-    """Fill rows [first, last) of `peaks`."""
-    columns = (size[1] + TILE - 1) // TILE
-    rows, around = (size[0] + TILE - 1) // TILE, (window // 2 + TILE - 1) // TILE
-    largest = np.empty(rows * columns, np.float32)
-    for q in range(first, last):
-        own, lead, highest = values[q], 0, -1.0
-        for tile in range(len(largest)):
-            largest[tile], mean = 0, 0.0
-            for plane in range(shares.starts[tile], shares.starts[tile + 1]):
-                value = own[shares.labels[plane]]
-                largest[tile] = max(largest[tile], value)
-                mean += averages[plane] * value
-            if mean > highest:
-                lead, highest = tile, mean
-        y, x = lead // columns, lead % columns
-        _, _, least = _peak_in(shares, own, size, window, (y, y + 1, x, x + 1))
-        top, bottom, left, right = rows, 0, columns, 0
-        for tile in range(len(largest)):
-            if largest[tile] >= least - ROUNDING:
-                y, x = tile // columns, tile % columns
-                top, bottom = min(top, y - around), max(bottom, y + around + 1)
-                left, right = min(left, x - around), max(right, x + around + 1)
-        box = max(top, 0), min(bottom, rows), max(left, 0), min(right, columns)
-        row, column, value = _peak_in(shares, own, size, window, box)
-        peaks[q, 0], peaks[q, 1], peaks[q, 2] = column, row, value
-
-
-@kernel
-def _peak_in(
-    shares: TileShares, values: Array, size: tuple[int, int], window: int, box: tuple[int, int, int, int]
-) -> tuple[int, int, float]:
-    """Return row, column and value of the peak in the tiles of `box`: top, bottom, left, right."""
-    columns, rows = (size[1] + TILE - 1) // TILE, (size[0] + TILE - 1) // TILE
-    around = (window // 2 + TILE - 1) // TILE
-    top, left = max(box[0] - around, 0), max(box[2] - around, 0)
-    bottom, right = min(box[1] + around, rows), min(box[3] + around, columns)
-    image = np.empty((TILE * (bottom - top), TILE * (right - left)), np.float32)
-    mean = np.empty(PIXELS, np.float32)
-    for y in range(top, bottom):
-        for x in range(left, right):
-            mean[:] = 0
-            tile = y * columns + x
-            for plane in range(shares.starts[tile], shares.starts[tile + 1]):
-                value, share = values[shares.labels[plane]], shares.shares[plane]
-                for n in range(PIXELS):
-                    mean[n] += value * share[n]
-            at = TILE * (y - top), TILE * (x - left)
-            image[at[0] : at[0] + TILE, at[1] : at[1] + TILE] = mean.reshape(TILE, TILE)
-    y0, x0 = TILE * box[0], TILE * box[2]
-    region = y0, min(TILE * box[1], size[0]), x0, min(TILE * box[3], size[1])
-    row, column, value = _middle_peak(_box_means(image, TILE * top, TILE * left, size, window, region))
-    return y0 + row, x0 + column, value
-
-
-@kernel
-def _box_means(
-    part: Array, top: int, left: int, size: tuple[int, int], window: int, box: tuple[int, int, int, int]
-) -> Array:
-    """Return float64 means over `window` px, edges repeated, of the pixels in `box` of an image of `size`.
-
-    part: the image from row `top` and column `left` on, as far as it is needed.
-    """
-    y0, y1, x0, x1 = box
-    before, after = window // 2, window - 1 - window // 2
-    means, sums, scale = np.empty((y1 - y0, x1 - x0)), np.zeros(part.shape[1]), 1 / window**2
-    running = np.zeros(x1 - x0 + window)
-    for y in range(y0, y1):
-        if y == y0:
-            for other in range(y - before, y + after + 1):
-                sums += part[min(max(other, 0), size[0] - 1) - top]
-        else:
-            new, old = part[min(y + after, size[0] - 1) - top], part[max(y - before - 1, 0) - top]
-            for x in range(len(sums)):
-                sums[x] += np.float64(new[x]) - np.float64(old[x])
-        for n in range(1, len(running)):
-            column = min(max(x0 - before + n - 1, 0), size[1] - 1)
-            running[n] = running[n - 1] + sums[column - left]
-        for x in range(x1 - x0):
-            means[y - y0, x] = (running[x + window] - running[x]) * scale
-    return means
-
-
-@partial(kernel, fastmath={"nnan", "nsz", "reassoc"})
-def _highest_of_rows(means: Array) -> Array:
-    """(H, W) -> (H,); a loop of its own, which runs in lanes."""
-    highest = np.empty(len(means))
-    for y in range(len(means)):
-        top = means[y, 0]
-        for x in range(means.shape[1]):
-            top = means[y, x] if means[y, x] > top else top
-        highest[y] = top
-    return highest
-
-
-@kernel
-def _middle_peak(means: Array) -> tuple[int, int, float]:
-    """Return row, column and value of the highest pixel, of those as high the middle one.
-
-    Which is higher by its last digits follows from the unit of lengths.
-    """
-    highest = _highest_of_rows(means)
-    least = highest.max() - 1e-6
-    high = [y for y in range(len(means)) if highest[y] >= least]
-    count = rows = columns = 0
-    for y in high:
-        for x in range(means.shape[1]):
-            if means[y, x] >= least:
-                count, rows, columns = count + 1, rows + y, columns + x
-    nearest, row, column = np.inf, 0, 0
-    for y in high:
-        for x in range(means.shape[1]):
-            far = (y - rows / count) ** 2 + (x - columns / count) ** 2
-            if means[y, x] >= least and far < nearest:
-                nearest, row, column = far, y, x
-    return row, column, means[row, column]
+    def of(self, values: Array) -> list[tuple[int, int, float]]:
+        """(Q, L) float32 relevancies >= 0 of the sets -> columns, rows and values; Q is `most` or less."""
+        met = values[:, : self._highest.shape[1]].T
+        sure = (self._typical @ met).max(0) - ROUNDING
+        images = self._images[: len(values)]
+        images[:] = 0
+        for tile, asked in enumerate(self._highest @ met >= sure):
+            some, planes = np.flatnonzero(asked), slice(*self._starts[tile : tile + 2])
+            means = values[some[:, None], self._labels[planes]] @ self._means[planes]
+            row, column = divmod(tile, images.shape[3])
+            images[some, row, :, column] = means.reshape(-1, TILE, TILE)
+        height, width = self._size
+        shape = TILE * images.shape[1], TILE * images.shape[3]
+        return [_middle_peak(image.reshape(shape)[:height, :width]) for image in images]

@@ -50,7 +50,6 @@ class TextTower(Protocol):
 
     dim: int  # length D of the vectors
     temperature: float  # factor of a difference of cosines before the sigmoid, 10 for CLIP
-    batch: int  # phrases per forward pass, at most
 
     def encode(self, texts: list[str]) -> Array:
         """(B, D) float32 vectors, of any length, of B > 0 phrases.
@@ -183,7 +182,7 @@ class PhraseEncoder:
         said = list(texts)
         if self.words is not None:
             said = [" ".join(self._taught(w) or "" for w in WORD.findall(text.lower())) for text in texts]
-        size = self.tower.batch
+        size = getattr(self.tower, "batch", 64)  # phrases per forward pass
         parts = [unit(self.tower.encode(said[i : i + size])) for i in range(0, len(texts), size)]
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
@@ -299,8 +298,6 @@ class TorchText:
     The folder's tokenizer.json is read as it is, by the `tokenizers` library: what transformers' own classes
     add around it (which side is padded, whether an end token is there) differs between its versions.
     """
-
-    batch = 64
 
     def __init__(self, kind: Any, weights: Weights, config: Any, output: str, begin: str | None) -> None:
         """kind: class of transformers; output: name of the vectors in what it returns.

@@ -138,16 +138,19 @@ def test_commas_separate_phrases_and_exclusions_stay_one(folder, capsys):
 
 def test_plain_phrases_share_one_view(folder, capsys, monkeypatch):
     drawn: list[str] = []
-    for name in ("splat", "label_shares"):
+    for name in ("splat", "paint_sets"):
         method = getattr(CpuView, name)
         monkeypatch.setattr(
             CpuView, name, lambda *args, name=name, method=method: drawn.append(name) or method(*args)
         )
-    some = [f"{word}{mark}" for word in ("mug", "book", "plant") for mark in ("", "!", "?", "...", "!?") * 5]
-    assert len(answers(capsys, "query", "a.ply", *some)) == len(some)
-    assert drawn == ["label_shares"]
+    names = ("mug", "book", "plant")
+    alone = answers(capsys, "query", "a.ply", *names)
+    monkeypatch.setattr(query, "CHANNELS_AT_ONCE", 2)
+    together = answers(capsys, "query", "a.ply", *names)
+    assert [answer["pixel"] for answer in together] == [answer["pixel"] for answer in alone]
+    assert drawn == ["splat", "paint_sets"]
     answers(capsys, "query", "a.ply", "mug or book")
-    assert drawn == ["label_shares", "splat"]
+    assert drawn == ["splat", "paint_sets", "splat"]
 
 
 def test_phrases_asked_together_answer_as_alone(folder, capsys):

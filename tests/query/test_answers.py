@@ -22,7 +22,7 @@ from langsplat_core.query.answers import (
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
-from langsplat_core.query.lookup import Relevancy
+from langsplat_core.query.lookup import Lookup, Relevancy
 from langsplat_core.query.rule import (
     RULE,
     Bar,
@@ -73,7 +73,10 @@ def asked(
     if rule == "peak":
         return by_peak(phrase, relevancy, gaussians.means, surface, scale, field.found, level)
     regions, calibration = regions_of(Scene(gaussians, field), surface), field.calibration
-    by_chance = bars_of(regions.table, chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
+    fewer = replace(scale, everyday=field.everyday[:9])
+    lookup = Lookup(field, fewer)
+    mixtures = regions.mixtures(lookup.features, lookup.count + 1)
+    by_chance = bars_of(regions.table, chance_in(regions.table, mixtures, lookup, fewer))
     fits, judged = (own_fits(regions, scale, relevancy), None), (by_chance, calibration, level)
     return by_regions(phrase, each_alone(relevancy), fits, gaussians.means, regions, *judged)
 

@@ -157,12 +157,13 @@ def test_peaks_by_shares_equal_those_of_images(size):
     values[10:15] = np.eye(40)[rng.integers(0, 40, 5)]
     values[15:20] = values[15:20].round()
     values[20:] = np.array([0, 1, 0.5, 0, 1])[:, None]
-    shares = view.label_shares(sets, 0.3, 10**6)
-    for own, (column, row, score) in zip(values, PeakPixels(shares, camera, 9).of(values), strict=True):
+    painted = view.paint_sets(sets, 10**6)
+    found = PeakPixels(camera, painted, 0.3, 9, len(values)).of(values)
+    for own, (column, row, score) in zip(values, found, strict=True):
         wanted = plain_peak(splatted_relevancy(view, own[sets][:, None], 0.3)[..., 0], 9)
         assert score == pytest.approx(wanted[2], abs=1e-5)
         assert (column, row) == wanted[:2]
-    assert view.label_shares(sets, 0.3, len(shares.labels) - 1) is None
+    assert view.paint_sets(sets, len(painted[0]) - 1) is None
 
 
 def test_many_answers_take_no_memory_per_gaussian():

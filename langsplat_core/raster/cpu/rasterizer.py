@@ -249,60 +249,22 @@ def label_weights(
 # ``W onehot(labels)``: how much of every pixel each set of Gaussians paints. A tile meets few of them.
 
 
-class TileShares(NamedTuple):
-    """Shares of sets of Gaussians in the alpha of pixels, as P planes of T tiles of 16 x 16 pixels."""
-
-    starts: Array  # (T + 1,) int64: tile t has planes starts[t] to starts[t + 1]
-    labels: Array  # (P,) int32 set of each plane
-    shares: Array  # (P, 256) float32 row by row, 0 beyond the image
-
-
-@kernel
-def _number_labels(
-    first: int, last: int, tiles: Tiles, labels: Array, all_labels: int, slots: Array, counts: Array
-) -> None:
-    """(M,) labels in depth order -> (I,) `slots`, each a number among those of its tile, (T,) counts."""
-    slot_of = np.full(all_labels, -1, np.int32)
-    for tile in range(first, last):
-        start, end, count = tiles.starts[tile], tiles.starts[tile + 1], 0
-        for s in range(start, end):
-            label = labels[tiles.ranks[s]]
-            if slot_of[label] < 0:
-                slot_of[label] = count
-                count += 1
-            slots[s] = slot_of[label]
-        for s in range(start, end):
-            slot_of[labels[tiles.ranks[s]]] = -1
-        counts[tile] = count
-
-
 @helper
-def _fetch_slot(work: Any, s: int, later: int) -> Any:
+def _fetch_place(work: Any, s: int, later: int) -> Any:
     return work[0][s]
 
 
 @helper
-def _add_to_slot(work: Any, slot: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
-    at = slot * PIXELS + row * TILE
+def _add_to_plane(work: Any, plane: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
+    at = plane * PIXELS + row * TILE
     store(work[1], at, load(work[1], at) + weight)
 
 
 @kernel
-def _share_tiles(
-    first: int, last: int, tiles: Tiles, labels: Array, slots: Array, gate: float, out: TileShares
-) -> None:
-    """Fill `out`: weights are divided by an alpha above `gate`, and are 0 where it is not."""
+def _paint_sets(first: int, last: int, tiles: Tiles, places: Array, planes: Array) -> None:
+    """(I,) plane of each intersection -> its weights are added to (P * 256,) `planes`."""
     for i in range(first, last):
-        tile = tile_at(i, tiles)
-        planes = out.shares[out.starts[tile] : out.starts[tile + 1]]
-        planes[:] = 0
-        for s in range(tiles.starts[tile], tiles.starts[tile + 1]):
-            out.labels[out.starts[tile] + slots[s]] = labels[tiles.ranks[s]]
-        work = slots, planes.reshape(-1)
-        transmittance, _ = walk(tile, tiles, work, _fetch_slot, _add_to_slot, nothing_to_close)
-        for n in range(PIXELS):
-            alpha = np.float32(1) - abs(transmittance[n])
-            planes[:, n] *= np.float32(1) / alpha if alpha > gate else np.float32(0)
+        walk(tile_at(i, tiles), tiles, (places, planes), _fetch_place, _add_to_plane, nothing_to_close)
 
 
 # Views.
@@ -418,24 +380,22 @@ class CpuView(LiftingView):
         labels = np.require(maps, np.int32, ["C", "W"])
         return label_weights(self.tiles, self.order, self.workers, labels, (self.count, count), least)
 
-    def label_shares(self, labels: Array, gate: float, most: int) -> TileShares | None:
-        """Return the shares of sets of Gaussians in pixels; None where they take more than `most` planes.
+    def paint_sets(self, labels: Array, most: int) -> tuple[Array, Array, Array] | None:
+        """Return how much of every pixel each set of Gaussians paints; None for more than `most` planes.
 
-        labels: (N,) int32 >= 0, the set of each. The mean of values that sets have, as `splat` over alpha
-        gives it, is the sum of shares times values; 0 where alpha is at most `gate`.
+        labels: (N,) int32 >= 0, the set of each. Returns (P,) tile, rising, and (P,) set of each plane, and
+        its (P, 16, 16) float32 weights, of which the sum times the sets' values is what `splat` gives.
         """
         check_array("labels", labels, (self.count,), dtype=np.int32)
-        own, number = labels[self.order], len(self.tiles.starts) - 1
-        slots, counts = np.empty(len(self.tiles.ranks), np.int32), np.empty(number, np.int64)
-        every = int(own.max(initial=-1)) + 1
-        self.workers.run(_number_labels, number, self.tiles, own, every, slots, counts)
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        if starts[-1] > most:
+        tile_of = np.repeat(np.arange(len(self.tiles.starts) - 1), np.diff(self.tiles.starts))
+        sets = int(labels.max(initial=0)) + 1
+        pairs = tile_of * sets + labels[self.order[self.tiles.ranks]]
+        kinds, places = np.unique(pairs, return_inverse=True)
+        if len(kinds) > most:
             return None
-        planes = np.empty((starts[-1], PIXELS), np.float32)
-        shares = TileShares(starts, np.empty(starts[-1], np.int32), planes)
-        self._over_tiles(_share_tiles, own, slots, np.float32(gate), shares)
-        return shares
+        planes = np.zeros(len(kinds) * PIXELS, np.float32)
+        self._over_tiles(_paint_sets, places, planes)
+        return *np.divmod(kinds, sets), planes.reshape(-1, TILE, TILE)
 
     def backward(
         self, values: Array, image_grad: Array, alpha_grad: Array | None = None
