@@ -181,7 +181,7 @@ def bookmarks(folder: Path) -> None:
 def project(folder: Path) -> None:
     view = Bookmark("view", some_flight().keyframes[0].pose, 1.0)
     content = Project(str(folder / "s.ply"), len(GAUSSIANS), view, Session())
-    write_project(folder / "p.langsplat", content, folder / "p-other.langsplat")
+    write_project(folder / "p.langsplat", content, lambda: folder / "p-other.langsplat")
 
 
 def stage(folder: Path) -> None:

@@ -331,36 +331,48 @@ class Project(msgspec.Struct, omit_defaults=True):
     left_out: tuple[str, ...] = ()  # of a project of an earlier version, a line each
 
 
-def write_project(path: Path, project: Project, apart: Path, before: Project | None = None) -> Project:
-    """Write a project, whole or not at all; return what the file holds now.
+def write_project(
+    path: Path, project: Project, apart: Callable[[], Path], before: Project | None = None
+) -> tuple[Project, Path | None]:
+    """Write a project, whole or not at all; return what the file holds now, and where another's is kept.
 
     before: what it held when it was last read or written here. What another window has made since then is
-    taken over. Of what both changed `project` counts, and the other's file is kept as `apart`.
+    taken over. Of what both changed `project` counts, and the other's file is kept under the name that
+    `apart` gives, asked while no other window writes.
     """
     project = msgspec.structs.replace(project, session=checked(project.session))
     folder, scene = Path(os.path.abspath(path)).parent, Path(project.scene)
     named = scene.relative_to(folder).as_posix() if scene.is_relative_to(folder) else str(scene)
+    kept = None
     with locked(folder):
         if path.exists():
             other, whole = _of_same_scene(path, project), False
             if other is not None:
-                start = Session() if before is None else before.session
-                session, whole = _merged(start, project.session, other.session, project.gaussians)
+                start = Session() if before is None else _about(project.origin, before)
+                session, whole = _merged(
+                    start, project.session, _about(project.origin, other), project.gaussians
+                )
                 project = msgspec.structs.replace(project, session=session)
             if not whole:
-                with atomic_path(apart) as temporary:
+                kept = apart()
+                with atomic_path(kept) as temporary:
                     temporary.write_bytes(path.read_bytes())
         _write(path, {"format": FORMAT, "version": VERSION, **plain(project), "scene": named})
-        return read_project(path)
+        return read_project(path), kept
 
 
 def _of_same_scene(path: Path, project: Project) -> Project | None:
     """Return the project in a file, None where that is none of the same scene."""
     with suppress(InputError):
         other = read_project(path)
-        if (other.scene, other.gaussians, other.origin) == (project.scene, project.gaussians, project.origin):
+        if (other.scene, other.gaussians) == (project.scene, project.gaussians):
             return other
     return None
+
+
+def _about(origin: Point, project: Project) -> Session:
+    """Return a project's session with its places relative to `origin`."""
+    return project.session.moved(np.subtract(project.origin, origin))
 
 
 def read_project(path: Path) -> Project:

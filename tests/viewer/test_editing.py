@@ -16,6 +16,7 @@ from langsplat_viewer.actions import editing, opening, queries, saving, settings
 from langsplat_viewer.actions.editing import take
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
+from langsplat_viewer.session import Move
 from langsplat_viewer.state import EditForm, QueryAnswer
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
 from tests.support.windowless import (
@@ -474,6 +475,14 @@ def test_transform_of_the_scene_moves_its_cameras(opened):
     moved = [camera.position for camera in opened.state.scene.cameras]
     np.testing.assert_allclose(moved, to.points(np.array(eyes)), atol=1e-9)
     np.testing.assert_allclose(opened.state.extent.up, to.rotation @ up, atol=1e-6)
+
+
+def test_a_session_that_leads_too_far_is_not_adopted(opened):
+    before, shown = opened.state.session, opened.state.scene
+    far = replace(before, level="part", moves=(Move(scaling(1e9)), Move(scaling(1e9))))
+    with pytest.raises(InputError):
+        editing.adopt(opened, far)
+    assert (opened.state.session, opened.state.scene) == (before, shown)
 
 
 def test_transforms_are_undone_exactly(opened):

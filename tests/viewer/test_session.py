@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -31,6 +32,7 @@ from langsplat_viewer.projects import (
     read_flight,
     read_project,
     save_preferences,
+    write_project,
 )
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.session import Note, Preferences, Query, Ruler, Things
@@ -340,6 +342,14 @@ def test_two_windows_save_one_project_and_lose_nothing(saved, opened, again):
     act(saving.save_project, again)
     assert saved.with_name("blobs-001-other-002.langsplat").read_text() == "damaged"
     assert len(read_project(saved).session.moves) == 2
+
+
+def test_a_project_about_another_origin_is_merged(saved):
+    before, away = read_project(saved), np.array([64.0, -32.0, 8.0])
+    made = msgspec.structs.replace(before, origin=(*away,), session=before.session.moved(-away))
+    found, kept = write_project(saved, made, lambda: saved.with_name("apart"), before)
+    assert (kept, found.origin) == (None, (*away,))
+    np.testing.assert_allclose(away + found.session.notes[0].at, before.session.notes[0].at, atol=1e-12)
 
 
 def test_a_project_of_one_window_is_saved_again(viewer, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ tools are not. The scene that is shown is made anew from the one that was opened
 that undoing them all gives exactly what was there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -299,29 +299,28 @@ def transform(viewer: Viewer, to: Similarity) -> None:
     move, before = _move_of(viewer, to), viewer.state.session
     moves = before.moves
     joined = (*moves[:-1], moves[-1].then(move)) if moves and moves[-1].of == move.of else (*moves, move)
-    viewer.change(moves=joined, ruler=replace(before.ruler, points=()))
     try:
-        place(viewer)
+        place(viewer, joined)
     except LangSplatError as error:
-        viewer.state.session = viewer.history.past.pop()
         viewer.say_error(str(error))
         return
+    viewer.change(moves=joined, ruler=replace(before.ruler, points=()))
+    ask_listed(viewer)
     what = "the scene" if move.of is None else "the selection"
     viewer.state.say(f"transformed {what}; save the scene to keep it")
 
 
-def place(viewer: Viewer) -> None:
-    """Make the scene that is shown anew by the session's transforms, or raise InputError, and ask anew."""
+def place(viewer: Viewer, moves: Sequence[Move]) -> None:
+    """Make the scene that is shown anew by a session's transforms; InputError, and all as it was, else."""
     state = viewer.state
     if state.scene is None:
         return
     scene = opened = state.opened or state.scene
-    for move in state.session.moves:
+    for move in moves:
         scene = move.applied(scene)
     scene = replace(scene, language=viewer.language)
     state.opened, state.scene, state.extent, state.moving = opened, scene, extent_of(scene), None
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
-    ask_listed(viewer)
 
 
 def apply_form(viewer: Viewer) -> None:
@@ -408,16 +407,15 @@ def _step(viewer: Viewer, there: list[Session], back: list[Session], otherwise: 
 def adopt(viewer: Viewer, session: Session) -> None:
     """Take another session of the scene that is shown.
 
-    What follows from it is brought in line: masks, the transformed scene, answers. Raises InputError where a
-    transform leads too far.
+    What follows from it is brought in line: masks, the transformed scene, answers. Raises InputError, and
+    leaves all as it was, where a transform leads too far.
     """
     state, before = viewer.state, viewer.state.session
+    if moved := session.moves != before.moves:
+        place(viewer, session.moves)
     set_tools(viewer, stroke=None)
     state.record.chosen = None
     state.marks = session.marks.masks(before.marks, state.marks)
     state.session = session
     forget_unlisted(viewer)
-    if session.moves != before.moves:
-        place(viewer)
-    else:
-        ask_listed(viewer, anew=session.level != before.level)
+    ask_listed(viewer, anew=moved or session.level != before.level)

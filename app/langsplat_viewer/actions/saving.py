@@ -247,18 +247,21 @@ def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
         intrinsics=state.view.intrinsics,
         panels=state.preferences.panels or (),
     )
-    apart = output.free_name(path.parent, f"{path.name.removesuffix(PROJECTS)}-other", PROJECTS)
-    written: list[Project] = []
+    written: list[tuple[Project, Path | None]] = []
+
+    def apart() -> Path:
+        return output.free_name(path.parent, f"{path.name.removesuffix(PROJECTS)}-other", PROJECTS)
 
     def write() -> None:
         written.append(write_project(path, project, apart, state.project_read))
 
     if viewer.save(path, write) is None:
         return None
-    state.project, state.project_read = path, written[0]
-    if apart.exists():
-        viewer.say_error(f"{path.name} held what this window has not: kept as {apart.name}")
-    _take_over(viewer, written[0].session)
+    ((state.project_read, kept),) = written
+    state.project = path
+    if kept is not None:
+        viewer.say_error(f"{path.name} held what this window has not: kept as {kept.name}")
+    _take_over(viewer, state.project_read.session)
     state.saved = state.session
     state.preferences = state.preferences.with_recent(path)
     return path
