@@ -1,6 +1,7 @@
 """Errors a user can cause, each with a message of one line: what is wrong, and how to mend it."""
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType, SimpleNamespace
@@ -63,14 +64,15 @@ def malformed(path: object, what: str, remedy: str = "copy it again, or export i
 # What a reader skips, pads, rounds or guesses is counted by it and said in one line.
 
 Tell = Callable[[str], None]  # takes such a loss, for the line of its file
-STRICTNESS = SimpleNamespace(on=False, last="")  # on: by --strict, a loss is an error; last: what was said
+# on: by --strict, a loss is an error; said: the latest losses
+STRICTNESS = SimpleNamespace(on=False, said=deque[str](maxlen=4))
 
 
 def report_loss(message: str, *values: object) -> None:
     """Say in one line what a reader could not take as it was given; InputError under --strict."""
-    STRICTNESS.last = message % values
+    STRICTNESS.said.append(message % values)
     if STRICTNESS.on:
-        raise InputError(f"{STRICTNESS.last} (refused by --strict)")
+        raise InputError(f"{STRICTNESS.said[-1]} (refused by --strict)")
     logging.getLogger("langsplat").warning(message, *values)
 
 

@@ -46,7 +46,8 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
 
 def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
     """Return what `load_capture` does, with the points and the scale that the dataset states, or none."""
-    path, STRICTNESS.last = Path(path), ""
+    path = Path(path)
+    STRICTNESS.said.clear()
     check_settings(config, "--dataset.")
     if not os.path.exists(path):  # unlike Path.exists, also no for names that no file system could hold
         raise InputError(f"{shown(path)} does not exist; expected {ACCEPTED}")

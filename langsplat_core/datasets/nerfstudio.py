@@ -134,7 +134,8 @@ def _guesses(values: Json) -> Iterator[str]:
             yield f"{', '.join(absent)} not given: taken from the others, or as none"
     if "fl_x" in known and not known & {"cx", "cy"}:
         yield "cx and cy not given: the middle of the photograph is taken"
-    if any(values.get(key) for key in DISTORTING) and not known & {"camera_model", "is_fisheye"}:
+    told = known & {"camera_model", "is_fisheye"} or known >= {"k1", "k2", "p1", "p2"}  # instant-ngp's keys
+    if any(values.get(key) for key in DISTORTING) and not told:
         yield "camera_model not given: OPENCV is taken"
 
 

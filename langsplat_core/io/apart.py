@@ -74,8 +74,8 @@ def run(
                         log.log(*message)
                     case "error", error:
                         raise error
-                    case _, (result, loss):
-                        STRICTNESS.last = loss or STRICTNESS.last
+                    case _, (result, losses):
+                        STRICTNESS.said.extend(losses)
                         return result
         except (EOFError, pickle.UnpicklingError, BrokenPipeError):  # it ended within or before a message
             code = process.wait()
@@ -119,7 +119,7 @@ def serve() -> None:
     threading.Thread(target=end_with_caller, daemon=True).start()
     progress = Progress(lambda at: send("progress", (at.stage, at.fraction, at.note, dict(at.metrics))))
     try:
-        send("result", (function(*arguments, progress), STRICTNESS.last))
+        send("result", (function(*arguments, progress), STRICTNESS.said))
     except Exception as error:  # noqa: BLE001  raised there instead
         try:
             pickle.loads(pickle.dumps(error))

@@ -132,7 +132,8 @@ class _Content(Struct, rename="camel"):
     scenes: list[_Scene] = []
 
 
-ENTRIES = {*_Content.__struct_encode_fields__, *_About.__struct_encode_fields__}
+# "materials" are of meshes; with Gaussians they say what a viewer without the extension draws.
+ENTRIES = {*_Content.__struct_encode_fields__, *_About.__struct_encode_fields__, "materials"}
 
 
 @np.errstate(all="ignore")  # whatever numbers a file holds: rows that come out unsound are not drawn

@@ -156,7 +156,7 @@ def read_stored(path: Path) -> Stored:
 
 
 _ALWAYS = ("confidence", "positions", "corners", "means", "canonical", "everyday", "phrasebook", "things")
-_STATED = {*_PARSED, "format", "version", "encoder", "levels", "codec", "means_blake2b"}
+_STATED = {*_PARSED, "format", "version", "encoder", "levels", "codec", "means_blake2b", "calibration"}
 
 
 def _passed_over(field: LanguageField, tensors: dict[str, Array], about: dict[str, Any]) -> Iterator[str]:
@@ -167,6 +167,8 @@ def _passed_over(field: LanguageField, tensors: dict[str, Array], about: dict[st
     read.update(name for name in ("taught", "taught.rivals") if field.taught)
     yield unread("tensors", (quoted(name, 40) for name in tensors if name not in read))
     yield unread("metadata", (quoted(name, 40) for name in about if name not in _STATED))
+    if "calibration" in about:
+        yield "its calibration is of another scale, not read: `langsplat train --gaussians` makes one anew"
     absent = [name for name in ("temperature", "found") if name not in about and about["version"] != "1"]
     if absent:
         yield f"{' and '.join(absent)} not given: taken as of the encoder CLIP"

@@ -193,7 +193,7 @@ def _photographs(run: _Run) -> Capture:
     """Return the photographs that have cameras, enough for a scene."""
     capture = load_capture(run.dataset, run.config.dataset, run.work, run.progress)
     if len(capture) < FEWEST_VIEWS and not run.config.dataset.allow_few_cameras:
-        why = f" ({STRICTNESS.last})" if STRICTNESS.last else ""
+        why = f" ({'; '.join(STRICTNESS.said)})" if STRICTNESS.said else ""
         raise InputError(
             f"{shown(run.dataset)}: only {len(capture)} photographs have cameras{why}, and a scene needs "
             f"{FEWEST_VIEWS}; take more, or go on with --dataset.allow-few-cameras"

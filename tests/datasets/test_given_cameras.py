@@ -27,7 +27,7 @@ from langsplat_core.datasets.intrinsics import (
     source_positions,
     undistorted_points,
 )
-from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.datasets.nerfstudio import DISTORTING, load_nerfstudio
 from langsplat_core.errors import STRICTNESS, FormatError, InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import NO_ORIGIN, moved_pose
@@ -354,6 +354,18 @@ def test_a_broken_frame_is_named(tmp_path: Path, change: dict[str, Any], words: 
         load(tmp_path)
     assert "frame 1" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"), [(("k1", "k2", "p1", "p2"), 0), (("k1", "k2", "k3", "k4"), 1)], ids=["ngp", "either"]
+)
+def test_a_model_that_keys_name_is_no_guess(tmp_path: Path, caplog, keys: tuple[str, ...], said: int) -> None:
+    data = write_transforms(tmp_path, GLOBAL)
+    lens = dict.fromkeys(DISTORTING, 0.0) | {"k1": 0.01}
+    rest = {key: value for key, value in data.items() if key not in ("camera_model", *DISTORTING)}
+    rewrite(tmp_path, rest | {key: lens[key] for key in keys})
+    load(tmp_path)
+    assert len(caplog.messages) == said
 
 
 def test_transforms_json_states_scale_and_drawn(tmp_path: Path) -> None:

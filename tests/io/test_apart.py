@@ -63,7 +63,7 @@ def test_results_progress_and_messages_come_back(caplog: pytest.LogCaptureFixtur
 
 def test_a_loss_in_the_process_is_said_or_with_strict_an_error(caplog, monkeypatch):
     apart.run(lose, progress=silent)
-    assert caplog.messages == [STRICTNESS.last] == ["a.jpg is left out"]
+    assert caplog.messages == [STRICTNESS.said[-1]] == ["a.jpg is left out"]
     monkeypatch.setattr(STRICTNESS, "on", True)
     with pytest.raises(InputError, match="--strict"):
         apart.run(lose, progress=silent)

@@ -669,12 +669,13 @@ def assert_same_cameras(got: Sequence[Camera], want: Sequence[Camera]) -> None:
 
 
 NAMED = tuple(replace(random_camera(seed), name=f"view {seed}") for seed in range(2))
+GLTF = parts(bytes_of(write_gltf, Scene(WANT)))
 CHANGED: dict[str, tuple[str, Any, Callable[..., bytes]]] = {  # the name of a file, a good one, its changes
     "PLY": ("a.ply", plain_ply(WANT), changed_ply),
     "compressed PLY": ("a.ply", compressed_ply(random_gaussians(300, sh_degree=1)), changed_ply),
     **{f"SPZ {v}": ("a.spz", spz_bytes(WANT, v), changed_spz) for v in (2, 3, 4)},
     "SOG": ("a.sog", sog_files(random_gaussians(40, sh_degree=1), 40), changed_sog),
-    "glTF": ("a.glb", bytes_of(write_gltf, Scene(WANT)), changed_glb),
+    "glTF": ("a.glb", glb(GLTF[0] | {"materials": [{}]}, GLTF[1]), changed_glb),
     "sidecar": ("a.safetensors", bytes_of(write_language, random_field(30), WANT.means), changed_sidecar),
     "cameras": ("a.json", bytes_of(write_cameras, NAMED), changed_cameras),
 }

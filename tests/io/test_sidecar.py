@@ -261,11 +261,12 @@ def test_things_of_version_2_are_wholes(sidecar, means):
     assert (tree.voted(2) == tree.at(2)).all()
 
 
-def test_files_without_tree_and_odds_are_read(sidecar, means):
+def test_files_without_tree_and_odds_are_read(sidecar, means, caplog):
     change(sidecar, **NO_TREE, everyday=None)
     says(odds=None, calibration="[-0.25, 18.5, 2.75, 0.625]")(sidecar)  # of another scale: not read
     field = read_language(sidecar, means)
     assert (field.tree, field.everyday, field.calibration) == (None, None, None)
+    assert "langsplat train --gaussians" in caplog.messages[0]
     assert (field.temperature, field.found) == (11.7, 0.73)
     assert rematch_language(sidecar, means[:9]).tree is None
 

@@ -239,11 +239,15 @@ def test_two_views_are_no_scene_unless_told_otherwise(room, tmp_path):
     pair = tmp_path / "pair"
     shutil.copytree(room, pair)
     transforms = json.loads((pair / "transforms.json").read_text())
-    transforms["frames"] = transforms["frames"][:2]
-    (pair / "transforms.json").write_text(json.dumps(transforms))
+    two, lost = transforms["frames"][:2], {**transforms["frames"][2], "file_path": "lost.png"}
     config = tiny_settings(room)
-    with pytest.raises(InputError, match=r"only 2 photographs have cameras.*--dataset\.allow-few-cameras"):
-        train_scene(pair, tmp_path / "scene.ply", config)
+    for frames, points in (([*two, lost], "none.ply"), (two, transforms.get("ply_file_path"))):
+        stated = {**transforms, "frames": frames, "ply_file_path": points}
+        (pair / "transforms.json").write_text(json.dumps(stated))
+        why = r" \(.*lost\.png.*none\.ply.*\)" if points == "none.ply" else ","
+        said = f"only 2 photographs have cameras{why}.*--dataset.allow-few-cameras"
+        with pytest.raises(InputError, match=said):
+            train_scene(pair, tmp_path / "scene.ply", config)
     told = replace(config, dataset=replace(config.dataset, allow_few_cameras=True))
     assert train_scene(pair, tmp_path / "scene.ply", told).views == 1
 

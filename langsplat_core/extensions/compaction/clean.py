@@ -35,8 +35,9 @@ from langsplat_core.extensions.compaction.compact import (
     contributions,
     mean_psnr,
     psnr_losses,
+    scene_for,
 )
-from langsplat_core.io.scenes import check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import Camera, Gaussians, Scene
@@ -272,10 +273,9 @@ def clean_scene(
     source: Path, out: Path, config: CleanConfig, photos: Path | None = None, progress: Progress = silent
 ) -> CleanReport:
     """Write the scene `source` without its floaters to `out`, with all that belongs to it; see `clean`."""
-    check_writable(out, source)
+    scene = scene_for(out, source)
     check_settings(config)
-    scene = load_scene(source)
     views = choose_views(scene, photos, config, progress)
     keep, report = clean(scene, views, config, progress)
-    save_scene(out, replace(scene.take(keep), path=out))
+    save_scene(out, replace(scene.take(keep), path=out), tell=False)
     return report

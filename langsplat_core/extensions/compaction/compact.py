@@ -45,7 +45,7 @@ from langsplat_core.config import DatasetConfig, Decibels, Range, SeveralCount, 
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import shown
-from langsplat_core.io.scenes import check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import ORIGIN_SUFFIX, check_writable, load_scene, report_left_out, save_scene
 from langsplat_core.io.summary import disk_bytes, memory_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import colours_seen, render, view_of
@@ -243,9 +243,8 @@ def compact_scene(
     `photos` is the dataset it was trained on; without, the loss is derived from the change of the images.
     Raises InputError, and leaves `out` as it was, where the budget cannot be kept or nothing can be dropped.
     """
-    check_writable(out, source)
+    scene = scene_for(out, source)
     check_settings(config)
-    scene = load_scene(source)
     views = choose_views(scene, photos, config, progress)
     measured = views.measured(scene)
     before, before_bytes = _stored(scene, out)
@@ -271,8 +270,15 @@ def compact_scene(
         measuring_views=len(views.measuring),
         views_from=views.origin,
     )
-    save_scene(out, replace(candidate, path=out))
+    save_scene(out, replace(candidate, path=out), tell=False)
     return report
+
+
+def scene_for(out: Path, source: Path) -> Scene:
+    """Return the scene `source`, with what a file `out` has no room for said before the work; InputError."""
+    row, scene = check_writable(out, source), load_scene(source)
+    report_left_out(out, scene, f"{row.suffix} files", row.loses, f"its companion *{ORIGIN_SUFFIX}")
+    return scene
 
 
 def _stored(scene: Scene, out: Path) -> tuple[Scene, int]:

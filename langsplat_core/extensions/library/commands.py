@@ -17,7 +17,7 @@ from langsplat_core.cli.arguments import EncoderOption, JsonOption, OutFile, Tra
 from langsplat_core.cli.query import Unit, in_world, once, unit_of
 from langsplat_core.cli.run import print_json
 from langsplat_core.config import CountOrZero, Positive
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import EncoderError, InputError, report_loss
 from langsplat_core.extensions.geometry.commands import read_transform, registered
 from langsplat_core.extensions.library.changes import Change, changes
 from langsplat_core.extensions.library.index import Answered, Hit, Library, find, update_library
@@ -190,7 +190,7 @@ class Changes:
             try:
                 describers = Describer(first, progress=progress), Describer(second, progress=progress)
             except EncoderError as error:
-                print(f"langsplat: without names: {error}", file=sys.stderr)
+                report_loss("without names: %s", error)
             if self.register:
                 placed = registered(scenes[1], scenes[0], scaled=unsure, progress=progress).transform
             found = changes(first, second, load_lifting_rasterizer("cpu"), placed, describers, progress)

@@ -8,7 +8,7 @@ import pytest
 from langsplat_core.arrays import Array, psnr
 from langsplat_core.cli import run as command_line
 from langsplat_core.datasets import Capture
-from langsplat_core.errors import InputError
+from langsplat_core.errors import STRICTNESS, InputError
 from langsplat_core.extensions.compaction import compact
 from langsplat_core.extensions.compaction.clean import CleanConfig, CleanReport, clean, find_floaters
 from langsplat_core.extensions.compaction.commands import Compact
@@ -154,6 +154,13 @@ def test_compact_refuses_unwritable_outputs(source, tmp_path, capsys, loss, out,
     assert said.startswith("langsplat: ")
     assert named in said
     assert contents(tmp_path) == before
+
+
+def test_strict_refuses_a_loss_before_the_work(scene, tmp_path, monkeypatch):
+    save_scene(tmp_path / "a.ply", replace(scene, metres_per_unit=0.5))
+    monkeypatch.setattr(STRICTNESS, "on", True)
+    with pytest.raises(InputError, match="no room for"):
+        compact_scene(tmp_path / "a.ply", tmp_path / "b.spz", CONFIG, None, lambda *_: pytest.fail("worked"))
 
 
 def test_unforeseen_loss_leaves_the_old_file(source, tmp_path, monkeypatch):

@@ -446,6 +446,10 @@ def test_changes_are_said_in_words_and_in_json(scans, capsys):
     save_scene(scans / "painted.ply", replace(scene, gaussians=replace(scene.gaussians, sh=sh)))
     assert run("changes", pair[0], "painted.ply") == 0
     assert "red to blue" in capsys.readouterr().out
+    lost = replace(scene.language, canonical=np.tile(axis(4), (4, 1)), encoder_id="lost")
+    save_scene(scans / "lost.ply", replace(scene, language=lost))
+    assert run("-q", "changes", "lost.ply", "lost.ply") == 0
+    assert capsys.readouterr() == ("nothing changed\n", "")
     (scans / "placed.json").write_text(json.dumps({"matrix": np.eye(4).tolist()}))
     assert run("changes", pair[0], "painted.ply", "--transform", "placed.json", "--json") == 0
     (change,) = json.loads(capsys.readouterr().out)["changes"]
