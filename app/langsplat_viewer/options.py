@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
+from langsplat_core.cli.arguments import Needs
 from langsplat_core.config import (
     ColourMap,
     Display,
@@ -41,6 +42,7 @@ MAX_SIDE = 16_384  # pixels; beyond it drivers refuse textures
 Seconds = Annotated[float, Range(0.1, 36_000.0)]
 PicturesPerSecond = Annotated[float, Range(0.1, 240.0)]
 Span = Annotated[float, Range(*SPAN_LIMITS)]
+HEADLESS = Needs("headless")  # of pictures without a window, in which it is chosen otherwise
 
 
 @dataclass(frozen=True)
@@ -55,10 +57,10 @@ class ViewerOptions:
     """Semantic level of the search; auto takes the one that answers best."""
     display: DisplayChoice = "auto"
     """What is shown; auto is relevancy with a query, else rgb."""
-    near_cut: NotNegative = 0.0
-    """Without a window: depth up to which nothing is drawn, world units."""
-    far_cut: Positive | None = None
-    """Without a window: depth beyond which nothing is drawn, world units (default: everything is)."""
+    near_cut: Annotated[NotNegative, HEADLESS] = 0.0
+    """With --headless: depth up to which nothing is drawn, world units."""
+    far_cut: Annotated[Positive | None, HEADLESS] = None
+    """With --headless: depth beyond which nothing is drawn, world units (default: everything is)."""
     heat_scale: Annotated[tuple[Share, Share] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
     """Relevancies at the ends of the heat map, the same in every image (default: each answer's own)."""
     heat: HeatOf = PictureConfig.heat
@@ -77,19 +79,19 @@ class ViewerOptions:
     """Neither use nor change the remembered layout, settings and recent files."""
     headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Draw an image or a film without a window and print the answers."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE.png")] = None
+    out: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE.png"), HEADLESS] = None
     """Where --headless writes: an image (.png); a film (.mp4, .webp, .gif) or a folder of its images."""
     path: Annotated[Path | None, tyro.conf.arg(metavar="PATH.json")] = None
     """A camera path: with --headless the film along it, else it is opened in the panel "Record"."""
-    turntable: Seconds | None = None
+    turntable: Annotated[Seconds | None, HEADLESS] = None
     """With --headless: a film of so many seconds, once around what the camera sees in its middle."""
     beside: Annotated[Path | None, tyro.conf.arg(metavar="SCENE")] = None
     """In the window: a second scene right of a line, by another encoder or method, seen and asked alike."""
-    fps: PicturesPerSecond = 30.0
+    fps: Annotated[PicturesPerSecond, HEADLESS, Needs("is_film", "--path or --turntable")] = 30.0
     """Images per second of a film."""
-    colour_map: ColourMap | None = None
+    colour_map: Annotated[ColourMap | None, HEADLESS] = None
     """Colours of relevancy and depth in an image of --headless (default: inferno)."""
-    transparent: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    transparent: Annotated[bool, tyro.conf.FlagCreatePairsOff, HEADLESS] = False
     """Draw the image of --headless without a background, transparent where the scene is not."""
 
     @property

@@ -40,7 +40,6 @@ from langsplat_viewer.rendering.request import plain_request, why_undrawable
 from langsplat_viewer.viewer import Services
 
 DEFAULT_SIZE = (1280, 720)
-WITHOUT_WINDOW = ("out", "turntable", "colour_map", "transparent", "near_cut", "far_cut")
 log = logging.getLogger("langsplat")
 
 
@@ -73,12 +72,6 @@ class ViewerCommand(ViewerOptions):
         print("\n".join(lines))
 
     def _window(self, path: Path) -> None:
-        for name in WITHOUT_WINDOW:
-            if getattr(self, name):
-                option = f"--{name.replace('_', '-')}"
-                raise InputError(
-                    f"{option} is for pictures without a window; choose it there, or add --headless"
-                )
         if self.beside is not None:
             scene_path(self.beside)
         from langsplat_viewer.window import open_window

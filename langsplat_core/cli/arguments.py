@@ -36,6 +36,14 @@ class OutputPath:
     kind: Literal["file", "folder"]
 
 
+@dataclass(frozen=True)
+class Needs:
+    """Marks an argument that says nothing unless another field of the command, or a property, is given."""
+
+    field: str
+    said: str = ""  # how that is given; "": by the option of its name
+
+
 OutFile = Annotated[Path, OutputPath("file")]
 OutFolder = Annotated[Path, OutputPath("folder")]
 
@@ -54,16 +62,20 @@ WordsOption = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help=_taught)
 
 
 def check_arguments(command: object) -> None:
-    """Raise InputError for the first argument out of its range, not UTF-8, or not to be written to."""
+    """Raise InputError for an argument out of its range, unused, not UTF-8, or not to be written to."""
     check_settings(command)
     for option, value, hint in named_values(command):
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str) and text != text.encode("utf-8", "ignore").decode():
                 plain = text[:40].encode("utf-8", "backslashreplace").decode()
                 raise InputError(f"{option} {plain}: is not UTF-8; use a terminal that is set to UTF-8")
-        written = next((part for part in annotations(hint) if isinstance(part, OutputPath)), None)
-        if written is not None and value is not None:
-            (check_output_file if written.kind == "file" else check_output_folder)(value)
+        for part in annotations(hint):
+            if isinstance(part, OutputPath) and value is not None:
+                (check_output_file if part.kind == "file" else check_output_folder)(value)
+            unused = isinstance(part, Needs) and not getattr(command, part.field)
+            if unused and value != getattr(type(command), option[2:].replace("-", "_")):
+                other = part.said or f"--{part.field.replace('_', '-')}"
+                raise InputError(f"{option}: is only used with {other}; add that, or leave {option} out")
 
 
 def named(args: Sequence[str], option: str) -> str:

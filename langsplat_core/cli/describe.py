@@ -14,7 +14,7 @@ import tyro
 from rich.table import Table
 
 from langsplat_core.arrays import Array, length_text
-from langsplat_core.cli.arguments import EncoderOption, Level, TrainedScene
+from langsplat_core.cli.arguments import EncoderOption, Level, Needs, TrainedScene
 from langsplat_core.cli.query import Unit, basis_fields, camera_of, in_world, unit_of
 from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.config import CountOrZero, PictureConfig
@@ -182,9 +182,9 @@ class Teach:
     """The word, such as "grandma's vase"; it replaces what the encoder takes it for."""
     at: Annotated[str, tyro.conf.arg(metavar="X,Y")] = ""
     """Column and row of a pixel in it, counted from the top left one, 0,0."""
-    camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
+    camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX"), Needs("at")] = 0
     """Training view in which the pixel is meant."""
-    level: Level = "whole"
+    level: Annotated[Level, Needs("at")] = "whole"
     """Semantic level of what is meant there."""
     into: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write into this vocabulary of yours, *.safetensors, instead of the scene."""

@@ -138,6 +138,10 @@ class Convert:
                 scene, lines = importer.read(request, progress)
             print(*lines, sep="\n")
             return scene
+        if self.levels or self.phrases or self.codec != CodebookConfig():
+            raise InputError(
+                "--levels, --phrases and --codec are for checkpoints; leave them out for a scene"
+            )
         if self.rematch is None:
             return load_scene(self.source)
         scene = load_without_language(self.source)

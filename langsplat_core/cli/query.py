@@ -15,6 +15,7 @@ from langsplat_core.arrays import Array, length_text
 from langsplat_core.cli.arguments import (
     EncoderOption,
     JsonOption,
+    Needs,
     OutFile,
     ScaleOption,
     TrainedScene,
@@ -191,9 +192,9 @@ class QueryScene:
     why: OutFile | None = None
     """Draw the evidence here, *.png: the photographs and masks that the best region of each answer stands on,
     best and worst. --json then has it, too."""
-    work: Path | None = None
+    work: Annotated[Path | None, Needs("why")] = None
     """Folder of the training, with its masks, for --why (default: <scene>.work)."""
-    photographs: Path | None = None
+    photographs: Annotated[Path | None, Needs("why")] = None
     """The dataset of the training, for --why, if it is elsewhere now."""
     json: JsonOption = False
 

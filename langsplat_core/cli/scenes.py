@@ -11,10 +11,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 from langsplat_core import __version__
-from langsplat_core.cli.arguments import AnyScene, OutFolder
+from langsplat_core.cli.arguments import AnyScene, Needs, OutFolder
 from langsplat_core.cli.run import print_json
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, printable_line, remedy
 from langsplat_core.io.scenes import load_scene
@@ -101,15 +101,13 @@ class Doctor:
 
     encoder: str = ""
     """Try this encoder: demo, a hub id, a folder or a file of weights."""
-    calibrate: bool = False
+    calibrate: Annotated[bool, Needs("encoder")] = False
     """Keep the calibration that the room gives, for all scenes of this encoder that have none."""
     json: bool = False
     """Print JSON."""
 
     def run(self) -> None:
         if not self.encoder:
-            if self.calibrate:
-                raise InputError("--calibrate: name the encoder, --encoder ID")
             machine = _machine()
             print_json(machine) if self.json else _print_rows(machine.items())
             return

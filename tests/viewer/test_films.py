@@ -528,6 +528,7 @@ def test_film_of_nothing_is_refused(folder):
         (["--path", "path.json", "--orthographic", "2", "--out", "a.gif"], "--orthographic is for one view"),
         (["--path", "path.json"], "--out film.mp4"),
         (["--path", "path.json", "--out", "a.png"], "a film is .mp4"),
+        (["--fps", "9", "--out", "a.png"], "--fps: is only used with --path or --turntable"),
         (["--path", "broken.json", "--out", "a.gif"], "broken.json"),
         (["--path", "nope.json", "--out", "a.gif"], "nope.json: no such file"),
         (["--turntable", "0", "--out", "a.gif"], "--turntable 0"),

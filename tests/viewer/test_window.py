@@ -173,9 +173,9 @@ REFUSED = [  # words, and why
             (["--headless", "--out", "folder.png"], "is a folder"),
             (["--headless", "--out", "blobs.ply/a.png"], "is a file, not a folder"),
             (["--headless", "--out", "x" * 5000 + ".png"], "choose another"),
-            (["--out", "a.png"], "add --headless"),
-            (["--transparent"], "add --headless"),
-            (["--far-cut", "1"], "add --headless"),
+            (["--out", "a.png"], "with --headless"),
+            (["--transparent"], "with --headless"),
+            (["--far-cut", "1"], "with --headless"),
         ]
     ),
 ]

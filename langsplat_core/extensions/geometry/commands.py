@@ -9,7 +9,7 @@ import tyro
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.arguments import AnyScene, EncoderOption, OutFile, OutFolder
+from langsplat_core.cli.arguments import AnyScene, EncoderOption, Needs, OutFile, OutFolder
 from langsplat_core.cli.query import found_answer, unit_of
 from langsplat_core.config import Count, LevelChoice, Positive
 from langsplat_core.errors import EncoderError, InputError, malformed, optional_imports, printable_line
@@ -61,7 +61,7 @@ class WriteMesh:
     """File to write: .ply in world units, .glb in metres with y up."""
     phrase: str = ""
     """Of everything that this names alone; the scene then needs its language field."""
-    level: LevelChoice = "auto"
+    level: Annotated[LevelChoice, Needs("phrase")] = "auto"
     """Semantic level of the phrase."""
     resolution: Positive | None = None
     """Side of a voxel, in metres if the scene has a scale, else world units; by default 1/100 of the radius,
@@ -70,7 +70,7 @@ class WriteMesh:
     """Images that must agree on a surface: more leave holes, and what is left is nearer to the truth."""
     watertight: bool = False
     """Close all holes (Poisson), and say how much of the surface is made up so."""
-    encoder: EncoderOption = ""
+    encoder: Annotated[EncoderOption, Needs("phrase")] = ""
 
     @optional_imports()
     def run(self) -> None:
@@ -155,8 +155,8 @@ class Merge:
     @optional_imports()
     def run(self) -> None:
         check_writable(self.out, self.first, self.second)
-        if self.as_is and self.transform is not None:
-            raise InputError("--as-is moves nothing, --transform does; give one of them")
+        if self.as_is + self.scaled + (self.transform is not None) > 1:
+            raise InputError("--as-is, --transform and --scaled are three ways to place it; give one of them")
         first, second = load_scene(self.first), load_scene(self.second)
         said = "as they were"
         if self.transform is not None:
@@ -222,11 +222,11 @@ class Map:
     and everything else is written."""
     robot_height: Positive = 0.5
     """Metres: what is higher is no obstacle."""
-    robot_radius: Positive = 0.2
+    robot_radius: Annotated[Positive, Needs("goal")] = 0.2
     """Metres: how far from obstacles its middle stays."""
     step: Positive = 0.12
     """Metres: what is lower is driven over, and the floor's own roughness."""
-    start: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="X Y")] = None
+    start: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="X Y"), Needs("goal")] = None
     """Where the robot is, metres on the map; else it may be wherever most of the free floor is connected."""
     metres_per_unit: Positive | None = None
     """In place of what the scene says."""
