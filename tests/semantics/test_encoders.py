@@ -24,6 +24,7 @@ from langsplat_core.scene import Calibration, PlattScaling
 from langsplat_core.semantics.clip_plain import PlainClipText, plain_text_tower, read_tokenizer
 from langsplat_core.semantics.encoders import (
     CLIP_PIXELS,
+    PhraseEncoder,
     clip_text,
     load_encoder,
     load_text_encoder,
@@ -465,3 +466,19 @@ def test_vocabularies_of_other_encodings_are_read(tmp_path, encoding, caplog):
     path.write_bytes("cup\r\ncafé table\r\n".encode(encoding))
     assert read_vocabulary(path) == ("cup", "café table")
     assert ["line 2: is not UTF-8" in text for text in caplog.messages] == [True] * (encoding == "cp1252")
+
+
+def test_a_text_tower_need_not_say_its_batch(tmp_path: Path) -> None:
+    """As those of extensions, which know `dim`, `temperature` and `encode` alone."""
+    sizes: list[int] = []
+
+    class Tower:
+        dim, temperature = 3, 10.0
+
+        def encode(self, texts: list[str]) -> np.ndarray:
+            sizes.append(len(texts))
+            return np.ones((len(texts), 3), np.float32)
+
+    vectors = PhraseEncoder(Weights("x", tmp_path, "cpu"), Tower()).encode_texts(["mug"] * 150)
+    assert vectors.shape == (150, 3)
+    assert sum(sizes) == 150
