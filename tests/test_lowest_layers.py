@@ -445,7 +445,7 @@ def test_the_example_of_the_docs_is_read(tmp_path: Path) -> None:
     config = found.config
     assert (found.preset, config.radiance.max_gaussians) == ("good", 60_000)  # the preset's
     assert (config.radiance.steps, config.clip.model) == (3000, "demo")
-    assert (config.codec.max_relevancy_error, config.phrases) == (0.002, ("red mug", "keyboard"))
+    assert (config.codec.max_relevancy_error, config.phrases) == (0.002, ("blue gift", "keyboard"))
 
 
 def test_options_beside_a_file_win(tmp_path: Path) -> None:
