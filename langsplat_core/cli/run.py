@@ -103,6 +103,7 @@ def parsed(program: str, kind: Any, args: Sequence[str], description: str | None
 
 def main(program: str, parser: Callable[[], Runnable]) -> int:
     """Parse and run; returns the exit code. All that is printed is printed in here, help and version too."""
+    level = log.level
     _prepare_standard_streams()
     try:
         _run(program, parser)
@@ -111,6 +112,7 @@ def main(program: str, parser: Callable[[], Runnable]) -> int:
         return _ended(program, error)
     finally:
         STRICTNESS.on = False
+        log.setLevel(level)
     return 0
 
 
