@@ -177,7 +177,7 @@ class DatasetConfig:
 
 
 class RadianceBudget(NamedTuple):
-    """What a training of Gaussians may spend."""
+    """Limits of a training of Gaussians."""
 
     longer_side: int  # px, of the photographs
     steps: int

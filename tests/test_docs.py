@@ -122,7 +122,7 @@ SAID = re.compile(r"(?:such as|, as|, like|example:[\w ]*|look for:) ((?:'[^']+'
 
 
 def example_phrases() -> set[str]:
-    """What the pages' commands ask a scene.ply, the grammar's table and what programs say as an example."""
+    """Return what the pages' commands ask a scene.ply, the grammar's table and programs' examples."""
     found: list[str] = []
     for page in PAGES:
         text = page.read_text()

@@ -108,7 +108,7 @@ class ViewerOptions:
 
     @property
     def picture(self) -> PictureConfig:
-        """What is shown and how. InputError for a scale that ends before it begins."""
+        """The settings of the display. InputError for a heat scale that ends before it begins."""
         scale = self.heat_scale
         if scale is not None and scale[0] >= scale[1]:
             raise InputError(f"--heat-scale {scale[0]:g} {scale[1]:g}: the second must be the larger")

@@ -138,7 +138,7 @@ class Note:
 
 @dataclass(frozen=True)
 class Things:
-    """What a user gave to nodes of the scene's tree."""
+    """Names and colours that a user gave to nodes of the scene's tree."""
 
     names: Mapping[Node, Name] = field(default_factory=dict)
 

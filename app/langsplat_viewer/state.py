@@ -32,7 +32,7 @@ SPACING = 2.0  # seconds from the last keyframe to one that is added
 
 @dataclass(eq=False)
 class Recording:
-    """How the camera path is played and filmed."""
+    """Settings with which the camera path is played and filmed."""
 
     chosen: Keyframe | None = None  # in the list
     at: float = 0.0  # seconds: where on the path the view is
@@ -85,7 +85,7 @@ class QueryAnswer:
 
 @dataclass(frozen=True)
 class Tools:
-    """How the mouse selects."""
+    """Settings of selecting with the mouse."""
 
     tool: Tool | None = None  # what a drag in the scene does; None: it turns the camera
     mode: Mode = "replace"

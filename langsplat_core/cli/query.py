@@ -159,7 +159,8 @@ def basis_fields(engine: QueryEngine) -> dict[str, Any]:
 def camera_of(scene: Scene, index: int) -> Camera:
     """Return the camera of a number; InputError where there is none."""
     if not 0 <= index < len(scene.cameras):
-        raise InputError(f"--camera {index}: the scene has cameras 0 to {len(scene.cameras) - 1}")
+        known = f"cameras 0 to {len(scene.cameras) - 1}" if scene.cameras else "no cameras; leave it out"
+        raise InputError(f"--camera {index}: the scene has {known}")
     return scene.cameras[index]
 
 
@@ -204,7 +205,7 @@ class QueryScene:
         if not self.texts:
             raise InputError("no phrase given; for example: langsplat query scene.ply 'blue gift'")
         explain = _Explainer(self, scene) if self.why is not None else None
-        camera = camera_of(scene, self.camera) if scene.cameras else None
+        camera = camera_of(scene, self.camera) if scene.cameras or self.camera else None
         engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
         unit = unit_of(self.scale or scene.metres_per_unit, scene.origin)
         texts = self._askable(engine, camera)

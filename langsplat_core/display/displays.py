@@ -105,7 +105,7 @@ Answers = Sequence[Answer | None]  # by colour slot; None: the slot has no answe
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What a display's channel is made of: a scene's Gaussians, language field and answers."""
+    """Source of a display's channels: a scene's Gaussians, language field and answers."""
 
     count: int  # Gaussians
     language: LanguageField | None = None
@@ -253,7 +253,7 @@ class Channels:
 
 
 class Drawing(IntEnum):
-    """How a pixel is drawn; each is a branch of the kernel in `composing` and an expression in GLSL."""
+    """Kind of drawing of a pixel; each is a branch of the kernel in `composing` and an expression in GLSL."""
 
     COLOURS = 0  # over the background
     SUMS = 1  # the same with the further channel in place of the colours

@@ -50,7 +50,7 @@ PLAIN_RATIO, SMALL_RATIO = 4, 32
 
 
 class Allowance:
-    """What may still be decoded of one file; it becomes less as its parts are read."""
+    """Budget of what one file may still decode to; it becomes less as its parts are read."""
 
     def __init__(self, path: object, size: int, ratio: int = PLAIN_RATIO, free: int = FREE) -> None:
         """path: for messages; size: of the file, bytes as they lie on the disk."""

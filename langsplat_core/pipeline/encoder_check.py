@@ -67,7 +67,7 @@ GEOMETRY: Mapping[str, tuple[str, tuple[str, str]]] = MappingProxyType({
 
 @dataclass(frozen=True)
 class Rates:
-    """How many phrases of one kind are found and rejected, as shares."""
+    """Shares of phrases of one kind that are found and rejected."""
 
     asked: str  # one of `ASKED`
     present: int
@@ -80,7 +80,7 @@ class Rates:
 
 @dataclass(frozen=True)
 class EncoderReport:
-    """What an encoder makes of the bundled room."""
+    """Figures of an encoder in the bundled room."""
 
     encoder: str
     dim: int

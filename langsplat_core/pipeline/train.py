@@ -93,7 +93,7 @@ def train_scene(
 
 @dataclass(frozen=True)
 class _Run:
-    """What all stages of a training share."""
+    """State that all stages of a training share."""
 
     dataset: Path
     out: Path

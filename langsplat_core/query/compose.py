@@ -289,7 +289,7 @@ def within_reach(engine: QueryEngine, answer: QueryResult, *shares: float) -> li
 
 @dataclass(frozen=True)
 class Number:
-    """How many single things an answer has, and how many it may have."""
+    """Number of single things in an answer, with the least and most that there may be."""
 
     best: int
     least: int  # with a stricter cut

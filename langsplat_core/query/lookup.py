@@ -47,7 +47,7 @@ class Relevancy:
 
 
 class Lookup:
-    """What of the relevancies in a scene does not depend on the phrase."""
+    """Part of the relevancies in a scene that does not depend on the phrase."""
 
     def __init__(self, field: LanguageField, scale: Scale) -> None:
         """Compare every distinct feature with the phrases of the scale."""

@@ -63,12 +63,12 @@ from tests.support.scenes import find_mask_weights
 
 
 class MissingError(Exception):
-    """What the section needs is not on this machine; its text is the reason, one line."""
+    """Raised where what a section needs is not on this machine; its text is the reason, one line."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is measured."""
+    """Sizes of what is measured."""
 
     scenes: tuple[tuple[int, tuple[int, int]], ...]  # random Gaussians and (width, height) of their picture
     channels: tuple[int, ...]  # values per Gaussian

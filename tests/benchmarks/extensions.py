@@ -320,7 +320,7 @@ class Compared:
 
     @property
     def far(self) -> bool:
-        """Whether the verdicts differ."""
+        """Return whether the verdicts differ."""
         return self.index != self.engine
 
 

@@ -455,6 +455,7 @@ def test_taught_word_may_be_a_part(described, capsys):
         (f"teach named.ply --name vase --at {MUG} --into junk.safetensors", "not a whole safetensors file"),
         (f"teach named.ply --name vase --at {MUG} --into named.langsplat.safetensors", "not of taught words"),
         (f"teach other.ply --name vase --at {MUG} --into own.safetensors", "own.safetensors: these words"),
+        ("query blind.ply mug --camera 1", "--camera 1: the scene has no cameras; leave it out"),
         ("query other.ply mug --taught own.safetensors", "with fake, the scene was made with other"),
         ("query named.ply mug --taught none.safetensors", "no such file"),
         ("query named.ply vase --mode paper --taught own.safetensors", "--mode paper"),

@@ -264,7 +264,7 @@ def test_hard_cases_equal_the_reference(case: Case, backend: Backend, measured: 
 @pytest.mark.long
 @pytest.mark.parametrize("case", NAMED)
 def test_antialiased_hard_cases_equal_the_reference(case: Case, backend: Backend, measured: Measure) -> None:
-    """What holds for every case, with Mip-Splatting's compensation."""
+    """Assert what holds for every case, with Mip-Splatting's compensation."""
     drawing = case.build()
     settings = replace(drawing.settings, antialiased=True)
     run_case(case, replace(drawing, settings=settings), backend, measured)
@@ -363,7 +363,7 @@ class Scored:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What the reference makes of a view."""
+    """Return what the reference makes of a view."""
 
     image: Array  # (H, W, 3) of `VALUES`
     alpha: Array

@@ -52,7 +52,7 @@ class Backend:
 
     @property
     def gsplat(self) -> bool:
-        """Whether gsplat's own Python code draws, over its kernels or over their twin."""
+        """Return whether gsplat's own Python code draws, over its kernels or over their twin."""
         return self.name.startswith("cuda")
 
     @property

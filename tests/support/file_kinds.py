@@ -258,7 +258,7 @@ def in_safetensors(data: bytes, _: Sequence[bytes], rng: np.random.Generator) ->
 
 @_half
 def in_glb(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
-    """What is stated of the arrays, or their numbers, in a whole file."""
+    """Return what is stated of the arrays, or their numbers, in a whole file."""
     size = int.from_bytes(data[12:16], "little")
     content, binary = data[20 : 20 + size], data[28 + size :]
     if rng.random() < 0.7:
@@ -385,7 +385,7 @@ SECONDS = 20.0  # of the processor: what the worst mutants need is hundredths
 
 @dataclass
 class Outcome:
-    """What became of many mutants of one kind."""
+    """Counts of what became of many mutants of one kind."""
 
     tried: int = 0
     loaded: int = 0
@@ -422,7 +422,7 @@ def fuzz(kind: FileKind, folder: Path, count: int, seed: int) -> Outcome:
 
 
 def tried(kind: FileKind, folder: Path, contents: Iterable[bytes]) -> Outcome:
-    """What became of each, as the contents of a file of the kind; no fault among them."""
+    """Return what became of each, as the contents of a file of the kind; no fault among them."""
     outcome, path = Outcome(), folder / kind.file
     with _listening() as said:
         for content in contents:

@@ -236,7 +236,7 @@ def sog_files(g: Gaussians, palette_entries: int = 70) -> dict[str, bytes]:
 
 
 def bytes_of(write: Callable[..., object], *content: object, name: str = "a") -> bytes:
-    """What a writer of ours makes of something, in a file of that name."""
+    """Return what a writer of ours makes of something, in a file of that name."""
     with TemporaryDirectory() as folder:
         write(Path(folder) / name, *content)
         return (Path(folder) / name).read_bytes()

@@ -48,7 +48,7 @@ def gsplat_on_cpu() -> Iterator[None]:
 
 
 def _check(*tensors: Tensor | None, kind: torch.dtype = torch.float32) -> None:
-    """What CHECK_INPUT and `data_ptr<T>` ask for."""
+    """Assert what CHECK_INPUT and `data_ptr<T>` ask for."""
     for tensor in tensors:
         if tensor is not None and not (tensor.is_contiguous() and tensor.dtype == kind):
             raise RuntimeError(f"a kernel was given {tensor.dtype}, contiguous: {tensor.is_contiguous()}")

@@ -82,7 +82,7 @@ def psnr(a: Array, b: Array) -> float:
 
 
 def pinhole_picture(camera: Camera, samples: int = 1) -> Array:
-    """What `camera` ought to show, with `samples` x `samples` samples averaged in every pixel."""
+    """Return what `camera` ought to show, with `samples` x `samples` samples averaged in every pixel."""
     fine = camera.resized(camera.width * samples, camera.height * samples)
     intrinsics = PhotoIntrinsics(fine.width, fine.height, fine.fx, fine.fy, fine.cx, fine.cy)
     picture = photograph(intrinsics, camera.world_to_camera).astype(np.float64)

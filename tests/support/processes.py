@@ -105,7 +105,7 @@ def surroundings(display: str) -> dict[str, str]:
 
 
 def play(display: str, arguments: list[str], folder: Path, timeout: float, **environment: str) -> str:
-    """What Python says with `arguments`, in `folder`, for at most `timeout` seconds. It has to end well."""
+    """Return what Python says with `arguments`, in `folder`, within `timeout` seconds; it has to end well."""
     done = subprocess.run(
         [sys.executable, *arguments],
         env=surroundings(display) | environment,
@@ -193,7 +193,7 @@ class Tab:
         self.page.evaluate("langsplat.then(() => 0)")
 
     def run(self, script: str, argument: Any = None) -> Any:
-        """What a function in JavaScript returns."""
+        """Return what a function in JavaScript returns."""
         return self.page.evaluate(script, argument)
 
     def ask(self, phrase: str, level: str = "auto") -> dict[str, Any]:
@@ -272,7 +272,7 @@ ROOM, SECONDS = 3 << 30, 20  # bytes of address space beyond the parent's, secon
 
 @dataclass(frozen=True)
 class Ended:
-    """How a child ended."""
+    """End of a child."""
 
     code: int  # negative: the number of the signal that killed it
     said: str  # on the standard error

@@ -43,7 +43,7 @@ ROUNDS = 3  # of moving and resting
 
 @dataclass
 class Orbiting:
-    """What was seen; times in seconds."""
+    """Observations of a process; times in seconds."""
 
     gaussians: int = 0
     backend: str = ""

@@ -199,7 +199,7 @@ def around(s: Any, centre: np.ndarray) -> tuple[tuple[float, float], tuple[float
 
 
 def looks_selected(colour: np.ndarray) -> bool:
-    """Whether a colour of the picture, 0 to 255, has the tint."""
+    """Return whether a colour of the picture, 0 to 255, has the tint."""
     return bool(np.abs(colour - 255 * np.array(SELECTED)).max() < 0.55 * 255 and colour[2] > colour[1] + 60)
 
 
@@ -679,7 +679,7 @@ def leave_settings(s: Any) -> None:
 
 
 def find_settings(s: Any) -> None:
-    """What `leave_settings` has left."""
+    """Return what `leave_settings` has left."""
     assert not s.state.show_help
     assert s.state.preferences.theme == "light"
     assert [Path(path).name for path in s.state.preferences.recent] == ["blobs.ply"]

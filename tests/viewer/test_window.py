@@ -54,7 +54,7 @@ def picture(path: Path) -> np.ndarray:
 
 
 def draw(run_viewer, out: str, *arguments: str) -> list[str]:
-    """What is said of a picture of the blobs that is drawn without a window."""
+    """Return what is said of a picture of the blobs that is drawn without a window."""
     code, said, errors = run_viewer("blobs.ply", "--headless", "--out", out, *arguments)
     assert (code, errors) == (0, [])
     return said

@@ -208,7 +208,7 @@ class Session:
         self.watched = before
 
     def on_screen(self, point: np.ndarray) -> tuple[float, float]:
-        """Where a world point is in the window."""
+        """Return where a world point is in the window."""
         area, (pixels, _) = scene_area(), self.state.view.camera(*self.state.size).project(point[None])
         return float(pixels[0, 0] + area.left), float(pixels[0, 1] + area.top)
 

@@ -107,7 +107,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
     imgui.text_colored(ui.muted(), f"{np.count_nonzero(result.members):,} Gaussians")
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=1)  # of the answer that is shown; what is kept holds all arrays of its scene
 def histogram(result: QueryResult) -> tuple[float, float, Array]:
     """Return lowest and highest relevancy of an answer, and (BINS,) float32 log(1 + n) of those between."""
     values = result.even[np.isfinite(result.even)]
@@ -193,7 +193,7 @@ def _verdict(viewer: Viewer, query: Query, width: float) -> None:
 
 
 def _details(viewer: Viewer, query: Query) -> None:
-    """How it was read or why it was not answered; of what may be here place, scores and threshold."""
+    """Draw how a query was read or why it was not answered; of what may be here place, scores, threshold."""
     answer, result = viewer.state.answer(query), viewer.state.result(query)
     if answer.problem:
         ui.small_wrapped(answer.problem, ui.bad())

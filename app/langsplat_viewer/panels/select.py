@@ -242,7 +242,7 @@ def _three(label: str, values: Point, what: str) -> Point:
 
 
 def _is_shown(viewer: Viewer) -> bool:
-    """Whether there is a gizmo: none under what lies over the scene."""
+    """Return whether the gizmo is drawn: not under what lies over the scene."""
     state = viewer.state
     covered = state.show_help or state.show_palette or imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
     return state.edit_form.gizmo != "off" and state.scene is not None and not covered

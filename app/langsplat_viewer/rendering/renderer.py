@@ -111,7 +111,7 @@ def _merged(request: RenderRequest, values: Array | None) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class Layers(Generic[L]):
-    """What was rasterized for a request."""
+    """Images that were rasterized for a request."""
 
     projection: tuple[object, ...]  # the request's
     view: View

@@ -135,7 +135,7 @@ def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -
 
 @dataclass(frozen=True)
 class CleanReport:
-    """What went, and what it cost; losses over the measuring views, dB, negative for a gain."""
+    """Report of a cleaning: what went, and its cost; losses over measuring views, dB, negative for a gain."""
 
     gaussians: int  # before
     invalid: int  # rows removed because nothing can draw them

@@ -172,7 +172,7 @@ class Merge:
 
 
 def registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) -> Registration:
-    """How a scene lies in the axes of another; InputError unless renderings confirm it."""
+    """Return the similarity from a scene to another; InputError unless renderings confirm it."""
     found = register(moving, fixed, scaled, progress=progress)
     if not found.trusted:
         hint = "" if scaled else ", and give --scaled where their units differ"

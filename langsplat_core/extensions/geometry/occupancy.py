@@ -234,7 +234,7 @@ def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -
 
 
 def _between(plan: FloorMap, blocked: Array, start: Array, end: Array) -> bool:
-    """Whether the straight line between two places (2,), metres, crosses a cell of `blocked` (X, Y) bool."""
+    """Return whether the line between two places (2,), metres, crosses a cell of `blocked` (X, Y) bool."""
     count = 2 * int(np.linalg.norm(end - start) / plan.resolution) + 2
     along = start + np.linspace(0, 1, count)[:, None] * (end - start)
     cells = np.floor((along - plan.origin) / plan.resolution).astype(int)

@@ -334,7 +334,7 @@ def _digests(library: Library) -> Iterator[Digest]:
 
 @dataclass(frozen=True)
 class _Stated:
-    """What the metadata of an index say of its scenes."""
+    """Metadata of an index about its scenes."""
 
     groups: tuple[tuple[str, tuple[Listed, ...]], ...]  # encoder, and its scenes
     unread: tuple[Listed, ...]
@@ -480,7 +480,7 @@ class Hit(Judged):
 
     @property
     def margin(self) -> float:
-        """How certain the answer is, 0 where it begins to count as found, see `Verdict`."""
+        """Certainty of the answer, 0 where it begins to count as found, see `Verdict`."""
         return self.judgement.margin
 
 

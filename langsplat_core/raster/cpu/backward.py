@@ -186,7 +186,7 @@ class GaussianGradients(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What `backward` left of the M Gaussians that are drawn."""
+    """Gradients that `backward` left of the M Gaussians that are drawn."""
 
     rank_of: Array  # (N,) int32 place in depth order of every row, -1 where it is not drawn
     partial: Array  # (I, 8 + padded(C))

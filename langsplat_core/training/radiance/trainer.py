@@ -237,7 +237,7 @@ def _halved(camera: Camera, image: Array, mask: Array | None) -> tuple[Camera, A
 
 @dataclass(frozen=True)
 class _Run:
-    """What stays the same over all steps."""
+    """Data that stay the same over all steps."""
 
     config: RadianceConfig
     schedule: Schedule

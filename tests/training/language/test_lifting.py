@@ -130,7 +130,7 @@ def view(of_row, level: int = WHOLE, weights: Array | None = None) -> Array:
 
 
 def joined(*parts: Array) -> Array:
-    """What several maps say of one view, by rising row."""
+    """Return what several maps say of one view, by rising row."""
     pairs = np.concatenate(parts)
     return pairs[np.argsort(pairs["row"], kind="stable")]
 
