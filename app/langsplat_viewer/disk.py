@@ -1,8 +1,8 @@
-"""What lies around a scene on the disk: folders, files that change, a training's checkpoints."""
+"""What lies around a scene on the disk: paths, files that change, a training's checkpoints."""
 
+import os
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,57 +11,33 @@ from safetensors import SafetensorError, safe_open
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path, is_utf8
 from langsplat_core.io.ply import write_ply
-from langsplat_core.io.scenes import format_of
 from langsplat_core.pipeline.report import work_folder
 from langsplat_core.scene import Gaussians
-from langsplat_viewer.projects import PATHS, PROJECTS
 
-# Folders of the file browser.
+# Paths that are typed.
 
-MOST_LISTED = 2000  # entries of a folder that are listed
-
-
-@dataclass(frozen=True)
-class FolderEntry:
-    """A file or folder as the browser lists it."""
-
-    path: Path
-    is_file: bool  # to be opened; else a folder to go into
-    size: int = 0  # bytes, of a file
+MOST_OFFERED = 8
 
 
-@dataclass(frozen=True)
-class Listing:
-    """A folder as the browser shows it."""
+def completions(typed: str, folder: Path, suffixes: tuple[str, ...] = ()) -> list[str]:
+    """Return the first folders, and files with these suffixes, whose paths go on from what was typed.
 
-    folder: Path
-    entries: tuple[FolderEntry, ...] = ()  # folders first, each kind by name
-    left_out: int = 0  # more than `MOST_LISTED`
-    problem: str = ""  # why there are none, one line
-
-
-def list_folder(folder: Path) -> Listing:
-    """Folders and scenes in `folder`; hidden ones are left out. Does not raise."""
+    `folder`: where a relative path begins. Hidden ones are left out. Does not raise.
+    """
+    before, slash, begun = typed.rpartition("/")
     try:
-        paths = sorted(folder.iterdir(), key=lambda path: path.name.lower())
-        entries = [entry for path in paths if (entry := _entry(path)) is not None]
-    except OSError as error:
-        return Listing(folder, problem=f"cannot be listed ({error.strerror or error})")
-    entries.sort(key=lambda entry: entry.is_file)
-    return Listing(folder, tuple(entries[:MOST_LISTED]), max(len(entries) - MOST_LISTED, 0))
-
-
-def _entry(path: Path) -> FolderEntry | None:
-    if path.name.startswith(".") or not is_utf8(path):
-        return None
-    try:
-        if path.is_dir():
-            return FolderEntry(path, is_file=format_of(path) is not None)
-        if format_of(path) is not None or path.name.endswith((PATHS, PROJECTS)):
-            return FolderEntry(path, True, path.stat().st_size)
-    except OSError:  # it may not be looked at
-        pass
-    return None
+        with os.scandir(folder / os.path.expanduser(before + slash)) as entries:
+            found = sorted(
+                (not entry.is_dir(), entry.name)
+                for entry in entries
+                if entry.name.lower().startswith(begun.lower())
+                and (entry.is_dir() or entry.name.lower().endswith(suffixes))
+                and not entry.name.startswith(".")
+                and is_utf8(Path(entry.name))
+            )
+    except (OSError, ValueError):
+        return []
+    return [before + slash + name + ("" if is_file else "/") for is_file, name in found[:MOST_OFFERED]]
 
 
 # A scene's files that change while it is shown. A thread of its own looks about once a second, so that the

@@ -19,7 +19,6 @@ from langsplat_core.scene import NO_ORIGIN, Camera, Scene
 from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.disk import Listing
 from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, unmarked
 from langsplat_viewer.projects import Project
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes
@@ -104,13 +103,17 @@ class Leaving:
     film: bool = False  # it is done as soon as the recorder is
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FileChoice:
-    """A file or folder that the file browser asks for."""
+    """A file or folder that a dialog asks for."""
 
-    title: str  # of the browser
-    then: Callable[[Any, Path], None] = lambda viewer, path: None  # what is done with it in a `Viewer`
-    is_folder: bool = False
+    title: str
+    then: Callable[[Any, Path], object]  # what is done with it in a `Viewer`
+    kind: Literal["open", "save", "folder"] = "open"
+    suffixes: tuple[
+        str, ...
+    ] = ()  # of the files that are offered; one to save has the first, if none of them
+    start: Path = Path()  # the folder that is shown first, and in it the name of a file to save
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,8 +298,7 @@ class ViewerState(SceneState):
     show_palette: bool = False
     resets_panels: bool = False  # at the next frame
     shows_panels: tuple[str, ...] = ()  # titles of those that alone are open from now on; (): as they are
-    browser: Listing | None = None  # the folder that the file browser shows, while it is open
-    choice: FileChoice = FileChoice("")  # that it is open for
+    choice: FileChoice | None = None  # what a dialog asks for, while one is open
     extension_panels: dict[str, Any] = field(default_factory=dict)  # title -> what an extension's panel keeps
     preferences: Preferences = field(default_factory=Preferences)
 

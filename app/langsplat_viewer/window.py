@@ -187,6 +187,7 @@ class Window:
         self._tidied: tuple[int, int] = (0, 0)  # news after which memory was given back
         self._titled: Path | None = None  # the scene that the window's title names
         self._start_page, self.toasts = dialogs.StartPage(folder), dialogs.Toasts()
+        self.files = dialogs.FileDialogs(glfw.post_empty_event)
         self._folder = folder
 
     def params(self) -> hello_imgui.RunnerParams:
@@ -397,7 +398,7 @@ class Window:
         if self.failure is not None:
             return
         viewer, area = self.viewer, ui.scene_area()
-        layout.draw_over(viewer, self._start_page, self.toasts)
+        layout.draw_over(viewer, self._start_page, self.toasts, self.files)
         self._menu.draw(viewer, area)
         overlays.draw_evidence(viewer, self._evidence)
         navigation.handle(viewer, area)
@@ -424,6 +425,7 @@ class Window:
         return saving.may_close(self.viewer)
 
     def _stop(self) -> None:
+        self.files.close()
         saving.finish_writing(self.viewer)
         self._workspace.update()
         self._keep_thumbnail((self.viewer.state.path, self.viewer.state.project))

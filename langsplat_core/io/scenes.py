@@ -1,6 +1,6 @@
 """Scenes on disk: their formats, and their companions.
 
-`formats()` is the one table that the loader, `langsplat convert`, the file browser, the desktop entry and the
+`formats()` is the one table that the loader, `langsplat convert`, file dialogs, the desktop entry and the
 tests of round trips and damaged files read. A scene is `scene.ply` with, beside it,
 `scene.langsplat.safetensors` and `scene.cameras.json`, either of which may be absent. The same companions are
 looked for beside a compressed PLY or a SOG folder. Those of the other formats keep its suffix,

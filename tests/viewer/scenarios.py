@@ -456,9 +456,9 @@ def search_a_library(s: Any) -> None:
     save_scene(s.folder / "deep" / "mug.ply", replace(fewer, cameras=cameras()))
     s.open_panel("Library", frames=3)
     s.click("//Library/Folder ...", frames=4)
-    opening.open_typed(viewer, "deep")
-    s.ctx.yield_(3)
-    s.ctx.item_click("//**/Take this folder")
+    s.type("de")
+    s.click("//###choice/deep\\/", frames=2)
+    s.click("//###choice/Open")
     s.until(lambda: library_panel.library_view(viewer) is not None)
     assert len(library_panel.library_view(viewer).hits) == 2
     library_panel.ask_library(viewer, "plant")
@@ -495,7 +495,7 @@ def large_letters(s: Any) -> None:
     for scale, show, name in (
         (2.0, lambda viewer: settings.put(viewer.state, show_help=True), "Help"),
         (3.0, settings.toggle_palette, "Commands"),
-        (3.0, opening.ask_for_file, "Open a scene"),
+        (3.0, opening.ask_for_file, "###choice"),
     ):
         settings.prefer(s.viewer, ui_scale=scale)
         show(s.viewer)
@@ -619,7 +619,43 @@ def use_shortcuts(s: Any) -> None:
     s.key("Ctrl+Z", frames=2)
     assert s.state.session.picture.display == "rgb"
     s.key("Ctrl+O", frames=3)
-    assert s.ctx.item_exists("//**/##path")
+    s.enter("plain.ply")
+    s.shows("plain.ply")
+
+
+class FakeDialog:
+    """A dialog of the system that is open until it is answered or killed."""
+
+    answer: list[str] | None = None
+    killed = False
+
+    def ready(self, timeout: int) -> bool:
+        return self.answer is not None
+
+    def result(self) -> list[str]:
+        return self.answer
+
+    def kill(self) -> None:
+        self.killed, self.answer = True, []
+
+
+def choose_in_the_systems_dialog(s: Any) -> None:
+    """Frames go on while the dialog is open; what is chosen opens, Esc closes the dialog."""
+    shown: list[FakeDialog] = []
+    s.window.files.open_system = lambda choice: shown.append(FakeDialog()) or shown[-1]
+    s.menu("File", "Open a scene ...")
+    s.ctx.yield_(20)
+    assert not s.ctx.item_exists("//**/##path")
+    shown[0].answer = [str(s.folder / "plain.ply")]
+    s.shows("plain.ply")
+    s.key("Ctrl+O", frames=3)
+    s.key("escape", frames=3)
+    assert (shown[1].killed, s.state.choice) == (True, None)
+    s.key("Ctrl+O", frames=3)
+    shown[2].answer = []  # its own Cancel
+    s.until(lambda: s.state.choice is None)
+    assert s.state.path.name == "plain.ply"
+    s.draws_nothing()
 
 
 def use_the_toolbar(s: Any) -> None:

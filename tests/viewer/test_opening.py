@@ -10,10 +10,9 @@ import pytest
 
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer import disk
 from langsplat_viewer.actions import editing, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.disk import list_folder
+from langsplat_viewer.disk import completions
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, result, settle
@@ -146,70 +145,45 @@ def test_scene_returns_with_its_camera_and_queries(three):
     assert three.state.shown_results()[0].found
 
 
-# The file browser, without a window.
+# Files and folders that are asked for, without a window.
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder: scenes, folders, and what is neither."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "B folder").mkdir()
-    (tmp_path / "sog folder").mkdir()
-    (tmp_path / "sog folder" / "meta.json").write_text("{}")
-    for name in ("a.ply", "Z.SPZ", "notes.txt", ".hidden.ply"):
+    for name in ("a.ply", "A.SPZ", "about.txt", ".a.ply"):
         (tmp_path / name).write_bytes(b"12345")
+    (tmp_path / "all").mkdir()
     return tmp_path
 
 
-def test_listing_has_folders_first_and_only_scenes(folder, monkeypatch):
-    listing = list_folder(folder)
-    listed = [(entry.path.name, entry.is_file, entry.size) for entry in listing.entries]
-    files = [("a.ply", True, 5), ("sog folder", True, 0), ("Z.SPZ", True, 5)]
-    assert listed == [("B folder", False, 0), *files]
-    assert not listing.problem
-    assert "No such file" in list_folder(folder / "gone").problem
-    assert "Not a directory" in list_folder(folder / "notes.txt").problem
-    monkeypatch.setattr(disk, "MOST_LISTED", 3)
-    assert list_folder(folder) == replace(listing, entries=listing.entries[:3], left_out=1)
+def test_typed_path_is_completed_by_folders_and_scenes(folder):
+    kinds = (".ply", ".spz")
+    assert completions("", folder, kinds) == ["all/", "A.SPZ", "a.ply"]
+    assert completions("all/../a.", folder, kinds) == ["all/../A.SPZ", "all/../a.ply"]
+    assert completions(f"{folder}/al", Path("/gone"), kinds) == [f"{folder}/all/"]
+    for typed in ("b", "gone/", "a.ply/", "x" * 5000, "\0/"):
+        assert completions(typed, folder, kinds) == []
 
 
-def test_browser_enters_folders_and_opens_scenes(viewer, folder):
+@pytest.mark.parametrize("typed", [" blobs.ply ", "all/../blobs.ply"])
+def test_chosen_path_is_opened(viewer, folder, typed):
     opening.ask_for_file(viewer)
-    assert viewer.state.browser.folder == folder
-    opening.browse(viewer, folder / "B folder")
-    assert viewer.state.browser.folder == folder / "B folder"
-    opening.browse(viewer, folder)
-    act(opening.choose, viewer, folder / "blobs.ply")
-    assert viewer.state.browser is None
+    act(settings.choose, viewer, "  ")
+    assert viewer.state.choice.start == folder
+    act(settings.choose, viewer, typed)
     assert viewer.state.scene is SCENES["blobs.ply"]
+    assert viewer.state.choice is None
     opening.ask_for_file(viewer)
-    assert viewer.state.browser.folder == folder  # that of the scene
     settings.escape(viewer)
-    assert viewer.state.browser is None
-
-
-def enter(viewer, typed: str) -> None:
-    """Type a path in the browser, and open it."""
-    act(opening.open_typed, viewer, typed)
-
-
-@pytest.mark.parametrize("typed", [" blobs.ply ", "B folder/../blobs.ply"])
-def test_typed_path_is_opened(viewer, folder, typed):
-    opening.ask_for_file(viewer)
-    for nothing in ("", "  "):
-        enter(viewer, nothing)
-        assert viewer.state.browser is not None
-    enter(viewer, "B folder")
-    assert viewer.state.browser.folder == folder / "B folder"
-    opening.browse(viewer, folder)
-    enter(viewer, typed)
-    assert viewer.state.scene is SCENES["blobs.ply"]
+    assert viewer.state.choice is None
 
 
 @pytest.mark.parametrize("typed", ["gone.ply", "x" * 5000, "~nobody-of-this-name/a.ply"])
-def test_typed_path_that_does_not_exist_is_one_error(viewer, folder, typed):
+def test_chosen_path_that_does_not_exist_is_one_error(viewer, folder, typed):
     opening.ask_for_file(viewer)
-    enter(viewer, typed)
+    act(settings.choose, viewer, typed)
     assert len(errors(viewer)) == 1
 
 

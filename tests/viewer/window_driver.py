@@ -67,6 +67,7 @@ class Session:
         wanted = ViewerOptions(size=size, backend=backend, **options)
         self.window = Window(path, wanted, services, self._make_renderer, remembered)
         self.window.idles = False
+        self.window.files.open_system = lambda choice: None
         self.window.toasts.seconds = 0.0  # they would cover what is looked at
         self.state = self.window.viewer.state
 

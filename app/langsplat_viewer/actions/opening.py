@@ -1,9 +1,8 @@
 """Opening scenes: from files, dropped, listed, returned to, trained; and a second one beside the first."""
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from langsplat_core.datasets.photos import count_photographs
 from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io.files import is_utf8, shown
-from langsplat_core.io.scenes import format_of, scene_files
+from langsplat_core.io.scenes import format_of, formats, scene_files
 from langsplat_core.pipeline.report import stated_warnings, work_folder
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
@@ -22,7 +21,7 @@ from langsplat_viewer import disk
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.editing import adopt
 from langsplat_viewer.actions.saving import COMPANIONS, leave
-from langsplat_viewer.actions.settings import open_panel
+from langsplat_viewer.actions.settings import ask_for, open_panel
 from langsplat_viewer.camera.controls import Extent, extent_of
 from langsplat_viewer.disk import Stamps, stamps
 from langsplat_viewer.jobs import one_line
@@ -252,34 +251,7 @@ def unlist_scene(viewer: Viewer, path: Path) -> None:
     viewer.visits.pop(path, None)
 
 
-# The file browser, typed paths, files dropped onto the window, and recent scenes.
-
-
-def ask_for(viewer: Viewer, choice: FileChoice) -> None:
-    """Open the browser, in the folder of the scene that is shown, to choose a file or a folder."""
-    path = viewer.state.path
-    viewer.state.choice = choice
-    browse(viewer, (Path.cwd() if path is None else path.parent).absolute())
-
-
-def browse(viewer: Viewer, folder: Path) -> None:
-    """Show a folder in the browser."""
-    viewer.state.browser = disk.list_folder(folder)
-
-
-def choose(viewer: Viewer, path: Path) -> None:
-    """Close the browser, and do what it was opened for."""
-    viewer.state.browser = None
-    viewer.state.choice.then(viewer, path)
-
-
-def open_typed(viewer: Viewer, text: str) -> None:
-    """Go to the folder, or open the scene, of a path: from the folder shown where it is relative."""
-    text, listing = text.strip(), viewer.state.browser
-    if not text:
-        return
-    path = (listing.folder if listing else Path.cwd()) / os.path.expanduser(text)
-    (browse if viewer.state.choice.is_folder or _is_plain_folder(path) else choose)(viewer, path)
+# Files that were chosen, dropped onto the window, or open lately.
 
 
 def _is_plain_folder(path: Path) -> bool:
@@ -291,7 +263,6 @@ def _is_plain_folder(path: Path) -> bool:
 
 def open_file(viewer: Viewer, path: Path) -> None:
     """Open a scene or a project, or take a camera path."""
-    viewer.state.browser = None
     if path.name.endswith(PROJECTS):
         open_project(viewer, path)
     elif path.name.endswith(PATHS):
@@ -549,8 +520,22 @@ def _mirrored(state: ViewerState, other: ViewerState) -> Session:
     )
 
 
-# What the browser is opened for.
+# What dialogs ask for.
 
-ask_for_file = partial(ask_for, choice=FileChoice("Open a scene", open_file))
-ask_for_beside = partial(ask_for, choice=FileChoice("Scene to compare with", open_beside))
-ask_for_dataset = partial(ask_for, choice=FileChoice("Photographs to train on", choose_photographs, True))
+
+def ask_for_file(viewer: Viewer) -> None:
+    """Have a dialog ask for a scene, a project or a camera path, and open it."""
+    scenes = chain.from_iterable((row.suffix, row.folder_file) for row in formats())
+    suffixes = (*filter(None, scenes), PROJECTS, PATHS)
+    ask_for(viewer, FileChoice("Open a scene", open_file, suffixes=suffixes))
+
+
+def ask_for_beside(viewer: Viewer) -> None:
+    """Have a dialog ask for a scene to compare with."""
+    suffixes = tuple(row.suffix for row in formats())
+    ask_for(viewer, FileChoice("Scene to compare with", open_beside, suffixes=suffixes))
+
+
+def ask_for_dataset(viewer: Viewer) -> None:
+    """Have a dialog ask for a folder of photographs."""
+    ask_for(viewer, FileChoice("Photographs to train on", choose_photographs, "folder"))

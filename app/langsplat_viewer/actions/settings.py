@@ -1,15 +1,19 @@
 """What is shown and how: displays side by side, overlays, ruler and notes; preferences and panels."""
 
+import os
 from collections.abc import Callable
 from dataclasses import fields, replace
+from os.path import exists
+from pathlib import Path
 from typing import Any
 
 from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
+from langsplat_viewer.projects import BUNDLED
 from langsplat_viewer.rendering.request import AT_RANGE, Clip, SplitMode
 from langsplat_viewer.session import LONGEST_NOTE, MOST_NOTES, OVERLAYS, SCALES, Note, Overlay, Ruler
-from langsplat_viewer.state import Recording, ViewerState
+from langsplat_viewer.state import FileChoice, Recording, ViewerState
 from langsplat_viewer.viewer import Viewer
 
 
@@ -215,10 +219,10 @@ def escape(viewer: Viewer) -> None:
     Queries that failed leave the list.
     """
     state, tools = viewer.state, viewer.state.tools
-    lay_over = state.show_help or state.show_palette or state.browser or state.leaving or state.show_start
+    lay_over = state.show_help or state.show_palette or state.choice or state.leaving or state.show_start
     state.show_start &= state.scene is None
     state.show_help = state.show_palette = state.pins_notes = state.letters_muted = False
-    state.browser = state.leaving = None
+    state.choice = state.leaving = None
     if state.session.ruler.measures:
         toggle_measuring(viewer)
     failed = {query.phrase for query in state.session.queries if state.answer(query).problem}
@@ -227,3 +231,33 @@ def escape(viewer: Viewer) -> None:
         viewer.change(queries=left, chosen=left[-1].phrase if left else "")
     if not lay_over:
         state.tools = replace(tools, stroke=None, tool=tools.tool if tools.stroke else None)
+
+
+# Files and folders that are chosen in a dialog.
+
+
+def ask_for(viewer: Viewer, choice: FileChoice) -> None:
+    """Have a dialog ask for a file or folder, at first where the scene lies."""
+    path = viewer.state.path
+    own = path is not None and path != BUNDLED
+    folder = path.absolute().parent if path is not None and own else Path.cwd()
+    viewer.state.choice = replace(choice, start=folder / choice.start)
+
+
+def choose(viewer: Viewer, text: str, is_confirmed: bool = False) -> None:
+    """Do what the dialog is open for with a path, from its folder where it is relative, and close it.
+
+    A file that is there is only written over where the dialog of the system has it `is_confirmed`.
+    """
+    choice, text = viewer.state.choice, text.strip()
+    if choice is None or not text:
+        return
+    saves = choice.kind == "save"
+    path = (choice.start.parent if saves else choice.start) / os.path.expanduser(text)
+    if saves and not path.name.lower().endswith(choice.suffixes):
+        path, is_confirmed = path.with_name(path.name + choice.suffixes[0]), False
+    if saves and exists(path) and not is_confirmed:
+        viewer.say_error(f"{path}: is there already; choose another name")
+        return
+    viewer.state.choice = None
+    choice.then(viewer, path)

@@ -1,26 +1,30 @@
-"""What asks over the scene: the start page, the file browser, a file that has changed, what is not saved.
+"""What asks over the scene: the start page, dialogs for files, a file that has changed, what is not saved."""
 
-The browser is the project's own beside ImFileDialog, since it fits small windows and large text, says why a
-folder cannot be read and opens folders that are scenes. Native dialogs need helpers that
-may be missing.
-"""
-
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from itertools import takewhile
 from os.path import exists
 from pathlib import Path
+from typing import Any
 
 import moderngl
 import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
+from imgui_bundle import portable_file_dialogs as pfd
 
 from langsplat_core.errors import LangSplatError
 from langsplat_core.io.hostile import opened
+from langsplat_core.progress import Progress
 from langsplat_viewer.actions import editing, opening, saving, settings
-from langsplat_viewer.disk import FolderEntry, Listing
+from langsplat_viewer.disk import completions
+from langsplat_viewer.jobs import Worker
 from langsplat_viewer.panels import ui
 from langsplat_viewer.projects import BUNDLED, thumbnail_of
-from langsplat_viewer.state import Message
+from langsplat_viewer.state import FileChoice, Message
 from langsplat_viewer.viewer import Viewer
 
 # The start page.
@@ -157,75 +161,101 @@ class Toasts:
             self._shown = []
 
 
-# The file browser.
+# Files and folders: by the dialogs of the system, else by a path.
 
-BROWSER_EM = 40.0, 30.0
-
-
-def draw_browser(viewer: Viewer) -> None:
-    """Draw the browser: a box for a path, the folders above, and what is in this one."""
-    listing, choice = viewer.state.browser, viewer.state.choice
-    title = choice.title or "Open"
-    ui.ask_for_popup(title, listing is not None)
-    imgui.set_next_window_size(ui.fitting(*BROWSER_EM), imgui.Cond_.appearing)
-    shown, stays = imgui.begin_popup_modal(title, True, imgui.WindowFlags_.no_saved_settings)
-    if not shown:
-        return
-    if listing is not None:
-        _path_box(viewer)
-        _above(viewer, listing.folder)
-        _entries(viewer, listing)
-        if choice.is_folder and imgui.button("Take this folder"):
-            opening.choose(viewer, listing.folder)
-    if not stays or imgui.is_key_pressed(imgui.Key.escape):
-        settings.put(viewer.state, browser=None)
-    if viewer.state.browser is None:
-        imgui.close_current_popup()
-    imgui.end_popup()
+BOX_EM = 34.0
+HELPERS = ("zenity", "kdialog", "matedialog", "qarma")  # programs that show dialogs on Linux
 
 
-def _path_box(viewer: Viewer) -> None:
+def system_dialog(choice: FileChoice) -> Any:
+    """Open the dialog of the system, as `portable_file_dialogs` has them; None where nothing shows one."""
+    if sys.platform.startswith("linux") and not any(map(shutil.which, HELPERS)):
+        return None
+    within = f"{choice.start}{os.sep}"
+    if choice.kind == "folder":
+        return pfd.select_folder(choice.title, within)
+    filters = [choice.title, " ".join(f"*{suffix}" for suffix in choice.suffixes), "All files", "*"]
+    if choice.kind == "save":
+        return pfd.save_file(choice.title, str(choice.start), filters)
+    return pfd.open_file(choice.title, within, filters)
+
+
+class FileDialogs:
+    """Asks for files and folders; no frame waits for the system."""
+
+    def __init__(self, wake: Callable[[], None]) -> None:
+        self.open_system: Callable[[FileChoice], Any] = system_dialog
+        self._choice: FileChoice | None = None
+        self._dialog: Any = None  # of the system
+        self._waiting = Worker(wake)
+
+    def close(self) -> None:
+        """Close the dialog of the system, which would keep the process."""
+        if self._dialog is not None:
+            self._waiting.cancel()
+            self._dialog.kill()
+            self._dialog = None
+
+    def draw(self, viewer: Viewer) -> None:
+        """Draw the dialog that is wanted, or what says that it is a window of its own."""
+        self._waiting.poll()
+        choice = viewer.state.choice
+        if choice is not self._choice:
+            self._begin(viewer, choice)
+        title = "Choose" if choice is None else choice.title
+        ui.ask_for_popup(f"{title}###choice", choice is not None)
+        imgui.set_next_window_size(ImVec2(ui.fitting(BOX_EM, 1).x, 0))
+        flags = imgui.WindowFlags_.no_saved_settings | imgui.WindowFlags_.no_resize
+        if not imgui.begin_popup_modal(f"{title}###choice", None, flags)[0]:
+            return
+        if choice is not None and self._dialog is None:
+            _path_box(viewer, choice)
+        else:
+            imgui.text_wrapped("Choose in the window that the system has opened.")
+        if imgui.button("Cancel") or imgui.is_key_pressed(imgui.Key.escape):
+            settings.put(viewer.state, choice=None)
+        if viewer.state.choice is None:
+            imgui.close_current_popup()
+        imgui.end_popup()
+
+    def _begin(self, viewer: Viewer, choice: FileChoice | None) -> None:
+        self.close()
+        self._choice = choice
+        if choice is None:
+            return
+        drafts, self._dialog = viewer.state.drafts, self.open_system(choice)
+        drafts["##path"], dialog = choice.start.name if choice.kind == "save" else "", self._dialog
+
+        def wait(progress: Progress) -> str:
+            while not dialog.ready(0):
+                time.sleep(0.05)
+            found = dialog.result()
+            return found if isinstance(found, str) else "".join(found[:1])
+
+        def done(path: str) -> None:
+            settings.choose(viewer, path, is_confirmed=True)
+            settings.put(viewer.state, choice=None)
+
+        if dialog is not None:
+            self._waiting.submit(choice.title, wait, done, viewer.say_error)
+
+
+def _path_box(viewer: Viewer, choice: FileChoice) -> None:
+    """Draw a box for a path, and what the disk has that begins so."""
+    saves, drafts = choice.kind == "save", viewer.state.drafts
+    folder = choice.start.parent if saves else choice.start
+    imgui.text_colored(ui.muted(), ui.elided(f"in {folder}", imgui.get_content_region_avail().x))
     if imgui.is_window_appearing():
-        viewer.state.drafts.pop("##path", None)
         imgui.set_keyboard_focus_here()
-    picks = viewer.state.choice.is_folder
-    hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
-    typed = ui.kept_box(viewer, "##path", hint, "Open")
+    hint = "path of a folder" if choice.kind == "folder" else "path; or drop a file onto the window"
+    typed = ui.kept_box(viewer, "##path", hint, "Save" if saves else "Open")
     if typed is not None:
-        opening.open_typed(viewer, typed)
-
-
-def _above(viewer: Viewer, folder: Path) -> None:
-    for number, parent in enumerate((*reversed(folder.parents), folder)):
-        if number:
-            ui.beside(parent.name)
-        if imgui.small_button(f"{parent.name or parent}##above {number}"):
-            opening.browse(viewer, parent)
-
-
-def _entries(viewer: Viewer, listing: Listing) -> None:
-    picks = viewer.state.choice.is_folder
-    below = imgui.get_frame_height_with_spacing() * picks
-    if imgui.begin_child("entries", ImVec2(0, -below), imgui.ChildFlags_.borders):
-        if listing.problem:
-            ui.small_wrapped(listing.problem, ui.bad())
-        elif not listing.entries:
-            ui.small_wrapped("no folders here" if picks else "no scenes and no folders here", ui.muted())
-        for entry in (entry for entry in listing.entries if not (picks and entry.is_file)):
-            _entry(viewer, entry)
-        if listing.left_out:
-            ui.small_wrapped(f"{listing.left_out:,} more: type a path", ui.muted())
-    imgui.end_child()
-
-
-def _entry(viewer: Viewer, entry: FolderEntry) -> None:
-    right = imgui.get_content_region_avail().x
-    if imgui.selectable(entry.path.name if entry.is_file else f"{entry.path.name}/", False)[0]:
-        (opening.choose if entry.is_file else opening.browse)(viewer, entry.path)
-    if entry.size:
-        text = f"{entry.size / 1e6:.1f} MB"
-        imgui.same_line(right - ui.width_of(text))
-        imgui.text_colored(ui.muted(), text)
+        settings.choose(viewer, typed)
+        drafts["##path"] = typed
+    suffixes = choice.suffixes or ("/",)  # which no name has
+    for offer in completions(drafts.get("##path", ""), folder, suffixes):
+        if imgui.selectable(offer, False, imgui.SelectableFlags_.no_auto_close_popups)[0]:
+            drafts["##path"] = offer
 
 
 # A file that has changed.

@@ -132,8 +132,10 @@ def _widen(width: float) -> None:
         imgui.internal.dock_builder_set_node_size(node.id_, ImVec2(width, node.size.y))
 
 
-def draw_over(viewer: Viewer, start: dialogs.StartPage, toasts: dialogs.Toasts) -> None:
-    """Draw what lies over the scene: legends, tools, questions, the file browser, help and palette."""
+def draw_over(
+    viewer: Viewer, start: dialogs.StartPage, toasts: dialogs.Toasts, files: dialogs.FileDialogs
+) -> None:
+    """Draw what lies over the scene: legends, tools, questions, dialogs, help and palette."""
     area = ui.scene_area()
     start.draw(viewer, area)
     said = _said(viewer)
@@ -151,7 +153,7 @@ def draw_over(viewer: Viewer, start: dialogs.StartPage, toasts: dialogs.Toasts) 
     toasts.draw(viewer, area)
     dialogs.draw_changed(viewer, area)
     dialogs.draw_unsaved(viewer)
-    dialogs.draw_browser(viewer)
+    files.draw(viewer)
     menus.draw_help(viewer)
     menus.draw_palette(viewer)
 

@@ -14,9 +14,9 @@ from langsplat_core.extensions.library.index import THUMBNAIL, Answered, Hit, Li
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import LoadEncoder
 from langsplat_core.query.rule import Verdict
-from langsplat_viewer.actions.opening import ask_for, open_scene
+from langsplat_viewer.actions.opening import open_scene
 from langsplat_viewer.actions.queries import ask
-from langsplat_viewer.actions.settings import open_panel
+from langsplat_viewer.actions.settings import ask_for, open_panel
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.layout import MIDDLE, Panel
 from langsplat_viewer.state import FileChoice
@@ -101,7 +101,7 @@ def draw_library(viewer: Viewer) -> None:
     if ui.button(
         "Folder ...", "Search all scenes of a folder and the folders in it. An index of them is kept there"
     ):
-        ask_for(viewer, FileChoice("Folder of scenes", open_library, is_folder=True))
+        ask_for(viewer, FileChoice("Folder of scenes", open_library, "folder"))
     if view is None:
         return
     imgui.same_line()
