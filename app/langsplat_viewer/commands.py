@@ -64,6 +64,7 @@ class Command:
     is_edit: bool = False  # belongs to the box while one types, as it does everywhere
     is_on: Callable[[Viewer], bool] | None = None  # for a check mark in the menu
     apart: bool = False  # a line is above it in the menu
+    now: Callable[[Viewer], str] = lambda viewer: ""  # words for the menu in place of `does`
     icon: str = ""  # on the toolbar, a name of Font Awesome 6 without its "ICON_FA_"
 
 
@@ -112,6 +113,13 @@ def _tool(tool: Tool) -> Command:
 def _export(button: str, does: str, part: Part, as_points: bool = False) -> Command:
     act = partial(saving.export, folder=Path(), part=part, as_points=as_points)
     return Command(does, act, (), button)
+
+
+def _step(step: editing.Step, act: editing.Action, *keys: str) -> Command:
+    def now(viewer: Viewer) -> str:
+        return editing.named_step(viewer, step)
+
+    return Command(step, act, keys, repeats=True, is_edit=True, apart=step == "undo", now=now)
 
 
 def _side(side: Side, key: str) -> Command:
@@ -171,11 +179,17 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             apart=True,
         ),
         Command(
-            "save a picture", saving.save_picture, ("Ctrl+S", "P"), "Save picture", icon="CAMERA", apart=True
+            "save the project",
+            saving.save,
+            ("Ctrl+S",),
+            "Save project",
+            apart=True,
+            now=lambda viewer: "save the project (changed)" if viewer.state.is_changed else "",
         ),
+        Command("save the project as ...", saving.save_as, ("Ctrl+Shift+S",)),
+        Command("save a picture", saving.save_picture, ("P",), "Save picture", icon="CAMERA", apart=True),
         Command("save the view", saving.save_view, (), "Save view"),
         Command("export a web page that can be searched", saving.save_page),
-        Command("save the project", saving.save_project, ("Ctrl+Shift+S",)),
         Command("save a picture of the film's size", saving.save_sized_picture, (), "Picture of this size"),
         Command("save a film of the path", saving.save_film, (), "Save film"),
         Command("save the camera path", saving.save_path, (), "Save path"),
@@ -184,8 +198,8 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
     "Edit": (
         Command("search", queries.focus_search, ("Ctrl+F", "/")),
         Command("remove all queries", queries.remove_all),
-        Command("undo", editing.undo, ("Ctrl+Z",), repeats=True, is_edit=True, apart=True),
-        Command("redo", editing.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), repeats=True, is_edit=True),
+        _step("undo", editing.undo, "Ctrl+Z"),
+        _step("redo", editing.redo, "Ctrl+Shift+Z", "Ctrl+Y"),
         Command(
             "gizmo: move, rotate, scale, box, off",
             editing.next_gizmo,

@@ -43,6 +43,7 @@ from langsplat_viewer.session import (
     Point,
     Preferences,
     Session,
+    Things,
 )
 
 T = TypeVar("T")
@@ -418,7 +419,10 @@ def checked(session: Session) -> Session:
     return replace(
         session,
         moves=tuple(map(_rigid, session.moves)),
-        things=replace(things, names={n: _line(name) for n, name in things.names.items()}),
+        things=Things(
+            {node: _line(name) for node, name in things.names.items()},
+            {_line(name): bits for name, bits in things.given.items()},
+        ),
         notes=tuple(replace(note, text=_line(note.text)) for note in session.notes),
         bookmarks=tuple(replace(mark, name=_line(mark.name)) for mark in session.bookmarks),
     )

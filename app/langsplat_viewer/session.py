@@ -19,6 +19,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap, LevelChoice, PictureConfig
 from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES
 from langsplat_core.scene import FARTHEST, LEVELS, Scene
+from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.transform import Similarity, between_worlds, transform_scene
 from langsplat_viewer.camera.flight import Keyframe, Pose
 from langsplat_viewer.marks import Marks
@@ -138,13 +139,19 @@ class Note:
 
 @dataclass(frozen=True)
 class Things:
-    """Names and colours that a user gave to nodes of the scene's tree."""
+    """Names that a user gave to nodes of the scene's tree, and to Gaussians."""
 
     names: Mapping[Node, Name] = field(default_factory=dict)
+    given: Mapping[Name, Bits] = field(default_factory=dict)  # what a taught name was given to
 
     def known(self, count: int) -> "Things":
-        """Return those of the first `count` nodes."""
-        return Things({node: name for node, name in self.names.items() if node < count})
+        """Return those of the first `count` nodes, and of Gaussians."""
+        return replace(self, names={node: name for node, name in self.names.items() if node < count})
+
+    def named(self, phrase: str) -> Array | None:
+        """(N,) bool of what was given a name; None where the phrase is none."""
+        key = phrase_key(phrase)
+        return next((bits.mask for name, bits in self.given.items() if phrase_key(name) == key), None)
 
 
 @dataclass(frozen=True)
@@ -280,6 +287,34 @@ class Session:
         kept |= {"picture": replace(now.picture, display=self.picture.display)}
         kept |= {"latent_level": self.latent_level, "bookmarks": now.bookmarks}
         return replace(self, **kept, marks=Marked(), moves=())
+
+
+# What led from a session to the next, for undo to name it.
+
+CHANGES = {  # fields of a session -> words
+    "moves": "transform", "things": "name", "notes": "note", "keyframes": "keyframe", "picture": "display",
+    "latent_level": "display", "split": "comparison", "splats": "splats", "clip": "near and far cut",
+    "overlays": "overlay", "level": "level of the search", "adds": "new answers", "queries": "answers shown",
+}  # fmt: skip
+MARKINGS = {"deleted": ("delete", "restore"), "hidden": ("hide", "show"), "selected": ("select", "deselect")}
+
+
+def change_between(before: Session, after: Session) -> str:
+    """Return what leads from one session to the next, in words."""
+    for name, verbs in MARKINGS.items():
+        old, new = (getattr(session.marks, name) for session in (before, after))
+        if old != new:
+            more = sum(sign * int(bits.mask.sum()) for sign, bits in ((-1, old), (1, new)) if bits)
+            return f"{verbs[more < 0]} {abs(more):,} Gaussians" if more else f"{verbs[0]} others"
+    asked, listed = ([query.phrase for query in session.queries] for session in (before, after))
+    for verb, phrases in (
+        ("search", [phrase for phrase in listed if phrase not in asked]),
+        ("remove", [phrase for phrase in asked if phrase not in listed]),
+    ):
+        if phrases:
+            return f"{verb} '{phrases[0]}'" + f" and {len(phrases) - 1} more" * (len(phrases) > 1)
+    changed = (words for name, words in CHANGES.items() if getattr(before, name) != getattr(after, name))
+    return next(changed, "change")
 
 
 OF_WINDOW = ("picture", "latent_level", "split", "splats", "overlays", "level", "adds")  # not of a scene

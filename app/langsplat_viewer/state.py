@@ -1,5 +1,6 @@
 """The viewer's state: the session, what follows from it, and what the window shows beside the scene."""
 
+import sys
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, fields, replace
@@ -219,9 +220,6 @@ class SceneState:
     opened: Scene | None = None  # the scene as its file has it, once something was transformed
     marks: Marks = field(default_factory=lambda: unmarked(0))
     answers: dict[str, QueryAnswer] = field(default_factory=dict)  # by phrase
-    named: dict[str, Array] = field(
-        default_factory=dict
-    )  # (N,) bool of what was given a name here, by its key
 
     view: OrbitCamera | None = None
     glide: Glide | None = None
@@ -263,6 +261,11 @@ class SceneState:
         session, saved = self.session, self.saved
         return (session.things, session.notes) != (saved.things, saved.notes)
 
+    @property
+    def is_changed(self) -> bool:
+        """True where something would be lost if the window closed."""
+        return self.is_unsaved or self.has_unsaved_notes
+
 
 @dataclass(eq=False)
 class ViewerState(SceneState):
@@ -288,6 +291,7 @@ class ViewerState(SceneState):
     edit_form: EditForm = field(default_factory=EditForm)
     drafts: dict[str, str] = field(default_factory=dict)  # half-typed texts of the panels, by their boxes
     messages: list[Message] = field(default_factory=list)
+    echoes: bool = False  # what is said is said in the terminal, too: the process is to end
     stats: FrameStats = field(default_factory=FrameStats)
     backend: str = ""
     size: tuple[int, int] = (1, 1)  # pixels of the scene's area
@@ -314,6 +318,8 @@ class ViewerState(SceneState):
         message = Message(" ".join(text.split()), is_error, file, undoes)
         kept = self.messages[:-1] if self.messages[-1:] == [message] else self.messages
         self.messages = [*kept[1 - MAX_MESSAGES :], message]
+        if self.echoes:
+            print(message.text, file=sys.stderr)
 
     def answer(self, query: Query) -> QueryAnswer:
         """Return the answer to a query of the list."""

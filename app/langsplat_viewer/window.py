@@ -185,7 +185,7 @@ class Window:
         self._frames = AWAKE_FRAMES  # to be drawn whatever happens
         self._last: tuple[object, ...] = ()  # what was there in the last frame
         self._tidied: tuple[int, int] = (0, 0)  # news after which memory was given back
-        self._titled: Path | None = None  # the scene that the window's title names
+        self._titled: tuple[Path | None, str] = None, ""  # the scene that the window's title names, its mark
         self._start_page, self.toasts = dialogs.StartPage(folder), dialogs.Toasts()
         self.files = dialogs.FileDialogs(glfw.post_empty_event)
         self._folder = folder
@@ -375,11 +375,11 @@ class Window:
         return bool(glfw.get_window_attrib(glfw_window_hello_imgui(), glfw.ICONIFIED))
 
     def _title(self) -> None:
-        path = self.viewer.state.path
-        if path is not None and path != self._titled:
-            self._keep_thumbnail((self._titled,))
-            glfw.set_window_title(glfw_window_hello_imgui(), f"{path.name} - {TITLE}")
-            self._titled = path
+        path, mark = self.viewer.state.path, "*" * self.viewer.state.is_changed
+        if path is not None and (path, mark) != self._titled:
+            self._keep_thumbnail((self._titled[0],) if path != self._titled[0] else ())
+            glfw.set_window_title(glfw_window_hello_imgui(), f"{mark}{path.name} - {TITLE}")
+            self._titled = path, mark
 
     def _keep_thumbnail(self, paths: tuple[Path | None, ...]) -> None:
         """Keep the image on screen as that of the files in `paths`, for the start page."""

@@ -397,12 +397,13 @@ def test_failed_saving_stays_in_the_scene(pruned, tmp_path):
     assert pruned.state.is_unsaved
 
 
-def test_ending_process_saves_unsaved_edits(pruned, tmp_path):
+def test_ending_process_saves_unsaved_edits_and_says_where(pruned, tmp_path, capsys):
     saving.end(pruned, tmp_path)
     assert not pruned.state.may_close
     settle(pruned)
     assert pruned.state.may_close
     assert kept_in(tmp_path) == 240
+    assert f"saved {tmp_path / 'blobs-edited-001.ply'}" in capsys.readouterr().err
 
 
 def test_taught_name_is_found_and_saved(opened, tmp_path):

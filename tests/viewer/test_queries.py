@@ -165,6 +165,21 @@ def test_name_finds_what_was_given_it_and_others_on_request(opened):
     assert answer(opened).like is None
 
 
+def test_given_name_finds_the_same_after_opening_the_project(opened, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("blobs.ply").touch()
+    half = blob("mug") & (np.arange(360) % 2 == 0)
+    take(opened, half)
+    act(editing.name_selection, opened, "Bruno")
+    assert opened.state.is_changed
+    path = saving.save_project(opened, tmp_path)
+    open_scene(opened, "plain.ply")
+    act(opening.open_project, opened, path)
+    assert [word.name for word in opened.engine.taught.values()] == ["Bruno"]
+    np.testing.assert_array_equal(result(opened).members, half)
+    assert answer(opened).like is not None
+
+
 def test_letters_for_a_box_that_is_not_there_are_no_keys(viewer):
     queries.focus_search(viewer)
     assert viewer.state.letters_muted

@@ -77,6 +77,25 @@ def test_undo_and_redo_restore_queries(opened):
     assert "nothing to redo" in opened.state.messages[-1].text
 
 
+NAMED = {
+    "select 360 Gaussians": editing.select_all,
+    "search 'mug'": lambda viewer: ask(viewer, "mug"),
+    "delete 360 Gaussians": lambda viewer: editing.select_all(viewer) or editing.delete_selected(viewer),
+    "transform": lambda viewer: editing.transform(viewer, moving(np.ones(3))),
+    "note": lambda viewer: settings.pin_at(viewer, 0.5, 0.5),
+    "display": lambda viewer: settings.set_display(viewer, "depth"),
+}
+
+
+@pytest.mark.parametrize("words", NAMED)
+def test_undo_and_redo_name_their_step(opened, words):
+    NAMED[words](opened)
+    assert editing.named_step(opened, "undo") == f"undo {words}"
+    editing.undo(opened)
+    assert opened.state.messages[-1].text == f"undo {words}"
+    assert editing.named_step(opened, "redo") == f"redo {words}"
+
+
 def test_undo_restores_a_removed_query_with_its_colour(opened):
     ask(opened, "mug", "book")
     queries.set_cut(opened, "mug", 0.6)
@@ -569,6 +588,25 @@ def test_unsaved_notes_are_asked_about_before_closing(opened, tmp_path, leave):
     assert opened.state.may_close
     assert len(read_project(tmp_path / "blobs-001.langsplat").session.notes) == 1
     assert saving.may_close(opened)
+
+
+def test_first_save_asks_for_a_file_and_the_next_do_not(opened, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings.pin_at(opened, 0.5, 0.5)
+    saving.save(opened)
+    assert opened.state.choice.start == tmp_path / "blobs-001.langsplat"
+    settings.choose(opened, "mine")
+    assert (opened.state.project, opened.state.is_changed) == (tmp_path / "mine.langsplat", False)
+    settings.pin_at(opened, 0.4, 0.4)
+    assert opened.state.is_changed
+    saving.save(opened)
+    assert (opened.state.choice, opened.state.is_changed) == (None, False)
+    saving.save_as(opened)
+    settings.choose(opened, "mine.langsplat")
+    assert "is there already" in errors(opened)[-1]
+    settings.choose(opened, "other.langsplat")
+    for name in ("mine", "other"):
+        assert read_project(tmp_path / f"{name}.langsplat").session.notes == opened.state.session.notes
 
 
 def test_notes_return_with_their_scene(opened):

@@ -7,7 +7,8 @@ that undoing them all gives exactly what was there.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, get_args
+from functools import partial
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -20,11 +21,11 @@ from langsplat_core.query.selection import at_point, grow, in_box, of_rows, shri
 from langsplat_core.scene import LEVELS
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
 from langsplat_viewer import marks
-from langsplat_viewer.actions.queries import ask_listed, forget_unlisted, teach
+from langsplat_viewer.actions.queries import ask_listed, forget_unlisted, teach, teach_given
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.marks import Drawn, Marks, Mode, Stroke, Tool
 from langsplat_viewer.rendering.request import UNCLIPPED
-from langsplat_viewer.session import Move, Point, Query, Session, pack
+from langsplat_viewer.session import Move, Point, Query, Session, change_between, pack
 from langsplat_viewer.state import EditForm, Gizmo
 from langsplat_viewer.viewer import Viewer
 
@@ -385,23 +386,31 @@ def crop(viewer: Viewer) -> None:
 # Undo and redo. The camera is not undone: its reset leads back.
 
 
-def undo(viewer: Viewer) -> None:
-    """Go back to the session before the last step."""
-    _step(viewer, viewer.history.past, viewer.history.future, "nothing to undo")
+Step = Literal["undo", "redo"]
 
 
-def redo(viewer: Viewer) -> None:
-    """Take back the last undo."""
-    _step(viewer, viewer.history.future, viewer.history.past, "nothing to redo")
-
-
-def _step(viewer: Viewer, there: list[Session], back: list[Session], otherwise: str) -> None:
+def undo(viewer: Viewer, step: Step = "undo") -> None:
+    """Go back to the session before the last step; "redo": take back the last undo."""
+    history, now, named = viewer.history, viewer.state.session, named_step(viewer, step)
+    there, back = (history.past, history.future)[:: 1 if step == "undo" else -1]
     if not there:
-        viewer.state.say(otherwise)
+        viewer.state.say(f"nothing to {step}")
         return
-    viewer.history.setting = ""
-    back.append(viewer.state.session)
-    adopt(viewer, there.pop().undone(now=viewer.state.session))
+    history.setting = ""
+    back.append(now)
+    adopt(viewer, there.pop().undone(now=now))
+    viewer.state.say(named)
+
+
+redo = partial(undo, step="redo")
+
+
+def named_step(viewer: Viewer, step: Step) -> str:
+    """Return what a step would undo or redo, in words: "undo delete 12 Gaussians"."""
+    past, future, now = viewer.history.past, viewer.history.future, viewer.state.session
+    if step == "undo":
+        return f"undo {change_between(past[-1], now)}" if past else step
+    return f"redo {change_between(now, future[-1])}" if future else step
 
 
 def adopt(viewer: Viewer, session: Session) -> None:
@@ -418,4 +427,5 @@ def adopt(viewer: Viewer, session: Session) -> None:
     state.marks = session.marks.masks(before.marks, state.marks)
     state.session = session
     forget_unlisted(viewer)
+    teach_given(viewer)
     ask_listed(viewer, anew=moved or session.level != before.level)

@@ -187,7 +187,7 @@ def take_session(viewer: Viewer, session: Session) -> None:
     """Adopt a session of an earlier time, as far as the scene that is shown has what it speaks of."""
     if viewer.engine is None or not viewer.state.has_field:
         session = replace(_without_field(session), things=Things())
-    elif session.things.names:
+    else:
         session = replace(session, things=session.things.known(viewer.engine.tree.count))
     adopt(viewer, session)
 

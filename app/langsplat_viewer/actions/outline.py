@@ -173,12 +173,6 @@ def show(viewer: Viewer, members: Array) -> None:
 
 def give_name(viewer: Viewer, target: Target, name: str) -> None:
     """Name a thing, and teach the name, so that it is found by it."""
-    name = tidy(name)
-
-    def done(taught: str) -> None:
-        if isinstance(target, int):
-            things = viewer.state.session.things
-            viewer.change(things=replace(things, names={**things.names, target: name}))
-
+    name, node = tidy(name), target if isinstance(target, int) else None
     if name:
-        of_thing(lambda viewer, members: teach(viewer, name, members, done))(viewer, target)
+        of_thing(lambda viewer, members: teach(viewer, name, members, node))(viewer, target)

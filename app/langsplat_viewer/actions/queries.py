@@ -1,6 +1,6 @@
 """Searching: the box, the list of queries, their colours, thresholds and level."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -26,7 +26,7 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
 from langsplat_viewer.actions.settings import open_panel
-from langsplat_viewer.session import Query
+from langsplat_viewer.session import Query, Things, pack
 from langsplat_viewer.state import QueryAnswer
 from langsplat_viewer.viewer import Viewer
 
@@ -58,17 +58,18 @@ def ask_together(viewer: Viewer, phrases: Sequence[str]) -> None:
         answer(viewer, phrase, shown_with=listed)
 
 
-def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = ()) -> None:
+def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = (), *, alike: bool = False) -> None:
     """Have the worker answer a query of the list; only what may be there takes a colour.
 
-    shown_with: the phrases that were asked together, it too; without, what is shown stays. Its instances come
-    later: the surface that they are told apart on takes seconds where there are a million Gaussians.
+    shown_with: the phrases that were asked together, it too; without, what is shown stays. alike: a name
+    finds all that is like what it was given to. Its instances come later: the surface that they are told
+    apart on takes seconds where there are a million Gaussians.
     """
     state, engine, level = viewer.state, viewer.engine, viewer.state.session.level
     if engine is None:
         return
     viewpoint = None if state.view is None else state.view.camera(*state.size)
-    path, members = state.path, state.named.get(phrase_key(phrase))
+    path, members = state.path, None if alike else state.session.things.named(phrase)
 
     def work(progress: Progress) -> QueryAnswer:
         try:
@@ -122,9 +123,7 @@ def _alone(like: QueryResult, members: Array) -> QueryResult:
 
 def show_alike(viewer: Viewer, query: Query) -> None:
     """Show of a name, which finds what was given it, all that is like that."""
-    state = viewer.state
-    state.named = {key: members for key, members in state.named.items() if key != phrase_key(query.phrase)}
-    answer(viewer, query.phrase, shown_with=[query.phrase])
+    answer(viewer, query.phrase, shown_with=[query.phrase], alike=True)
 
 
 def _tell_apart(viewer: Viewer, engine: QueryEngine, phrase: str, result: QueryResult) -> None:
@@ -166,19 +165,35 @@ def focus_search(viewer: Viewer) -> None:
 # Names that are taught.
 
 
-def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None] = lambda name: None) -> None:
+def teach(viewer: Viewer, name: str, members: Array, node: int | None = None) -> None:
     """Have the worker teach a name by the language of (N,) bool, and search for it: it finds just these.
 
-    What is saved from now on keeps it. `done` gets the name, if the scene is still there.
+    What is saved from now on keeps it. `node` of the tree, where they are one.
     """
 
     def taught(word: TaughtWord) -> None:
-        done(word.name)
-        viewer.state.say(f"taught '{word.name}'; to keep it, save the scene")
-        viewer.state.named = {**viewer.state.named, word.key: members}
+        things, bits = viewer.state.session.things, pack(members)
+        assert bits is not None  # else there was nothing to teach by
+        given = {other: those for other, those in things.given.items() if phrase_key(other) != word.key}
+        names = things.names if node is None else {**things.names, node: word.name}
+        viewer.change(things=Things(names, {**given, word.name: bits}))
+        viewer.state.say(f"taught '{word.name}'; to keep it, save the project or the scene")
         ask_together(viewer, [word.name])
 
     viewer.ask_engine(f"teaching '{name}'", lambda engine, _: engine.teach(name, members), taught)
+
+
+def teach_given(viewer: Viewer) -> None:
+    """Have the worker teach the names of the session that the scene was saved without."""
+    given, engine = viewer.state.session.things.given, viewer.engine
+
+    def work(engine: QueryEngine, progress: Progress) -> None:
+        for name, bits in given.items():
+            if not engine.is_taught(name):
+                engine.teach(name, bits.mask)
+
+    if engine is not None and not all(map(engine.is_taught, given)):
+        viewer.ask_engine("teaching names", work, lambda nothing: None)
 
 
 # The list of queries.

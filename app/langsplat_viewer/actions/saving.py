@@ -25,6 +25,7 @@ from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
 from langsplat_viewer.actions.editing import adopt, has_selection
+from langsplat_viewer.actions.settings import ask_for, folder_of
 from langsplat_viewer.actions.viewpoint import path_motion
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.jobs import one_line
@@ -41,7 +42,7 @@ from langsplat_viewer.projects import (
 )
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.session import Bookmark, Session
-from langsplat_viewer.state import Leaving, flight_of
+from langsplat_viewer.state import FileChoice, Leaving, flight_of
 from langsplat_viewer.viewer import Viewer
 
 
@@ -231,13 +232,37 @@ def finish_writing(viewer: Viewer) -> None:
 # Projects.
 
 
-def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
-    """Save the project to the file that it came from, or to a new one in `folder`; None where that failed."""
+def save(viewer: Viewer) -> None:
+    """Save the project to its file; where it has none yet, a dialog asks for one."""
+    if viewer.state.project is None:
+        save_as(viewer)
+    else:
+        save_project(viewer)
+
+
+def save_as(viewer: Viewer) -> None:
+    """Have a dialog ask for the file that the project is saved to from now on."""
+    if viewer.has_scene("save the project"):
+        new = _new_file(viewer, folder_of(viewer), PROJECTS)
+        choice = FileChoice("Save the project", _save_to, "save", (PROJECTS,), new)
+        ask_for(viewer, choice)
+
+
+def _save_to(viewer: Viewer, path: Path) -> None:
+    save_project(viewer, to=path)
+
+
+def save_project(viewer: Viewer, folder: Path = Path(), to: Path | None = None) -> Path | None:
+    """Save the project, as `to` or to the file that it came from or to a new one in `folder`.
+
+    Return where it is, None where that failed.
+    """
     state = viewer.state
     if state.scene is None or state.path is None or state.view is None:
         viewer.say_error("open a scene first, then save the project")
         return None
-    path = state.project or _new_file(viewer, folder, PROJECTS)
+    path = to or state.project or _new_file(viewer, folder, PROJECTS)
+    read = state.project_read if path == state.project else None
     project = Project(
         scene=os.path.abspath(state.path),
         gaussians=len(state.scene.gaussians),
@@ -253,7 +278,7 @@ def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
         return output.free_name(path.parent, f"{path.name.removesuffix(PROJECTS)}-other", PROJECTS)
 
     def write() -> None:
-        written.append(write_project(path, project, apart, state.project_read))
+        written.append(write_project(path, project, apart, read))
 
     if viewer.save(path, write) is None:
         return None
@@ -303,7 +328,7 @@ def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str, loses_more: b
 
 def quit_viewer(viewer: Viewer) -> None:
     """Close the window; ask first where something would be lost."""
-    leave(viewer, _close, "the window closes", viewer.state.has_unsaved_notes)
+    leave(viewer, _close, "the window closes", viewer.state.is_changed)
 
 
 def may_close(viewer: Viewer) -> bool:
@@ -326,7 +351,11 @@ def end_at_once(viewer: Viewer) -> None:
 
 
 def end(viewer: Viewer, folder: Path = Path()) -> None:
-    """Close without a question: what would be lost is first written to new files in `folder`."""
+    """Close without a question: what would be lost is first written to new files in `folder`.
+
+    Where they are is said in the terminal.
+    """
+    viewer.state.echoes = True
     if viewer.state.has_unsaved_notes:
         save_project(viewer, folder)
     if viewer.state.is_unsaved:

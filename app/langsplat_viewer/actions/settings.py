@@ -236,12 +236,15 @@ def escape(viewer: Viewer) -> None:
 # Files and folders that are chosen in a dialog.
 
 
+def folder_of(viewer: Viewer) -> Path:
+    """Return the folder that dialogs begin in: where the scene lies, unless it is the bundled one."""
+    path = viewer.state.path
+    return Path.cwd() if path is None or path == BUNDLED else path.absolute().parent
+
+
 def ask_for(viewer: Viewer, choice: FileChoice) -> None:
     """Have a dialog ask for a file or folder, at first where the scene lies."""
-    path = viewer.state.path
-    own = path is not None and path != BUNDLED
-    folder = path.absolute().parent if path is not None and own else Path.cwd()
-    viewer.state.choice = replace(choice, start=folder / choice.start)
+    viewer.state.choice = replace(choice, start=folder_of(viewer) / choice.start)
 
 
 def choose(viewer: Viewer, text: str, is_confirmed: bool = False) -> None:

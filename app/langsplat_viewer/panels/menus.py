@@ -30,7 +30,8 @@ def _items(viewer: Viewer, commands: list[Command]) -> None:
     for command in commands:
         if command.apart:
             imgui.separator()
-        title = command.does[0].upper() + command.does[1:]
+        does = command.now(viewer) or command.does
+        title = does[0].upper() + does[1:]
         is_on = command.is_on is not None and command.is_on(viewer)
         if imgui.menu_item(title, ", ".join(command.keys[:1]), is_on)[0]:
             command.act(viewer)

@@ -14,7 +14,7 @@ from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, Drawing, ma
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import LevelWords
 from langsplat_core.scene import LEVELS, NO_ORIGIN, Camera
-from langsplat_viewer.actions import saving, settings, viewpoint
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import PlacedText, placed
@@ -492,8 +492,7 @@ def draw_notes(viewer: Viewer) -> None:
     pin = with_key("Pin one to what is clicked", settings.toggle_pinning)
     if imgui.checkbox(pin, state.pins_notes)[0]:
         settings.toggle_pinning(viewer)
-    if ui.button("Save project", "Notes, queries, selection, edits, views: one file, to be opened again"):
-        saving.save_project(viewer)
+    ui.verbs(viewer, "Save project")
     imgui.end_disabled()
     if not state.session.notes:
         ui.small_wrapped("notes are listed here", ui.muted())
