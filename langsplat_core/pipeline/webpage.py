@@ -289,8 +289,8 @@ def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any
     phrases: Sequence[str] = book
     if encoder is not None:
         phrases = (*book, *suggested, *(phrase for name in BUNDLED for phrase in bundled_vocabulary(name)))
-    things = filter(None, map(grammar.thing_of, phrases))
-    known, vectors = engine.known_vectors((*phrases, *things))
+    others = (name for phrase in phrases for name in grammar.thing_and_part(phrase) if name)
+    known, vectors = engine.known_vectors((*phrases, *others))
     return {"keys": known, "phrases": known if encoder else book}, {"vectors": vectors.astype(np.float16)}
 
 

@@ -10,23 +10,11 @@ import numpy as np
 from scipy.sparse import csr_matrix, vstack
 
 from langsplat_core.arrays import Array
-from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
-from langsplat_core.query.grammar import named
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.lookup import TOGETHER, Lookup, Relevancy
-from langsplat_core.query.rule import (
-    RULE,
-    Bars,
-    Judged,
-    RegionTable,
-    Verdict,
-    decide,
-    region_fits,
-    region_relevancies,
-    triple,
-)
-from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Tree
+from langsplat_core.query.rule import RULE, Decision, Judged, RegionTable, Verdict, region_fits, triple
+from langsplat_core.scene import LEVELS, Fits, LanguageField, Tree
 from langsplat_core.scene.surface import NEIGHBOURS, Surface
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale
 
@@ -184,6 +172,10 @@ class Regions:
         of = self.everywhere[level]
         return np.where(of >= 0, np.append(values, others.dtype.type(0))[of], others)
 
+    def mostly(self, members: Array) -> Array:
+        """Return (R,) bool: the regions that are by more than half among `members` (N,) bool."""
+        return np.concatenate(self.means(np.tile(members, (len(LEVELS), 1)))) > 0.5
+
     def level_of(self, members: Array) -> int:
         """Return the level with the region most like `members` (N,) bool, of equal ones the coarsest."""
         best = []
@@ -279,27 +271,10 @@ def chance_in(table: RegionTable, mixtures: csr_matrix, lookup: Lookup, scale: S
 # The answers.
 
 
-def own_fits(regions: Regions, scale: Scale, relevancy: Array) -> Array:
-    """Return the (R,) fits of the mean of (3, N) relevancy over each region of all levels."""
-    return np.concatenate([scale.fit(values) for values in regions.means(relevancy)])
-
-
 def by_regions(
-    phrase: str,
-    relevancy: Relevancy,
-    fits: tuple[Array, Array | None],
-    means: Array,
-    regions: Regions,
-    bars: Bars,
-    calibration: Calibration | None,
-    level: LevelChoice,
+    phrase: str, relevancy: Relevancy, decision: Decision, means: Array, regions: Regions
 ) -> QueryResult:
-    """Return the answer by the rule. means: (N, 3) of the Gaussians.
-
-    fits: (R,) of the regions with the phrase, and with the thing that it names a part of, see `decide`.
-    """
-    own, thing = fits
-    decision = decide(regions.table, own, named(phrase), level, bars, calibration, thing)
+    """Return the answer by the rule. means: (N, 3) of the Gaussians."""
     chosen = decision.level
     place, box = regions.place(means, chosen, decision.best)
     return QueryResult(
@@ -315,16 +290,6 @@ def by_regions(
         place=place,
         box=box,
         points=means,
-    )
-
-
-def even_relevancy(regions: Regions, scale: Scale, relevancy: Array) -> Array:
-    """Return (3, N) relevancy with that of its region's fit for every Gaussian; its own for one in none."""
-    own = plain(relevancy)
-    fits = region_fits(regions.table, own_fits(regions, scale, own))
-    values = region_relevancies(fits).astype(np.float32)
-    return np.stack(
-        [regions.spread(level, regions.table.level(level, values), row) for level, row in enumerate(own)]
     )
 
 

@@ -14,9 +14,10 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import SPAN, QueryResult, even_relevancy, locate
+from langsplat_core.query.answers import QueryResult, locate
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import (
+    ADJECTIVES,
     Atom,
     Both,
     Counted,
@@ -32,14 +33,12 @@ from langsplat_core.query.grammar import (
     parse,
     unparse,
 )
-from langsplat_core.query.relations import WHOLE, Body, body, most, separate, stands, upright, viewpoint
-from langsplat_core.query.rule import RULE, combined, judge, triple
+from langsplat_core.query.relations import Body, body, most, separate, stands, upright, viewpoint
+from langsplat_core.query.rule import RULE, combined
 from langsplat_core.scene import LEVELS, Camera
 from langsplat_core.scene.language import phrase_key, tidy
 from langsplat_core.semantics.relevancy import FLOOR
 
-SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
-LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
 # Of the peak, where the place ends; of a thing's Gaussians, which two things share that are the same; of the
 # way below its best region, to which an unwanted name reaches.
 HALF = 0.5
@@ -175,17 +174,18 @@ class _Asking:
         return whole if whole.peak >= FLOOR else self._ask(text, "auto")
 
     def _inside(self, part: Phrase, whole: Phrase, level: LevelChoice) -> QueryResult:
-        thing, surface = self.answer(whole), self.engine.surface
-        there = thing.members.copy()  # and what is next to them on the surface
-        there[surface.rows[surface.links[np.flatnonzero(there[surface.rows])].indices]] = True
-        if not isinstance(part, Atom) or self.engine.is_taught(part.text):
+        thing, engine = self.answer(whole), self.engine
+        if not isinstance(part, Atom) or engine.is_taught(part.text) or engine.bars is None:
             found = self.answer(part, level)
-            return restricted(found, found.members & there, thing)
-        asked = [self._ask(part.text, level)]
-        if isinstance(whole, Atom) and not self.engine.is_taught(whole.text):
-            with suppress(EncoderError):  # where it is unknown, the part alone is left
-                asked.append(self._ask(f"{whole.text} {part.text}", level))
-        return cut_inside(self.engine, asked, thing, there, level)
+            return restricted(found, thing.members, thing)
+        names, on = [part.text], thing.members
+        if isinstance(whole, Atom) and not engine.is_taught(whole.text):
+            names += filter(engine.is_known, [f"{whole.text} {part.text}"])
+            if ADJECTIVES.isdisjoint(whole.text.lower().split()):  # else it is told from others of its kind
+                on = within_reach(engine, thing, RULE.around)[0]
+        calibration = engine.calibration if thing.probability is not None else None
+        found = engine.run_inside(names, on, level, calibration)
+        return restricted(found, found.members, thing)
 
     def _chosen(self, tree: Relation | Superlative, level: LevelChoice) -> QueryResult:
         what = self.answer(tree.what, level)
@@ -214,39 +214,6 @@ class _Asking:
         surface = self.engine.surface
         parts = separate(surface, answer.members[surface.rows], self.engine.tree)
         return [(numbers, body(surface.positions[numbers], self._frame)) for numbers in parts]
-
-
-def cut_inside(
-    engine: QueryEngine, asked: list[QueryResult], thing: QueryResult, there: Array, level: LevelChoice
-) -> QueryResult:
-    """Return the answers of a part in one, cut anew among the Gaussians of its thing, `there` (N,) bool."""
-    surface, known = engine.surface, engine.field.known
-    relevancy = np.asarray(np.mean([result.relevancy for result in asked], axis=0, dtype=np.float32))
-    even = np.where(there, even_relevancy(engine.regions, engine.scale, relevancy), 0)
-    peaks = triple(even[:, surface.rows[there[surface.rows]]].max(1, initial=0))
-    own = int(np.argmax(peaks[:WHOLE])) if max(peaks[:WHOLE]) > 0 else WHOLE
-    chosen = own if level == "auto" else LEVELS.index(level)
-    peak = peaks[chosen]
-    own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
-    low = float(np.quantile(even[chosen][own_surface], LEAST)) if own_surface.any() else peak
-    members = there & known[chosen] & (even[chosen] > low + SHARE * max(peak - low, SPAN))
-    fits, judgements = triple(engine.scale.fit(np.array(peaks))), [thing.judgement]
-    if engine.bars is not None:
-        calibration = engine.calibration if thing.probability is not None else None
-        bars = engine.bars_among(there) if calibration is None else None
-        judgements += [judge(fits, "inside", level, bars, calibration)]
-    judgement = combined(judgements, all_needed=True)
-    return replace(
-        asked[0],
-        level=chosen,
-        scores=peaks,
-        relevancy=np.where(there, relevancy, 0),
-        even=even[chosen],
-        peak=peak,
-        fits=fits,
-        judgement=judgement if members.any() else judgement.absent,
-        members=members,
-    )
 
 
 def joined(answers: Sequence[QueryResult], all_needed: bool) -> QueryResult:

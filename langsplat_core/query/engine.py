@@ -28,10 +28,10 @@ from langsplat_core.query.answers import (
     by_regions,
     chance_in,
 )
-from langsplat_core.query.grammar import STOP_WORDS, check_names, only, thing_of
+from langsplat_core.query.grammar import STOP_WORDS, check_names, named, only, thing_and_part
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, Relevancy, through_cells
-from langsplat_core.query.rule import Bars, bars_of
+from langsplat_core.query.rule import Bars, bars_of, decide, on_things
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
@@ -134,24 +134,23 @@ class QueryEngine:
         texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
         vectors = self.text_vectors(texts, progress)  # first: what it refuses leaves nothing cached
         relevancies = self._lookup.relevancies(vectors) if texts else iter(())
-        things, answers = self._thing_fits(texts), []
+        others, answers = self._fits_of_names(texts), []
         for phrase in phrases:
             progress(f"searching '{tidy(phrase)}'", 0.5)
             if self.is_taught(phrase):
                 answers.append(self._by_showing(self.taught[phrase_key(phrase)], level))
             else:
-                thing = things.get(thing_of(tidy(phrase)))
-                answers.append(self._answer(tidy(phrase), next(relevancies), level, thing))
+                answers.append(self._answer(tidy(phrase), next(relevancies), level, others))
         return answers
 
     def relevancy(self, vector: Array) -> Array:
         """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
         return next(self._lookup.relevancies(vector[None]))()
 
-    def _thing_fits(self, phrases: Sequence[str]) -> dict[str, Array]:
-        """Return the (R,) fits of the things that `phrases` name parts of, as far as they can be asked."""
-        wanted = dict.fromkeys(thing_of(tidy(phrase)) for phrase in phrases)
-        names = [name for name in wanted if self._is_known(name) and self.bars is not None]
+    def _fits_of_names(self, phrases: Sequence[str]) -> dict[str, Array]:
+        """Return the (R,) own fits of the things and parts that `phrases` name, as far as they are known."""
+        wanted = dict.fromkeys(name for phrase in phrases for name in thing_and_part(tidy(phrase)))
+        names = [name for name in wanted if self.is_known(name) and self.bars is not None]
         relevancies = self._lookup.relevancies(self.text_vectors(names)) if names else ()
         found = zip(names, relevancies, strict=True)
         return {name: self._own_fits(relevancy) for name, relevancy in found}
@@ -159,21 +158,43 @@ class QueryEngine:
     def _own_fits(self, relevancy: Relevancy) -> Array:
         return self.scale.fit(self._mixtures @ relevancy.values)
 
-    def _is_known(self, name: str) -> bool:
+    def is_known(self, name: str) -> bool:
+        """Return whether a phrase is a known text: no taught word, and of no unknown words."""
         try:
             return bool(name) and not (self.is_taught(name) or self.unknown_words(name))
         except EncoderError:
             return False
 
     def _answer(
-        self, phrase: str, relevancy: Relevancy, level: LevelChoice, thing: Array | None
+        self, phrase: str, relevancy: Relevancy, level: LevelChoice, others: dict[str, Array]
     ) -> QueryResult:
         means = self.scene.gaussians.means
         if self.bars is None:
             return by_peak(phrase, relevancy(), means, self.surface, self.scale, self.field.found, level)
-        fits = self._own_fits(relevancy), thing
-        judged = self.bars, self.calibration, level
-        return by_regions(phrase, relevancy, fits, means, self.regions, *judged)
+        thing, part = map(others.get, thing_and_part(phrase))
+        fits, on = [self._own_fits(relevancy)], None
+        if thing is not None:
+            fits += [] if part is None else [part]
+            on = on_things(self.regions.table, thing)
+        judged = self.bars, self.calibration, on
+        decision = decide(self.regions.table, fits, named(phrase), level, *judged)
+        return by_regions(phrase, relevancy, decision, means, self.regions)
+
+    def run_inside(
+        self, names: Sequence[str], members: Array, level: LevelChoice, calibration: Calibration | None
+    ) -> QueryResult:
+        """Answer a part by all its `names` on the thing that has `members` (N,) bool.
+
+        It is judged there, by the first name. Raises as `text_vectors` does.
+        """
+        assert self.bars is not None
+        assert self.chance is not None
+        asked = list(self._lookup.relevancies(self.text_vectors(names)))
+        relevancy = replace(asked[0], values=np.mean([one.values for one in asked], axis=0))
+        fits, on, table = list(map(self._own_fits, asked)), self.regions.mostly(members), self.regions.table
+        bars = self.bars if calibration else bars_of(table, self.chance, on)
+        decision = decide(table, fits, "inside", level, bars, calibration, on)
+        return by_regions(names[0], relevancy, decision, self.scene.gaussians.means, self.regions)
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """Return the things among the members of an answer, best first, or only so many of them."""
@@ -268,15 +289,6 @@ class QueryEngine:
     def bars(self) -> Bars | None:
         """The best fits of everyday phrases in the scene; None where there are none."""
         return None if self.chance is None else bars_of(self.regions.table, self.chance)
-
-    def bars_among(self, members: Array) -> Bars:
-        """Return the best fits of everyday phrases at the regions of some Gaussians, (N,) bool."""
-        assert self.chance is not None
-        chosen = [
-            np.isin(np.arange(len(sizes)), row[members])
-            for row, sizes in zip(self.regions.everywhere, self.regions.sizes, strict=True)
-        ]
-        return bars_of(self.regions.table, self.chance, np.concatenate(chosen))
 
     @property
     def basis(self) -> Basis:

@@ -103,9 +103,10 @@ def named(phrase: str) -> Named:
     return "part" if only(ADJECTIVES | ARTICLES, before) else "part of a thing"
 
 
-def thing_of(phrase: str) -> str:
-    """Return the thing that a phrase names a part of, "red mug" of "red mug handle"; else ""."""
-    return " ".join(phrase.split()[:-1]) if named(phrase) == "part of a thing" else ""
+def thing_and_part(phrase: str) -> tuple[str, str]:
+    """Return the thing that a phrase names a part of, and the part: "red mug" and "handle"; else ""."""
+    *thing, part = phrase.split() if named(phrase) == "part of a thing" else [""]
+    return " ".join(thing), part
 
 
 def only(words: frozenset[str], tokens: Sequence[str]) -> bool:

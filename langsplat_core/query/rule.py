@@ -107,11 +107,12 @@ def region_relevancies(fits: Array) -> Array:
 
 
 def on_things(table: RegionTable, thing: Array) -> Array:
-    """Return where, (R,) bool, parts of a thing may be in a scene, by (R,) fits of regions with it.
+    """Return where, (R,) bool, parts of a thing may be in a scene, by its (R,) own fits of regions.
 
     That is in and below the wholes that fit it nearly as well as the best does.
     """
-    whole, solid = table.level(len(LEVELS) - 1, thing), table.level(len(LEVELS) - 1, table.solid)
+    last = len(LEVELS) - 1
+    whole, solid = table.level(last, region_fits(table, thing)), table.level(last, table.solid)
     best = float(whole[solid if solid.any() else slice(None)].max(initial=RULE.nothing))
     on = np.zeros(len(thing) + 1, bool)  # the last: what has no parent
     on[len(thing) - len(whole) : -1] = whole >= RULE.least_fit(best, RULE.around)
@@ -328,7 +329,7 @@ class Decision:
 
     level: int  # index into LEVELS
     scores: Fits  # best relevancy per level
-    fits: Fits  # of the best region per level, wherever it is: what the verdict stands on
+    fits: Fits  # of the best region per level that the verdict counts
     relevancies: Array  # (r,) float32 of the regions of the level
     inside: Array  # (r,) bool: the regions that answer
     best: int  # the region that the place is taken from; -1 for none
@@ -337,28 +338,32 @@ class Decision:
 
 def decide(
     table: RegionTable,
-    own: Array,
-    named: Named,
+    own: Sequence[Array],
+    sought: Sought,
     level: LevelChoice,
     bars: Bars,
     calibration: Calibration | None,
-    thing: Array | None = None,
+    on: Array | None = None,
 ) -> Decision:
     """Return the answer of the whole regions of a scene that fit nearly as well as the best one.
 
-    own: (R,) fits of the mean relevancy of each region. named: what the phrase names. thing: the same as
-    `own` for the thing that the phrase names a part of: nothing else has the part, and no whole is one.
+    own: (R,) fits of the mean relevancy of each region, of every name of what is sought. Where it is a part
+    of a thing, these are the phrase ("mug handle") and, if known, the part ("handle"), which count the same;
+    `on` (R,) bool are the regions on its thing, which alone have the part, and of which no whole is one.
+    Verdicts count the first name, in all regions, or on the thing where a part is sought "inside".
     """
-    fits = region_fits(table, own)
-    evidence = triple(fit_of(best_relevancies(table, region_relevancies(fits))[0]))
-    common = float(common_fits(table, fits)[0])
-    if thing is not None:
-        fits = np.where(on_things(table, region_fits(table, thing)), fits, RULE.nothing)
+    every, fits = region_fits(table, own[0]), region_fits(table, np.mean(own, axis=0))
+    common = float(common_fits(table, every)[0])
+    if on is not None:
+        fits = np.where(on, fits, RULE.nothing)
+    if on is not None and sought == "inside":
+        every, common = np.where(on, every, RULE.nothing), 0.0
+    evidence = triple(fit_of(best_relevancies(table, region_relevancies(every))[0]))
     relevancies = region_relevancies(fits)
     scores = best_relevancies(table, relevancies)[0]
     best = fit_of(scores)
-    given = best + RULE.advantage[named]
-    if thing is not None:
+    given = best + RULE.advantage["part of a thing" if sought == "inside" else sought]
+    if on is not None:
         given[-1] = RULE.nothing
     # Of equal levels the coarsest.
     chosen = int(np.flatnonzero(given == given.max())[-1]) if level == "auto" else LEVELS.index(level)
@@ -371,7 +376,7 @@ def decide(
         relevancies=shown,
         inside=table.level(chosen, fits) >= RULE.least_fit(float(best[chosen])),
         best=int(solid.argmax()) if solid.max(initial=0) > 0 else -1,
-        verdict=judge(evidence, named, level, bars, calibration, common),
+        verdict=judge(evidence, sought, level, bars, calibration, common),
     )
 
 

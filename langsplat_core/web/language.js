@@ -3,7 +3,7 @@
 
 import { ClipText, PhraseError, dot } from "./encoder.js";
 import { decide, fitOf, heatRange, levelRange, regionRelevancies, sigmoid, verdict } from "./rule.js";
-import { namedBy, phraseKey, thingOf, tidy } from "./words.js";
+import { namedBy, phraseKey, thingAndPart, tidy } from "./words.js";
 
 // [page]
 const LISTS = ["articles", "stop_words", "adjectives", "parts"];
@@ -82,9 +82,9 @@ class Language {
     const phrase = tidy(text);
     const relevancies = this.relevancies(this.vector(key));
     const named = namedBy(phrase, this.lists);
-    const thing = this.thingFits(thingOf(phrase, this.lists));
+    const others = thingAndPart(phrase, this.lists).map((name) => this.knownFits(name));
     const own = this.ownFits(relevancies);
-    const decision = decide(this.meta.rule, this.regions, own, named, level, this.meta, thing);
+    const decision = decide(this.meta.rule, this.regions, own, named, level, this.meta, ...others);
     return this.answer(phrase, decision, relevancies);
   }
 
@@ -127,9 +127,9 @@ class Language {
     return means.map((mean) => fitOf(this.meta.rule, mean));
   }
 
-  // Fits of the regions with the thing that a phrase names a part of; null where it cannot be asked.
-  thingFits(thing) {
-    const key = phraseKey(thing);
+  // Fits of the regions with a thing or part that a phrase names; null where it cannot be asked.
+  knownFits(name) {
+    const key = phraseKey(name);
     if (!key || this.taught.has(key)) {
       return null;
     }

@@ -120,11 +120,15 @@ function judge(rule, fits, named, level, { bars, calibration }, common) {
 
 // The answer of the whole regions that fit nearly as well as the best one: its level, `scores` and `fits` of
 // all levels, the regions that are `inside`, the `best` one that the place is of (-1: none), and the verdict.
-// evidence: { bars, calibration }. thing: the same as `own` for the thing that the phrase names a part of.
-function decide(rule, regions, own, named, level, evidence, thing = null) {
+// evidence: { bars, calibration }. thing, part: the same as `own` for the thing that the phrase names a part of,
+// and for that part alone.
+function decide(rule, regions, own, named, level, evidence, thing = null, part = null) {
   const anywhere = regionFits(rule, regions, own);
+  const both = thing && part ? own.map((fit, region) => (fit + part[region]) / 2) : own;
   const on = thing && onThings(rule, regions, regionFits(rule, regions, thing));
-  const every = anywhere.map((fit, region) => (!on || on[region] ? fit : rule.nothing));
+  const every = regionFits(rule, regions, both).map((fit, region) =>
+    !on || on[region] ? fit : rule.nothing,
+  );
   const bestOf = (relevancies) =>
     regions.counts.map((_, at) => bestRelevancy(rule, regions, relevancies, at));
   const fits = bestOf(regionRelevancies(rule, anywhere)).map((score) => fitOf(rule, score));

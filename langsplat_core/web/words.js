@@ -68,10 +68,11 @@ function namedBy(phrase, { parts, adjectives, articles }) {
   return words.every((word) => adjectives.has(word) || articles.has(word)) ? "part" : "part of a thing";
 }
 
-// The thing that a phrase names a part of, "red mug" of "red mug handle"; else "".
-function thingOf(phrase, lists) {
-  return namedBy(phrase, lists) === "part of a thing" ? phrase.split(" ").slice(0, -1).join(" ") : "";
+// The thing that a phrase names a part of, and the part: "red mug" and "handle"; else "".
+function thingAndPart(phrase, lists) {
+  const words = namedBy(phrase, lists) === "part of a thing" ? phrase.split(" ") : [""];
+  return [words.slice(0, -1).join(" "), words[words.length - 1]];
 }
 // [/page]
 
-export { namedBy, phraseKey, tidy, thingOf, tokens };
+export { namedBy, phraseKey, thingAndPart, tidy, tokens };

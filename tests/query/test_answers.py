@@ -15,14 +15,12 @@ from langsplat_core.query.answers import (
     build_regions,
     by_peak,
     by_regions,
-    chance_in,
-    own_fits,
     smoothed,
 )
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.grammar import Named
-from langsplat_core.query.lookup import Lookup, Relevancy
+from langsplat_core.query.grammar import Named, named
+from langsplat_core.query.lookup import Relevancy
 from langsplat_core.query.rule import (
     RULE,
     Bar,
@@ -33,6 +31,7 @@ from langsplat_core.query.rule import (
     decide,
     excess,
     judge,
+    on_things,
     region_fits,
 )
 from langsplat_core.query.taught import FOUND, LIKEST, NEXT, shown
@@ -50,7 +49,7 @@ from langsplat_core.scene import (
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, tree_of_wholes
 from langsplat_core.scene.surface import SMALLEST, Surface, build_surface
-from langsplat_core.semantics.relevancy import FLOOR, Scale, TextEncoder
+from langsplat_core.semantics.relevancy import FLOOR, Scale, TextEncoder, fit_of
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field
 from tests.support.scenes import chain_of_levels, random_gaussians, regions_of, unturned_gaussians
@@ -73,18 +72,18 @@ def asked(
     if rule == "peak":
         return by_peak(phrase, relevancy, gaussians.means, surface, scale, field.found, level)
     regions, calibration = regions_of(Scene(gaussians, field), surface), field.calibration
-    fewer = replace(scale, everyday=field.everyday[:9])
-    lookup = Lookup(field, fewer)
-    mixtures = regions.mixtures(lookup.features, lookup.count + 1)
-    by_chance = bars_of(regions.table, chance_in(regions.table, mixtures, lookup, fewer))
-    fits, judged = (own_fits(regions, scale, relevancy), None), (by_chance, calibration, level)
-    return by_regions(phrase, each_alone(relevancy), fits, gaussians.means, regions, *judged)
+    return by_rule(relevancy, regions, gaussians.means, scale, named(phrase), level, calibration)
 
 
-def each_alone(relevancy) -> Relevancy:
-    """(3, N) relevancy, every number as a feature of its own."""
+def by_rule(
+    relevancy, regions: Regions, means: Array, scale: Scale, sought: Named, level="auto", calibration=None
+) -> QueryResult:
+    """Answer to (3, N) relevancy, every number of which is a feature of its own."""
     values = np.append(relevancy, 0).astype(np.float32)
-    return Relevancy(values, np.arange(values.size - 1).reshape(np.shape(relevancy)))
+    of_features = Relevancy(values, np.arange(values.size - 1).reshape(np.shape(relevancy)))
+    own = scale.fit(np.concatenate(regions.means(relevancy)))
+    decision = decide(regions.table, [own], sought, level, BARS, calibration)
+    return by_regions("x", of_features, decision, means, regions)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -326,17 +325,6 @@ def spread_out(surface: Surface, regions: Regions, fits) -> Array:
     return relevancy
 
 
-PHRASES = {"thing": "mug", "part": "handle", "part of a thing": "mug handle"}
-
-
-def answer_of(
-    surface: Surface, relevancy, regions: Regions, level="auto", named: Named = "thing"
-) -> QueryResult:
-    means = np.random.default_rng(1).normal(size=(len(surface.anchors), 3))
-    fits = own_fits(regions, SCALE, np.asarray(relevancy)), None
-    return by_regions(PHRASES[named], each_alone(relevancy), fits, means, regions, BARS, None, level)
-
-
 def plain_extent(fits, sizes, level: str, named: Named) -> tuple[int, list[bool]]:
     """The level and the regions that answer."""
     solid = [n for n, size in enumerate(sizes) if size >= SMALLEST] or list(range(len(sizes)))
@@ -351,13 +339,13 @@ def plain_extent(fits, sizes, level: str, named: Named) -> tuple[int, list[bool]
 @pytest.mark.parametrize("middle", [-2.0, 0.0, 1.0])
 def test_extent_equals_that_of_the_rule_written_out(surface, level, named, middle):
     rng = np.random.default_rng(0)
-    count = len(surface.rows)
+    count, means = len(surface.rows), rng.normal(size=(N, 3))
     for _ in range(30):
         sizes = rng.integers(3, 30, 9).tolist()
         sizes = (*sizes, count - sum(sizes))
         fits = middle + rng.normal(size=(3, len(sizes)))
         regions = regions_by(surface, sizes)
-        got = answer_of(surface, spread_out(surface, regions, fits), regions, level, named)
+        got = by_rule(spread_out(surface, regions, fits), regions, means, SCALE, named, level)
         solid = np.array(sizes) >= SMALLEST  # every region has one part, all of it; of crumbs it says nothing
         fits[1:, solid] = (1 - RULE.part_share) * fits[1:, solid] + RULE.part_share * fits[:-1, solid]
         chosen, answering = plain_extent(fits, sizes, level, named)
@@ -384,10 +372,19 @@ TWO = RegionTable(np.array([[2, 2, 2]]), np.array([2, 3, 4, 5, -1, -1]), np.ones
 )
 def test_parts_are_looked_for_on_wholes_that_fit_their_thing(first, second, level, answer):
     own = np.array([1.5, 2.5, 0.0, 0.0, 0.5, 3.0])
-    thing = np.array([-2.0, -2.0, -2.0, -2.0, first, second])
-    decision = decide(TWO, own, "part of a thing", level, BARS, None, thing)
+    on = on_things(TWO, np.array([-2.0, -2.0, -2.0, -2.0, first, second]))
+    decision = decide(TWO, [own], "part of a thing", level, BARS, None, on)
     assert (decision.level, decision.inside.tolist()) == answer
-    assert decision.fits == decide(TWO, own, "part of a thing", level, BARS, None).fits
+    assert decision.fits == decide(TWO, [own], "part of a thing", level, BARS, None).fits
+    inside = decide(TWO, [own], "inside", level, BARS, None, on)  # nothing off the thing is evidence
+    assert inside.fits == pytest.approx(fit_of(np.array(decision.scores)).tolist())
+
+
+def test_part_is_chosen_by_its_phrase_and_its_own_word():
+    phrase, word = np.array([1.5, 1.0, 0.0, 0.0, 0.5, 0.5]), np.array([0.0, 2.0, 0.0, 0.0, 0.5, 0.5])
+    asked = decide(TWO, [phrase, word], "part of a thing", "auto", BARS, None, np.ones(6, bool))
+    assert asked.inside.tolist() == [False, True]
+    assert asked.fits == decide(TWO, [phrase], "part of a thing", "auto", BARS, None).fits
 
 
 # Words taught by showing, in scenes whose regions have the statistics of images: a gap between image and

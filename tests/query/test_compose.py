@@ -228,7 +228,7 @@ def test_phrasebook_answers_a_whole_phrase():
         run_phrase(engine, "lid of the mug")
 
 
-def test_part_is_cut_inside_at_the_wanted_level(table):
+def test_part_is_found_inside_at_the_wanted_level(table):
     result = run_phrase(table[0], "handle of the red mug")
     assert (result.answer.level, result.answer.phrase) == (1, "handle of the red mug")
     assert result.reading == "handle  inside  red mug"
