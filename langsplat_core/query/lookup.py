@@ -8,9 +8,9 @@ decoded once. Of other codecs every latent is a feature of its own.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import kernel, shared_workers
@@ -165,7 +165,9 @@ def decoded_relevancy(
 
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
     """Return the peak (column, row, value) of a (H, W) map's means over `window` px, edges repeated."""
-    return _middle_peak(_box_means(relevancy, max(1, min(window, *relevancy.shape))))
+    means = _box_means(relevancy, max(1, min(window, *relevancy.shape)))
+    rows, columns = np.indices(means.shape, sparse=True)
+    return _middle_peak(means, rows, columns)
 
 
 def _box_means(image: Array, window: int) -> Array:
@@ -174,27 +176,36 @@ def _box_means(image: Array, window: int) -> Array:
     return np.asarray(uniform_filter(np.asarray(image, np.float64), size=window, mode="nearest"))
 
 
-def _middle_peak(means: Array) -> tuple[int, int, float]:
-    """Return column, row and value of the highest pixel, of those as high the middle one.
+def _middle_peak(means: Array, rows: Array, columns: Array) -> tuple[int, int, float]:
+    """Return column, row and value of the highest of some pixels, of those as high the middle one.
 
     Which is higher by its last digits follows from the unit of lengths.
     """
-    rows, columns = np.divmod(np.flatnonzero(means >= means.max() - 1e-6), means.shape[1])
-    middle = ((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2).argmin()
-    row, column = int(rows[middle]), int(columns[middle])
-    return column, row, float(means[row, column])
+    tied = means >= means.max() - TIED
+    rows, columns = (np.broadcast_to(at, means.shape)[tied] for at in (rows, columns))
+    away = (rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2
+    middle = np.lexsort((columns, rows, away))[0]
+    return int(columns[middle]), int(rows[middle]), float(means[tied][middle])
 
 
+TIED = 1e-6  # means of pixels nearer than this are as high
 PLANES = 2**16  # of weights of sets in tiles, at most: 64 MB, and about three times as much of their means
-ROUNDING = 1e-5  # of means of float32 shares, generously
+
+
+class _Tiles(NamedTuple):
+    """Means of P pairs of a set and a tile, in the order of the T tiles of an image."""
+
+    starts: Array  # (T + 1,) of a tile's pairs
+    sets: Array  # (P,)
+    means: Array  # (P, PIXELS) of the set's share in alpha
+    highest: Array  # (P,) of these
 
 
 class PeakPixels:
     """Peak pixels, as of `peak_pixel`, in one view of many answers that are even over sets of Gaussians.
 
     A mean over pixels is the sum of the answer's relevancies times means of the sets' shares in alpha. These
-    are made once, in tiles; an answer then costs the tiles where its peak may be, by the highest share that
-    each set has there and by the mean of any one tile.
+    are made once, in tiles; an answer then costs the tiles where its peak may be.
     """
 
     def __init__(
@@ -222,26 +233,49 @@ class PeakPixels:
             down, along = np.nonzero(part.max((1, 3)) > 1e-9)
             at = (down + top) * columns + along + left
             found.append((at, np.full(len(at), label), part[down, :, along].reshape(-1, PIXELS)))
-        tiles, self._labels, self._means = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        order = np.argsort(tiles, kind="stable")
-        self._labels, self._means = self._labels[order], self._means[order]
-        self._starts = np.searchsorted(tiles[order], np.arange(rows * columns + 1))
-        shape = rows * columns, int(labels.max(initial=-1)) + 1
-        each = self._means.max(1), self._means.mean(1)
-        self._highest, self._typical = (csr_matrix((of, self._labels, self._starts), shape) for of in each)
-        self._images = np.empty((most, rows, TILE, columns, TILE))  # again and again: new pages take longer
+        at, sets, means = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.argsort(at, kind="stable")
+        starts, means = np.searchsorted(at[order], np.arange(rows * columns + 1)), means[order]
+        self._tiles = _Tiles(starts, sets[order], means, means.max(1))
+        self._images = np.empty((most, rows * columns, PIXELS))  # again and again: new pages take longer
 
     def of(self, values: Array) -> list[tuple[int, int, float]]:
         """(Q, L) float32 relevancies >= 0 of the sets -> columns, rows and values; Q is `most` or less."""
-        met = values[:, : self._highest.shape[1]].T
-        sure = (self._typical @ met).max(0) - ROUNDING
-        images = self._images[: len(values)]
-        images[:] = 0
-        for tile, asked in enumerate(self._highest @ met >= sure):
-            some, planes = np.flatnonzero(asked), slice(*self._starts[tile : tile + 2])
-            means = values[some[:, None], self._labels[planes]] @ self._means[planes]
-            row, column = divmod(tile, images.shape[3])
-            images[some, row, :, column] = means.reshape(-1, TILE, TILE)
+        images, peaks = self._images, np.empty((len(values), self._images.shape[1]))
+        shared_workers().run(_blend_peaks, len(values), values, self._tiles, images, peaks)
+        return [self._peak(image, peak) for image, peak in zip(images, peaks, strict=False)]
+
+    def _peak(self, image: Array, peaks: Array) -> tuple[int, int, float]:
+        """Return the peak of (T, PIXELS) means, in those of T tiles that are as high."""
         height, width = self._size
-        shape = TILE * images.shape[1], TILE * images.shape[3]
-        return [_middle_peak(image.reshape(shape)[:height, :width]) for image in images]
+        tiles, within = np.flatnonzero(peaks >= peaks.max() - TIED), np.arange(PIXELS)
+        row, column = np.divmod(tiles[:, None], -(-width // TILE))
+        rows, columns = TILE * row + within // TILE, TILE * column + within % TILE
+        inside = (rows < height) & (columns < width)
+        return _middle_peak(image[tiles][inside], rows[inside], columns[inside])
+
+
+@kernel
+def _blend_peaks(first: int, last: int, values: Array, tiles: _Tiles, images: Array, peaks: Array) -> None:
+    """Fill rows [first, last) of `peaks` (Q, T), the highest means in tiles, and of `images` (Q, T, PIXELS).
+
+    Tiles come in the order of what their peaks could be, by the highest share that each set has there. Where
+    that is lower than the image's peak it stands for the tile's own, whose row of `images` stays as it was.
+    """
+    for i in range(first, last):
+        own, best = values[i], 0.0
+        for tile in range(len(tiles.starts) - 1):
+            peaks[i, tile] = 0
+            for j in range(tiles.starts[tile], tiles.starts[tile + 1]):
+                peaks[i, tile] += own[tiles.sets[j]] * tiles.highest[j]
+        for tile in np.argsort(-peaks[i]):
+            if peaks[i, tile] < best - TIED:
+                break
+            pixels = images[i, tile]
+            pixels[:] = 0
+            for j in range(tiles.starts[tile], tiles.starts[tile + 1]):
+                value, means = own[tiles.sets[j]], tiles.means[j]
+                for k in range(PIXELS):
+                    pixels[k] += value * means[k]
+            peaks[i, tile] = pixels.max()
+            best = max(best, peaks[i, tile])

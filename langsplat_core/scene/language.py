@@ -34,7 +34,7 @@ def phrase_key(text: str) -> str:
     return " ".join(token for token in tokens(text) if token != ",").lower()
 
 
-@lru_cache(1024)  # a phrase is looked up a dozen times while it is answered
+@lru_cache(2**14)  # a phrase is looked up a dozen times while it is answered, beside thousands of others
 def tokens(text: str) -> tuple[str, ...]:
     """Words without quotes and punctuation around them, and commas, none at the end."""
     text = "".join(" " if unicodedata.category(mark) in ("Cc", "Cs") else mark for mark in _composed(text))
@@ -56,7 +56,7 @@ def _composed(text: str) -> str:
 
 def _bare(word: str) -> str:
     """`word` without punctuation around it; a possessive's apostrophe stays. "" where it is nothing else."""
-    if word == "&":
+    if word == "&" or word.isalnum():
         return word
     kinds = [unicodedata.category(mark) for mark in word]
     marks = [kind[0] in "PZ" or kind == "Cf" for kind in kinds]
