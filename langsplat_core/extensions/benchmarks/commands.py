@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from langsplat_core.cli.arguments import EncoderOption, OutFile
+from langsplat_core.cli.arguments import EncoderOption, Needs, OutFile
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.profiles import (
     GR_PROFILES,
@@ -34,9 +34,14 @@ class _Eval:
     """Names of the benchmark's scenes to score; all of them if empty."""
     json: OutFile | None = None
     """Also write all figures to this file."""
-    paper_order: bool = False
+    paper_order: Annotated[bool, Needs("is_ours", "a scene in place of --maps")] = False
     """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""
-    encoder: EncoderOption = ""
+    encoder: Annotated[EncoderOption, Needs("is_ours", "a scene in place of --maps")] = ""
+
+    @property
+    def is_ours(self) -> bool:
+        """Return True where a scene is scored, False for maps of another system."""
+        return self.maps is None
 
     def evaluate(self, read: "Callable[[Path], Benchmark]", profile: Profile) -> None:
         """Score what was given, print the tables and write the files asked for."""

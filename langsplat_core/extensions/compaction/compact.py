@@ -245,6 +245,8 @@ def compact_scene(
     """
     scene = scene_for(out, source)
     check_settings(config)
+    if photos is not None and config.assumed_psnr != type(config)().assumed_psnr:
+        raise InputError("--assumed-psnr: the loss is measured on photographs; leave it out, or --photos")
     views = choose_views(scene, photos, config, progress)
     measured = views.measured(scene)
     before, before_bytes = _stored(scene, out)
