@@ -166,8 +166,7 @@ def decoded_relevancy(
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
     """Return the peak (column, row, value) of a (H, W) map's means over `window` px, edges repeated."""
     means = _box_means(relevancy, max(1, min(window, *relevancy.shape)))
-    rows, columns = np.indices(means.shape, sparse=True)
-    return _middle_peak(means, rows, columns)
+    return _middle_peak(means, *np.ogrid[: means.shape[0], : means.shape[1]])
 
 
 def _box_means(image: Array, window: int) -> Array:
