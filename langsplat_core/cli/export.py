@@ -55,6 +55,8 @@ class Export:
     """Page to write, *.html."""
     title: str = ""
     """Heading of the page, by default the scene's name."""
+    view: str = ""
+    """Name of the camera that the page opens with, by default the first."""
     encoder: EncoderOption = ""
 
     def run(self) -> None:
@@ -67,8 +69,10 @@ class Export:
             engine = None
             if scene.language is not None:
                 engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
-            title = self.title or self.out.stem
-            report = write_page(self.out, scene, engine, title, progress)
+            first = [camera for camera in scene.cameras if self.view and camera.name == self.view][:1]
+            if self.view and not first:
+                raise InputError(f"--view {self.view}: {self.scene} has no camera of this name")
+            report = write_page(self.out, scene, engine, self.title or self.out.stem, progress, first)
         what = "any words of the scene's encoder" if report.free_text else f"{report.phrases:,} phrases"
         asked = f"nothing can be searched: {report.why_not}" if report.why_not else f"{what} can be searched"
         print(f"{self.out}: {report.gaussians:,} Gaussians, {report.bytes / 1e6:.2f} MB; {asked}")

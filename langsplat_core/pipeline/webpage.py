@@ -16,20 +16,24 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.resources import files
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 from safetensors.numpy import save
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import PictureConfig
+from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import (
     COLOUR_MAPS,
     DISPLAYS,
     HEAT_BASE,
     QUERY_COLOURS,
     STRENGTH,
+    Channels,
     shader_defines,
 )
 from langsplat_core.errors import EncoderError, InputError
@@ -43,6 +47,7 @@ from langsplat_core.query.instances import BOXED, oriented_box
 from langsplat_core.query.inventory import suggest
 from langsplat_core.query.rule import RULE
 from langsplat_core.raster.opengl import WEB, shader, splat_shaders
+from langsplat_core.raster.render import render
 from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
 from langsplat_core.semantics.clip_plain import PlainClipText
@@ -53,6 +58,7 @@ from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary
 MODULES = ("words", "rule", "encoder", "language", "data", "camera", "draw", "page")
 BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, without its imports and exports
 WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS")  # which tell a part from a thing
+STILL = 1280  # pixels of the longer side of the picture in the page
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
 CHUNK = 256  # Gaussians that share the range of a quantised column
 FLATTEST, OPAQUE = -46.0, 20.0  # bounds of the logarithm of a scale, whatever a file holds; of a logit
@@ -70,15 +76,26 @@ class PageReport:
 
 
 def write_page(
-    path: Path, scene: Scene, engine: QueryEngine | None, title: str, progress: Progress = silent
+    path: Path,
+    scene: Scene,
+    engine: QueryEngine | None,
+    title: str,
+    progress: Progress = silent,
+    first: Sequence[Camera] = (),
+    notes: Sequence[tuple[str, Sequence[float]]] = (),
 ) -> PageReport:
-    """Write `scene` as an HTML file, searched by `engine`; InputError where nothing can be drawn."""
+    """Write `scene` as an HTML file, searched by `engine`; InputError where nothing can be drawn.
+
+    first: views ahead of the scene's cameras, the first of which the page opens with. notes: texts and the
+    (3,) points that they are pinned to, in the scene's units.
+    """
     opacities = sigmoid(scene.gaussians.opacity_logits.astype(np.float64))
     rows = np.flatnonzero(scene.gaussians.valid() & (opacities >= 1 / 255))
     rows = rows[np.argsort(along_curve(scene.gaussians.means[rows]), kind="stable")]
     if len(rows) == 0:
         raise InputError(f"{scene.path}: no Gaussian of this scene can be drawn; there is nothing to export")
     centre, radius = scene.bounds()
+    seen_from = views(scene, first)
     progress("packing the Gaussians", 0.1)
     tensors = pack_gaussians(scene.gaussians.take(rows), centre)
     meta: dict[str, Any] = {
@@ -89,7 +106,16 @@ def write_page(
         "metres_per_unit": scene.metres_per_unit,
         "raster": asdict(scene.raster_settings()),
         "sh_count": scene.gaussians.sh.shape[1],
-        "views": views(scene),
+        "views": [
+            {
+                "name": camera.name or f"view {number}",
+                **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
+                "rotation": camera.rotation.ravel().tolist(),
+                "position": (camera.position - centre).tolist(),
+            }
+            for number, camera in enumerate(seen_from)
+        ],
+        "notes": [{"text": text, "at": (np.array(at) - centre).tolist()} for text, at in notes],
         "picture": {
             **asdict(PictureConfig()),
             "displays": {name: row.drawing for name, row in DISPLAYS.items()},
@@ -109,7 +135,7 @@ def write_page(
     progress("compressing", 0.8)
     plain = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     packed = zlib.compress(save(plain, {"page": json.dumps(meta, allow_nan=False)}), 9)
-    text = page_text(title, packed)
+    text = page_text(title, packed, _still(scene, seen_from[0]))
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     free = "encoder" in language
@@ -166,21 +192,12 @@ def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
     }
 
 
-def views(scene: Scene) -> list[dict[str, Any]]:
-    """Return the scene's cameras, relative to the page's origin; one that frames it where it has none."""
-    centre, _ = scene.bounds()
-    cameras: Sequence[Camera] = scene.cameras or (scene.framing_camera((1280, 800)),)
-    step = -(-len(cameras) // 200)  # bookmarks at most
-    return [
-        {
-            "name": camera.name or f"view {number}",
-            **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
-            "rotation": camera.rotation.ravel().tolist(),
-            "position": (camera.position - centre).tolist(),
-        }
-        for number, camera in enumerate(cameras)
-        if number % step == 0 and not camera.orthographic
-    ] or views(Scene(scene.gaussians))
+def views(scene: Scene, first: Sequence[Camera]) -> tuple[Camera, ...]:
+    """Return the views of a page: `first` and the scene's cameras; without any, one that frames it."""
+    step = -(-len(scene.cameras) // 200)  # views at most
+    others = (camera for camera in scene.cameras[:: step or 1] if camera not in first)
+    kept = tuple(camera for camera in (*first, *others) if not camera.orthographic)
+    return kept or (scene.framing_camera((1280, 800)),)
 
 
 def page_shaders() -> dict[str, list[str]]:
@@ -297,7 +314,15 @@ def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any
 # The file.
 
 
-def page_text(title: str, data: bytes) -> str:
+def _still(scene: Scene, camera: Camera) -> bytes:
+    """Return a JPEG of a view, which is seen until the scene is drawn, and where it cannot be."""
+    image, jpeg = render(scene, camera.within(STILL)), BytesIO()
+    pixels = compose(Channels(image.colours, image.alpha, None), PictureConfig())
+    Image.fromarray(pixels).save(jpeg, "JPEG", quality=85)
+    return jpeg.getvalue()
+
+
+def page_text(title: str, data: bytes, still: bytes) -> str:
     """Return the HTML file, whose policy lets only its own script run, and nothing be fetched."""
     folder = files("langsplat_core") / "web"
     modules = [folder.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES]
@@ -315,6 +340,7 @@ def page_text(title: str, data: bytes) -> str:
         "TITLE": html.escape(title),
         "STYLE": style,
         "SCRIPT": script,
+        "STILL": base64.b64encode(still).decode(),
         "DATA": base64.b64encode(data).decode(),
     }
     page = folder.joinpath("page.html").read_text(encoding="utf-8")

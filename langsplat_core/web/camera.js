@@ -18,6 +18,13 @@ function turned(vector, axis, angle) {
   return vector.map((value, i) => value * cosine + side[i] * sine + axis[i] * along);
 }
 
+// The rotation that looks ahead, with down as near as can be, of the six numbers of both directions.
+function upright(directions) {
+  const ahead = unit(directions.slice(3));
+  const right = unit(cross(directions.slice(0, 3), ahead));
+  return [...right, ...cross(ahead, right), ...ahead];
+}
+
 // Pixels of a camera in which a point is seen, and its depth.
 function project(camera, point) {
   const [x, y, z] = axes(camera).map((axis) => inner(axis, add(point, camera.position, -1)));
@@ -26,12 +33,16 @@ function project(camera, point) {
 
 const STEP = 24; // pixels of a drag that a press of an arrow key is worth
 const FLIGHT = 700; // ms
+const FLYING = { w: [2, 1], s: [2, -1], a: [0, -1], d: [0, 1] }; // axis of the camera, and direction
+const SPEED = 0.6; // radii a second
+const TURN = 60; // pixels of a drag a second, of the turntable
 
 class Controls {
   // changed(): called when the camera has another pose. free(): left, top, width and height of what no panel
   // covers, pixels of CSS.
   constructor(element, { radius, up }, free, changed) {
     Object.assign(this, { element, radius, up, free, changed, moving: 0, pointers: new Map() });
+    this.held = new Set(); // keys that fly, while they are pressed
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
     element.addEventListener("pointerdown", (event) => this.down(event));
     element.addEventListener("pointermove", (event) => this.move(event));
@@ -48,6 +59,8 @@ class Controls {
     );
     element.addEventListener("contextmenu", (event) => event.preventDefault());
     element.addEventListener("keydown", (event) => this.key(event));
+    addEventListener("keyup", (event) => this.held.delete(event.key));
+    addEventListener("blur", () => this.held.clear());
   }
 
   // The camera that fills the window, at so many pixels for one of CSS: the bookmark's whole image lies in
@@ -106,10 +119,43 @@ class Controls {
       this.zoom(1.15);
     } else if (event.key === "-") {
       this.zoom(1 / 1.15);
+    } else if (FLYING[event.key]) {
+      this.held.add(event.key);
+      this.run();
     } else {
       return;
     }
     event.preventDefault();
+  }
+
+  // Turn the scene on and on, or no longer; returns which.
+  spin() {
+    this.spinning = !this.spinning;
+    this.run();
+    return this.spinning;
+  }
+
+  // Move by the time that passes, image by image, while the scene turns or a key is held.
+  run(last = performance.now()) {
+    if (this.running) {
+      return;
+    }
+    this.running = requestAnimationFrame(() => {
+      const now = performance.now();
+      const seconds = Math.min((now - last) / 1000, 0.2);
+      this.running = 0;
+      if (this.spinning && !this.pointers.size) {
+        this.orbit(-TURN * seconds, 0);
+      }
+      for (const [axis, side] of Array.from(this.held, (key) => FLYING[key])) {
+        const { rotation, position } = this.view;
+        this.moving++;
+        this.pose(rotation, add(position, axes(this.view)[axis], side * SPEED * this.radius * seconds));
+      }
+      if (this.spinning || this.held.size) {
+        this.run(now);
+      }
+    });
   }
 
   pose(rotation, position) {
@@ -159,10 +205,18 @@ class Controls {
     return add(this.view.position, axes(this.view)[2], this.distance);
   }
 
-  // Go to a view; its pivot is as far ahead as the middle of the scene.
-  go(view, distance = 0) {
+  // Go to a view, or to where it was moved: position, direction down, direction ahead, and distance of the
+  // pivot, which else is as far ahead as the middle of the scene.
+  go(view, moved = null) {
+    if (moved) {
+      const rotation = upright(moved.slice(3, 9));
+      return this.fly(
+        { ...view, rotation, position: moved.slice(0, 3) },
+        Math.max(moved[9], 0.05 * this.radius),
+      );
+    }
     const ahead = view.rotation.slice(6, 9);
-    this.fly(view, distance || Math.max(-inner(view.position, ahead), 0.3 * this.radius));
+    this.fly(view, Math.max(-inner(view.position, ahead), 0.3 * this.radius));
   }
 
   // Look at a box's (8, 3) corners from where the camera stands, as near as they fill half of the view.
@@ -193,9 +247,7 @@ class Controls {
       const time = Math.min((now - begun) / FLIGHT, 1);
       const share = time * time * (3 - 2 * time);
       const mixed = add(from.rotation, add(view.rotation, from.rotation, -1), share);
-      const ahead = unit(mixed.slice(6, 9));
-      const right = unit(cross(mixed.slice(3, 6), ahead));
-      const rotation = [...right, ...cross(ahead, right), ...ahead];
+      const rotation = upright(mixed.slice(3));
       const position = add(from.position, add(view.position, from.position, -1), share);
       this.view = time === 1 ? view : { ...view, rotation, position };
       this.changed();

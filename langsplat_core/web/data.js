@@ -20,13 +20,23 @@ const KINDS = {
 };
 
 // Tensors by name as { values, shape }, half floats as single ones, and the JSON that lies beside them.
-async function readPage(text) {
+// unpacked(share): called with how much of it is read.
+async function readPage(text, unpacked) {
   const letters = atob(text.trim());
   const packed = new Uint8Array(letters.length);
   for (let i = 0; i < letters.length; ++i) {
     packed[i] = letters.charCodeAt(i);
   }
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  let read = 0;
+  const counted = new TransformStream({
+    transform(chunk, controller) {
+      read += chunk.length;
+      unpacked(read / packed.length);
+      controller.enqueue(chunk);
+    },
+  });
+  const deflated = new Blob([packed]).stream().pipeThrough(counted);
+  const stream = deflated.pipeThrough(new DecompressionStream("deflate"));
   const buffer = await new Response(stream).arrayBuffer();
   const size = Number(new DataView(buffer).getBigUint64(0, true));
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, size)));

@@ -14,7 +14,8 @@ const DISPLAYS = { rgb: "Colours", relevancy: "Relevancy", segmentation: "Found"
 const OF_ANSWERS = ["relevancy", "segmentation"]; // displays that need one
 const HEATS = { smooth: "Smoothed", own: "Each Gaussian", node: "Each node", everywhere: "Everywhere" };
 const OUTCOMES = { found: "found", "weak match": "weak", "not here": "none" }; // their styles
-const KEYS = { c: "rgb", r: "relevancy", s: "segmentation", l: "latent" };
+const KEYS = { c: "rgb", r: "relevancy", f: "segmentation", l: "latent" };
+const BUTTONS = { t: "spin", p: "picture", b: "boxes" };
 const SLOW = 60; // ms of an image while the camera moves, above which fewer pixels are drawn until it rests
 const COARSEST = 0.3;
 const REST = 180; // ms
@@ -47,13 +48,16 @@ class Page {
       () => this.free(),
       () => this.moved(),
     );
+    byId("panel").hidden = false;
     this.fill();
     this.listenToSearch();
     this.listenToButtons();
     addEventListener("resize", () => this.redraw());
     addEventListener("keydown", (event) => this.key(event));
-    this.update();
-    this.view(0);
+    addEventListener("hashchange", () => this.open());
+    addEventListener("beforeprint", () => this.paint());
+    this.panel(true);
+    this.open();
   }
 
   // Fill the panel by what the scene has.
@@ -157,7 +161,20 @@ class Page {
     byId("views").addEventListener("change", () => this.view(+byId("views").value));
     byId("before").addEventListener("click", () => this.view(this.current - 1));
     byId("after").addEventListener("click", () => this.view(this.current + 1));
-    byId("show").addEventListener("click", () => this.panel(true));
+    byId("fold").addEventListener("click", () => this.panel(byId("controls").hidden));
+    byId("full").hidden = !document.fullscreenEnabled;
+    byId("full").addEventListener("click", () =>
+      document.fullscreenElement ? document.exitFullscreen() : document.body.requestFullscreen(),
+    );
+    byId("picture").addEventListener("click", () => this.save());
+    byId("spin").addEventListener("click", () => {
+      byId("spin").ariaPressed = String(this.controls.spin());
+    });
+    let { matches: light } = matchMedia("(prefers-color-scheme: light)");
+    byId("theme").addEventListener("click", () => {
+      light = !light;
+      document.documentElement.style.colorScheme = light ? "light" : "dark";
+    });
   }
 
   key(event) {
@@ -168,19 +185,18 @@ class Page {
     if (event.key === "[" || event.key === "]") {
       this.view(this.current + (event.key === "]" ? 1 : -1));
     } else if (event.key === "h") {
-      this.panel(byId("panel").hidden);
+      this.panel(byId("controls").hidden);
+    } else if (BUTTONS[event.key]) {
+      byId(BUTTONS[event.key]).click();
     } else if (!this.language) {
       return;
     } else if (event.key === "/") {
-      this.panel(true);
       byId("phrase").focus();
       byId("phrase").select();
     } else if ("0123".includes(event.key)) {
       this.choose("levels", ["auto", ...this.meta.language.levels][event.key]);
     } else if (KEYS[event.key]) {
       this.choose("displays", KEYS[event.key]);
-    } else if (event.key === "b") {
-      byId("boxes").click();
     } else {
       return;
     }
@@ -189,18 +205,66 @@ class Page {
 
   // Left, top, width and height of what the panel does not cover: it lies at the left, on phones below.
   free() {
-    const { right, top, width } = byId("panel").getBoundingClientRect();
-    if (!width) {
-      return [0, 0, innerWidth, innerHeight];
-    }
+    const { right, top } = byId("panel").getBoundingClientRect();
     return right < 0.6 * innerWidth ? [right, 0, innerWidth - right, innerHeight] : [0, 0, innerWidth, top];
   }
 
+  // Fold or unfold all of the panel but its title and the search.
   panel(shown) {
-    byId("panel").hidden = !shown;
-    byId("show").hidden = shown;
-    (shown ? byId("phrase") : byId("show")).focus();
+    byId("controls").hidden = !shown;
+    byId("fold").ariaExpanded = String(shown);
+    byId("fold").ariaLabel = shown ? "Fold the panel" : "Unfold the panel";
     this.redraw();
+  }
+
+  // What the address says after "#": phrase, level, display, view and, where it is another, the pose; what it
+  // leaves out is as at first.
+  state() {
+    const { phrase, level, display, current } = this;
+    const { rotation, position } = this.controls.view;
+    const own = this.meta.views[current];
+    const said = { phrase, level, show: display, view: current || "" };
+    if (position.some((length, i) => length !== own.position[i]) || rotation !== own.rotation) {
+      const numbers = [...position, ...rotation.slice(3), this.controls.distance];
+      said.at = numbers.map((number) => +number.toPrecision(6));
+    }
+    const told = Object.entries(said).filter(([, value]) => !["", "auto", "rgb"].includes(value));
+    return `#${new URLSearchParams(told)}`;
+  }
+
+  // Say in the address what is shown: as a step that the browser goes back from, or in place of the last one.
+  remember(step) {
+    this.address = this.state();
+    if (this.address === (location.hash || "#")) {
+      return;
+    }
+    if (step) {
+      location.hash = this.address;
+    } else {
+      location.replace(this.address);
+    }
+  }
+
+  // Show what the address says.
+  open() {
+    if (location.hash === this.address) {
+      return;
+    }
+    const said = new URLSearchParams(location.hash.slice(1));
+    const [level, show, view] = ["level", "show", "view"].map((name) => said.get(name));
+    this.level = Object.hasOwn(LEVELS, level) ? level : "auto";
+    this.display = "rgb";
+    if (this.language) {
+      this.take((said.get("phrase") ?? "").slice(0, 400));
+      this.display =
+        Object.hasOwn(DISPLAYS, show) && (this.answer || !OF_ANSWERS.includes(show)) ? show : "rgb";
+    }
+    this.update();
+    const numbers = (said.get("at") ?? "").split(",").map(Number);
+    this.current = this.meta.views[view] ? +view : 0;
+    byId("views").value = this.current;
+    const known = numbers.length === 10 && numbers.every((number) => Math.abs(number) < 1e6);
+    this.controls.go(this.meta.views[this.current], known ? numbers : null);
   }
 
   // Options under the search box; the arrow keys mark one, which enter then asks.
@@ -229,6 +293,11 @@ class Page {
   }
 
   search(phrase) {
+    this.take(phrase);
+    this.remember(true);
+  }
+
+  take(phrase) {
     byId("phrase").value = phrase;
     byId("clear").hidden = !phrase;
     this.offer([]);
@@ -264,13 +333,12 @@ class Page {
   choose(what, value) {
     if (what === "levels") {
       this.level = value;
-      return this.ask();
+      this.ask();
+    } else if (!document.querySelector(`#displays [value=${value}]`).disabled) {
+      this.display = value;
+      this.update();
     }
-    if (document.querySelector(`#displays [value=${value}]`).disabled) {
-      return;
-    }
-    this.display = value;
-    this.update();
+    this.remember(true);
   }
 
   // Bring panel and values of the Gaussians up to date with phrase, level and display.
@@ -424,6 +492,7 @@ class Page {
     this.current = (number + views.length) % views.length;
     byId("views").value = this.current;
     this.controls.go(views[this.current]);
+    this.remember(true);
   }
 
   moved() {
@@ -437,14 +506,37 @@ class Page {
     }
     this.asked = requestAnimationFrame(() => {
       this.asked = 0;
-      const camera = this.controls.camera(devicePixelRatio * this.share);
-      this.painter.sort(camera);
       const began = performance.now();
-      this.painter.paint(camera, this.appearance());
-      this.draw();
+      this.paint();
+      if (this.painter.drawn) {
+        byId("still").hidden = true;
+      }
       if (this.moving) {
         this.keepUp(began);
       }
+    });
+  }
+
+  paint() {
+    const camera = this.controls.camera(devicePixelRatio * this.share);
+    this.painter.sort(camera);
+    this.painter.paint(camera, this.appearance());
+    this.draw();
+  }
+
+  // Save what is seen, with its boxes, as a PNG.
+  save() {
+    const image = element("canvas");
+    const scene = byId("scene");
+    this.paint();
+    Object.assign(image, { width: scene.width, height: scene.height });
+    for (const layer of [scene, byId("marks")].filter(({ hidden }) => !hidden)) {
+      image.getContext("2d").drawImage(layer, 0, 0, image.width, image.height);
+    }
+    image.toBlob((blob) => {
+      const href = URL.createObjectURL(blob);
+      element("a", "", { href, download: `${this.meta.title}.png` }).click();
+      URL.revokeObjectURL(href);
     });
   }
 
@@ -459,6 +551,7 @@ class Page {
     this.rest = setTimeout(
       () => {
         Object.assign(this, { share: 1, moving: false });
+        this.remember(false);
         this.redraw();
       },
       Math.max(REST, 2 * taken),
@@ -468,7 +561,8 @@ class Page {
   // Boxes over the image, in pixels of the screen.
   draw() {
     const canvas = byId("marks");
-    canvas.hidden = !this.shown.length || !byId("boxes").checked; // a cleared one may stay on screen
+    const { notes } = this.meta;
+    canvas.hidden = !(this.shown.length || notes.length) || !byId("boxes").checked; // a cleared one may stay
     if (canvas.hidden) {
       return;
     }
@@ -480,6 +574,12 @@ class Page {
     }
     const context = canvas.getContext("2d");
     context.clearRect(0, 0, width, height);
+    for (const { text, at } of notes) {
+      const seen = project(camera, at);
+      if (seen[2] >= this.meta.raster.near) {
+        this.tag(context, text, [seen], dots);
+      }
+    }
     for (const [rank, corners] of this.shown.entries()) {
       const seen = Array.from({ length: 8 }, (_, k) =>
         project(camera, Array.from(corners.slice(3 * k, 3 * k + 3))),
@@ -523,12 +623,13 @@ class Page {
 // For scripts: `await langsplat` has `ask(phrase, level)`, an answer without anything shown, and `image(camera,
 // display, phrase)`, the bytes of an image of that camera's size, drawn as soon as its order is known.
 globalThis.langsplat = (async () => {
-  const { tensors, meta } = await readPage(byId("data").textContent);
+  const { tensors, meta } = await readPage(byId("data").textContent, (share) => {
+    byId("loading").textContent = `Unpacking the scene: ${Math.round(100 * share)} %`;
+  });
   byId("data").remove();
   meta.maps = tensors.colour_maps.values;
-  byId("panel").hidden = false;
   const page = new Page(meta, tensors);
-  byId("loading").remove();
+  byId("welcome").remove();
   const image = async (camera, display = "rgb", phrase = "") => {
     Object.assign(page, { display, phrase, level: "auto", answer: null });
     if (page.language) {
@@ -544,7 +645,8 @@ globalThis.langsplat = (async () => {
   return { page, image, ask: (phrase, level) => page.language.ask(phrase, level) };
 })();
 globalThis.langsplat.catch((error) => {
-  byId("loading").textContent = `This scene cannot be shown. ${error.message}`;
+  byId("loading").textContent = error.message;
+  byId("welcome").className += " failed";
   throw error;
 });
 // [/page]

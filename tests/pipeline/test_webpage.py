@@ -5,12 +5,14 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib.resources import files
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import moderngl
 import numpy as np
 import pytest
+from PIL import Image
 
 from langsplat_core.arrays import Array, psnr, unit
 from langsplat_core.cli.app import parse
@@ -278,16 +280,19 @@ def test_markup_in_names_is_shown_as_text(browser, demo, engine, tmp_path):
     scene, other = without_encoder(demo, phrasebook={MARKUP: vector, "laptop": vector}, taught=(word,))
     scene = replace(scene, cameras=tuple(replace(camera, name=MARKUP) for camera in demo.cameras[:3]))
     path = tmp_path / "a.html"
-    write_page(path, scene, other, MARKUP + "{{DATA}}{{SCRIPT}}")
+    first, notes = [replace(demo.cameras[4], name="here")], [(MARKUP, (0.0, 0.0, 0.0))]
+    write_page(path, scene, other, MARKUP + "{{DATA}}{{SCRIPT}}", first=first, notes=notes)
     with open_tab(browser, path) as tab:
         assert tab.page.title() == MARKUP + "{{DATA}}{{SCRIPT}}"
         assert MARKUP in tab.page.inner_text("h1")
+        assert tab.page.locator("#views option").all_inner_texts() == ["here", *[MARKUP] * 3]
+        assert tab.page.locator("#marks").is_visible()  # the note
         for phrase in (MARKUP, name):
             tab.page.fill("#phrase", phrase[:6])
             assert tab.page.locator("#list li").count() > 0
             tab.page.fill("#phrase", phrase)
             tab.page.press("#phrase", "Enter")
-        assert tab.page.locator("img").count() == 0
+        assert tab.page.locator("img").count() == 1  # that of the first view
         assert tab.page.locator("script").count() == 1  # the data's is gone once it is read
         # Should text ever become markup, the page's policy still runs none of it and fetches nothing.
         tab.run("markup => document.body.insertAdjacentHTML('beforeend', markup)", MARKUP)
@@ -344,8 +349,13 @@ def test_keyboard_alone_searches_and_moves(browser: Any, thin: Path) -> None:
         keys.press("Shift+ArrowLeft")
         keys.press("+")
         turned = tab.run(STATE)
+        keys.down("w")
+        tab.page.wait_for_timeout(200)
+        keys.up("w")
+        flown = np.subtract(tab.run(STATE)["position"], turned["position"])
+        np.testing.assert_allclose(unit(flown), turned["rotation"][6:], atol=1e-6)  # ahead
         np.testing.assert_allclose(np.linalg.det(np.reshape(turned["rotation"], (3, 3))), 1, atol=1e-9)
-        for key, display in (("l", "latent"), ("s", "segmentation"), ("c", "rgb")):
+        for key, display in (("l", "latent"), ("f", "segmentation"), ("c", "rgb")):
             keys.press(key)
             assert tab.run(STATE)["display"] == display
         keys.press("3")
@@ -423,6 +433,95 @@ def test_page_draws_coarsely_however_slow_it_is(browser: Any, thin: Path) -> Non
         widths = tab.run("() => widths")
         assert min(widths) < 0.5
         assert sum(width == 1 for width in widths) <= 3  # at first, and at rest
+
+
+@pytest.mark.parametrize("size", [(390, 844), (844, 390), (1280, 720)])
+def test_panel_folds_and_leaves_room_for_the_scene(browser: Any, thin: Path, size: tuple[int, int]) -> None:
+    width, height = size
+    with open_tab(browser, thin, viewport={"width": width, "height": height}) as tab:
+        tab.run("async () => (await langsplat).page.search('teddy bear')")
+        panel, button = tab.page.locator("#panel"), tab.page.locator("#fold")
+        heights = []
+        for opened in ("true", "false", "true"):
+            assert button.get_attribute("aria-expanded") == opened
+            assert tab.page.locator("#phrase").is_visible()
+            box = panel.bounding_box()
+            assert box["y"] >= 0
+            assert box["y"] + box["height"] <= height
+            assert box["width"] < 0.5 * width or box["y"] >= 0.6 * height - 8  # a sheet from below
+            heights.append(box["height"])
+            button.click()
+        assert heights[1] < 150
+        assert heights[0] == heights[2] > 150
+
+
+STARTED = """addEventListener("DOMContentLoaded", () => {
+  globalThis.said = [];
+  const seen = () => said.push([document.getElementById("loading")?.textContent, document.images.length]);
+  new MutationObserver(seen).observe(document, { subtree: true, childList: true, characterData: true });
+});"""
+WITHOUT_GL = "HTMLCanvasElement.prototype.getContext = () => null"
+
+
+@pytest.mark.parametrize("missing", ["JavaScript", "WebGL 2"])
+def test_page_shows_a_picture_and_what_to_do_without(browser: Any, thin: Path, missing: str) -> None:
+    context = browser.new_context(offline=True, java_script_enabled=missing != "JavaScript")
+    context.add_init_script(WITHOUT_GL)
+    page = context.new_page()
+    page.goto(thin.as_uri())
+    page.locator("#help").wait_for(state="visible")
+    assert missing in page.inner_text("#welcome")
+    assert page.locator("#panel").is_hidden()
+    seen = np.asarray(Image.open(BytesIO(page.locator("#still").screenshot())).convert("RGB"))
+    assert seen.std() > 20
+    context.close()
+
+
+def test_page_says_how_much_is_unpacked_before_its_first_image(browser: Any, thin: Path) -> None:
+    context = browser.new_context(offline=True)
+    context.add_init_script(STARTED)
+    tab = Tab(context.new_page())
+    tab.open(thin)
+    said = tab.run("() => said")
+    shares = [int(found[1]) for text, _ in said if (found := re.search(r"(\d+) %", text or ""))]
+    assert shares == sorted(shares)
+    assert shares[-1] == 100
+    assert all(pictures == 1 for text, pictures in said if text)
+    tab.page.locator("#still").wait_for(state="hidden")
+    context.close()
+
+
+def test_address_opens_exactly_what_is_shown(browser: Any, thin: Path) -> None:
+    ask = "async (phrase) => (await langsplat).page.search(phrase)"
+    with open_tab(browser, thin, reduced_motion="reduce", viewport={"width": 320, "height": 240}) as tab:
+        assert "#" not in tab.page.url
+        tab.page.keyboard.press("]")
+        tab.run(ask, "toy duck & <b>")
+        tab.run(ask, "teddy bear")
+        tab.page.keyboard.press("f")
+        tab.page.focus("#scene")
+        tab.page.keyboard.press("ArrowLeft")
+        tab.page.wait_for_function("() => location.hash.includes('at=')")
+        link, shown = tab.page.url, tab.run(STATE)
+        tab.page.go_back()
+        tab.page.wait_for_function("async () => (await langsplat).page.display === 'relevancy'")
+        tab.page.go_back()
+        tab.page.wait_for_function("() => document.getElementById('phrase').value === 'toy duck & <b>'")
+        tab.page.go_forward()
+        tab.page.wait_for_function("() => document.getElementById('phrase').value === 'teddy bear'")
+        hostile = "#view=99&show=__proto__&level=constructor&at=1,2,NaN,1,1,1,1,1,1,1e999&phrase=%00%FF"
+        for address, expected in ((link, shown), (thin.as_uri() + hostile, None), (link, shown)):
+            tab.page.goto("about:blank")
+            tab.page.goto(address)
+            state = tab.run(STATE)
+            if expected is not None:
+                assert (state["display"], state["current"]) == ("segmentation", 1)
+                assert tab.page.inner_text("#verdict").startswith("found")
+                np.testing.assert_allclose(state["position"], shown["position"], rtol=1e-5, atol=1e-6)
+                np.testing.assert_allclose(state["rotation"], shown["rotation"], atol=1e-5)
+            else:
+                assert (state["display"], state["current"]) == ("rgb", 0)
+        assert tab.faults == []
 
 
 def test_page_hides_boxes_with_their_answer(browser: Any, thin: Path) -> None:

@@ -26,7 +26,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer import output
 from langsplat_viewer.actions.editing import adopt, has_selection
 from langsplat_viewer.actions.settings import ask_for, folder_of
-from langsplat_viewer.actions.viewpoint import path_motion
+from langsplat_viewer.actions.viewpoint import bookmarked_view, path_motion
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import say_compiling
@@ -102,17 +102,24 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
 
 
 def save_page(viewer: Viewer, folder: Path = Path()) -> None:
-    """Have the scene, without what was deleted, written as a web page that can be searched, a new file."""
-    state = viewer.state
-    if not viewer.has_scene("write its web page") or state.scene is None:
+    """Have the scene, without what was deleted, written as a web page that can be searched, a new file.
+
+    It opens with the current view, and has the bookmarks and notes.
+    """
+    state, session = viewer.state, viewer.state.session
+    if not viewer.has_scene("write its web page") or not (state.scene and state.view and state.extent):
         return
     scene, kept = replace(state.scene, language=viewer.language), state.marks.kept
+    stands = {"as exported": replace(state.view, orthographic=False)}
+    stands |= {bookmark.name: bookmarked_view(bookmark, state.extent) for bookmark in session.bookmarks}
+    first = [replace(view.camera(*state.size), name=name) for name, view in stands.items()]
+    notes = [(note.text, note.at) for note in session.notes]
 
     def work(progress: Progress) -> tuple[Path, str]:
         path = _new_file(viewer, folder, ".html")
         left = scene if kept.all() else scene.take(np.flatnonzero(kept))
         engine = viewer.services.engine(left) if left.language is not None else None
-        report = write_page(path, left, engine, path.stem, progress)
+        report = write_page(path, left, engine, path.stem, progress, first, notes)
         return path, f"saved {path}: {report.bytes / 1e6:.1f} MB, opens in any browser"
 
     _record(viewer, "web page", work)
