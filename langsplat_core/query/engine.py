@@ -29,7 +29,7 @@ from langsplat_core.query.answers import (
     chance_in,
 )
 from langsplat_core.query.grammar import STOP_WORDS, check_names, named, only, thing_and_part
-from langsplat_core.query.instances import Instance, find_instances
+from langsplat_core.query.instances import Instance, find_instances, find_wholes
 from langsplat_core.query.lookup import Lookup, Relevancy, through_cells
 from langsplat_core.query.rule import Bars, bars_of, decide, on_things
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
@@ -198,9 +198,13 @@ class QueryEngine:
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """Return the things among the members of an answer, best first, or only so many of them."""
-        relevancy, whole = result.relevancy[result.level], len(LEVELS) - 1
-        told = self.tree.voted_wholes, result.level == whole
-        return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most, *told)
+        wholes, join = self.tree.voted_wholes, result.level == len(LEVELS) - 1
+        members, even, gaussians = result.members, result.even, self.scene.gaussians
+        if join and wholes is not None:
+            found = find_wholes(gaussians, members, even, wholes, at_most)
+            if found is not None:
+                return found
+        return find_instances(self.surface, gaussians, members, even, at_most, wholes, join)
 
     # What answers stand on: each is computed when first needed.
 

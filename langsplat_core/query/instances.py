@@ -9,7 +9,7 @@ from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import plain
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.language import NO_NODE
-from langsplat_core.scene.surface import Surface
+from langsplat_core.scene.surface import FAINTEST, Surface, surface_weights
 
 INNER = (0.02, 0.98)  # a box holds the points between these quantiles of each coordinate: strays do not count
 COARSE = np.radians(np.arange(0.0, 90.0, 10.0))  # beginning with 0: of equal areas the principal axes stay
@@ -159,37 +159,74 @@ def find_instances(
     many of the best. Crumbs are left out, unless all are: then the largest alone is kept.
     """
     every = np.flatnonzero(members)
-    numbers = surface.anchors[every]
+    numbers, labels = surface.anchors[every], np.full(len(every), -1)
     near = numbers >= 0
     rows, numbers = every[near], numbers[near]
     visible = surface.rows[numbers] == rows
     if not visible.any():
         return ()
     parts = told_apart(surface, numbers[visible], wholes, join)
-    counts, values = np.array(list(map(len, parts))), plain(relevancy)
-    starts = np.cumsum(counts) - counts
-    scores = np.maximum.reduceat(surface.smooth(values, np.concatenate(parts)), starts)
+    counts = np.array(list(map(len, parts)))
+    smoothed = surface.smooth(plain(relevancy), np.concatenate(parts))
     label_of = np.full(len(surface.rows), -1)
     label_of[np.concatenate(parts)] = np.repeat(np.arange(len(parts)), counts)
-    labels = label_of[numbers]  # -1: faint ones beside something else
-    sizes = _extent(gaussians, every)
-    extents = np.bincount(labels + 1, sizes[near], len(parts) + 1)[1:]
+    labels[near] = label_of[numbers]  # -1: faint ones beside something else
+    scores = np.maximum.reduceat(smoothed, np.cumsum(counts) - counts)
+    own = [surface.rows[np.sort(part)] for part in parts]
+    return _ranked(gaussians, every, labels, own, scores, relevancy, at_most)
+
+
+def find_wholes(
+    gaussians: Gaussians, members: Array, even: Array, wholes: Array, at_most: int | None = None
+) -> tuple[Instance, ...] | None:
+    """Return the instances among `members` that are voted wholes, as `find_instances` does.
+
+    even: (N,) in [0, 1], the same in all of a region. No surface is needed. None where one is of no whole.
+    """
+    every = np.flatnonzero(members)
+    seen, owner = surface_weights(gaussians)[every] > 0, wholes[every]
+    if (owner[seen] == NO_NODE).any():
+        return None
+    own = [every[seen & (owner == whole)] for whole in np.unique(owner[seen])]
+    if not own:
+        return ()
+    label_of = np.full(int(wholes.max()) + 2, -1)  # the last: of no whole
+    label_of[[wholes[rows[0]] for rows in own]] = np.arange(len(own))
+    labels = np.where(gaussians.valid()[every], label_of[owner], -1)
+    return _ranked(gaussians, every, labels, own, np.array([even[rows].max() for rows in own]), even, at_most)
+
+
+def _ranked(
+    gaussians: Gaussians,
+    every: Array,
+    labels: Array,
+    parts: list[Array],
+    scores: Array,
+    relevancy: Array,
+    at_most: int | None,
+) -> tuple[Instance, ...]:
+    """Return instances of P parts on the surface, given as rows, near ones near each other.
+
+    every: (K,) rows of all members; labels: (K,) part of each, -1 for none; scores: (P,).
+    """
+    sizes, counts = _extent(gaussians, every), np.array(list(map(len, parts)))
+    extents = np.bincount(labels + 1, sizes, len(parts) + 1)[1:]
     found = []
     kept = np.flatnonzero((counts >= CRUMB_COUNT) & (extents >= CRUMB_SHARE * extents.max()))
     kept = kept if len(kept) else np.array([int(extents.argmax())])
     ranked = kept[np.lexsort((-extents[kept], -np.round(scores[kept] / EQUAL_SCORES)))]
     for part in ranked[:at_most]:
-        share = extents[part] / max(sizes.sum(), 1e-300)
-        own = parts[part]  # on the surface
-        weights = surface.weights[own].astype(np.float64)
+        own = parts[part]
+        weights = np.maximum(sigmoid(gaussians.opacity_logits[own].astype(np.float64)), FAINTEST)
         weights /= weights.sum()
+        points = gaussians.means[own].astype(np.float64)
         thing = Instance(
-            members=rows[labels == part],
+            members=every[labels == part],
             score=float(scores[part]),
-            mean=float(weights @ values[surface.rows[own]]),
-            centre=weights @ surface.positions[own],
-            points=surface.positions[np.sort(own)[:: -(-len(own) // BOXED)]],  # near ones have near numbers
-            share=float(share),
+            mean=float(weights @ relevancy[own]),
+            centre=weights @ points,
+            points=points[:: -(-len(own) // BOXED)],
+            share=float(extents[part] / max(sizes.sum(), 1e-300)),
         )
         found.append(thing)
     return tuple(found)

@@ -12,7 +12,13 @@ from scipy.sparse.csgraph import connected_components
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError
 from langsplat_core.query import instances, selection
-from langsplat_core.query.instances import OrientedBox, axis_aligned_box, find_instances, oriented_box
+from langsplat_core.query.instances import (
+    OrientedBox,
+    axis_aligned_box,
+    find_instances,
+    find_wholes,
+    oriented_box,
+)
 from langsplat_core.query.selection import (
     Projected,
     Regions,
@@ -512,6 +518,28 @@ def test_voted_wholes_divide_touching_instances():
     members[15:26] = False
     assert counts(members, wholes, True) == [10, 29, 30]
     assert counts(members, wholes, False) == [10, 14, 15, 30]
+
+
+def test_wholes_are_found_without_a_surface():
+    gaussians, number = balls([60, 200, 90, 4])
+    gaussians.opacity_logits[::10] = -6.0  # faint
+    gaussians.means[7, 0] = np.nan
+    even, wholes, members = (
+        np.array([0.7, 0.9, 0.8, 0.8])[number],
+        np.array([4, 2, 9, 5])[number],
+        number > -1,
+    )
+    members[70:80] = False
+    wanted = find_instances(build_surface(gaussians), gaussians, members, even, None, wholes, True)
+    found = find_wholes(gaussians, members, even, wholes)
+    assert [thing.members.tolist() for thing in found] == [thing.members.tolist() for thing in wanted]
+    for field in ("score", "mean", "centre", "share"):
+        pairs = [(getattr(a, field), getattr(b, field)) for a, b in zip(found, wanted, strict=True)]
+        np.testing.assert_allclose(*zip(*pairs, strict=True), rtol=1e-5)
+    assert len(find_wholes(gaussians, members, even, wholes, 2)) == 2
+    assert find_wholes(gaussians, ~members & (number == 2), even, wholes) == ()
+    wholes[3] = -1
+    assert find_wholes(gaussians, members, even, wholes) is None
 
 
 def test_equal_scores_are_ranked_by_size():
