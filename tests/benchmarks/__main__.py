@@ -6,7 +6,7 @@ from typing import Union
 from langsplat_core.cli.arguments import Runnable, with_codec
 from langsplat_core.cli.run import main, parsed
 from tests.benchmarks.answers import Lifting, Rooms, Verdicts
-from tests.benchmarks.extensions import Changed, Clean, Found, Maps, Meshes
+from tests.benchmarks.extensions import Changed, Clean, Maps, Meshes
 from tests.benchmarks.few import Few
 from tests.benchmarks.phrases import Counts, Phrases
 from tests.benchmarks.scale import Formats, Scale
@@ -19,7 +19,7 @@ def parse(args: list[str]) -> Runnable:
     about = "Measure this project where the truth is known, and at large sizes."
     known = (
         *(Rooms, Verdicts, Phrases, Counts, Clean, Maps, Meshes),
-        *(Lifting, Scale, Found, Changed, Formats, Few),
+        *(Lifting, Scale, Changed, Formats, Few),
     )
     reports = tuple(with_codec(report, args) for report in known)
     command: Runnable = parsed(PROGRAM, Union[(*reports,)], args, about)

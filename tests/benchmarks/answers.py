@@ -4,14 +4,15 @@
   one that makes no mistake;
 * lifting: methods from masks to answers: the paper's with and without its autoencoder, its training from both
   starts, lifted CLIP vectors behind every codec, and ours with one part taken out;
-* verdicts: accept and reject rates, and how well probabilities are calibrated.
+* verdicts: accept and reject rates, how well probabilities are calibrated, how often chance fits as well, and
+  things that are shown in one room and asked for in another.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass, field, replace
-from itertools import pairwise, product
+from itertools import pairwise, permutations, product
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -21,7 +22,7 @@ import numpy as np
 from assets.making.dataset import PHRASE_KINDS, Region
 from assets.making.objects import EVERYTHING
 from assets.making.world import TIERS, Tier, part_words
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.cli.arguments import OutFile
 from langsplat_core.config import (
     AutoencoderConfig,
@@ -39,7 +40,8 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import PARTS, forms, is_part
-from langsplat_core.scene import Calibration, Fits
+from langsplat_core.query.rule import IN_SPREADS, RULE
+from langsplat_core.scene import Calibration, Fits, TaughtWord
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from tests.benchmarks.room import HOLD_OUT, InRooms, MaskOrigin, Room, Seeds, Variant, publish
 from tests.benchmarks.scoring import (
@@ -311,6 +313,10 @@ PAIRS = {  # what is looked for -> the kinds of phrases that are there and that 
     "part": ("part", "absent part"),
     "inside": ("part of thing", "absent part of thing"),
 }
+SHOWN = {
+    "thing shown elsewhere": ("shown", "absent shown")
+}  # what answers by likeness, without a calibration
+MARGINS = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0)  # spreads above what counts as found
 
 
 @dataclass(frozen=True)
@@ -322,15 +328,21 @@ class Verdicts(InRooms):
     codec: CodecConfig = field(default_factory=CodebookConfig)
     fit: OutFile | None = None
     """Fit the encoder's calibration to these rooms and write it into this reading.json; measure elsewhere."""
+    by_chance: bool = False  # judge as where no calibration is known
+    taught: bool = False  # also show every thing in one room and ask for it in all others
 
     def run(self) -> None:
         variant = Variant("the method", self.masks, codec=self.codec)
-        rows = self.each(lambda room: measure_verdicts(room, variant))
+        rows = self.each(lambda room: measure_verdicts(room, variant, self.by_chance))
+        if self.taught:
+            rows += ask_elsewhere(self.each(lambda room: [show_things(room, variant)]))
         if self.fit is not None:
             calibration = fit_calibration(rows)
             write_calibration(self.fit, calibration)
             print(f"{self.fit}: {calibration}")
-        tables = "\n".join([verdict_table(rows), *(curve_table(rows, asked) for asked in PAIRS)])
+        tables = "\n".join(
+            [verdict_table(rows), *(curve_table(rows, asked) for asked in PAIRS), chance_table(rows)]
+        )
         publish(self, "verdicts", "Verdicts: accept and reject rates, and calibration", tables, rows)
 
 
@@ -339,20 +351,24 @@ class Verdict:
     tier: str
     seed: int
     text: str
-    kind: str  # one of those in `PAIRS`, or "colour+object"
+    kind: str  # one of those in `PAIRS` and `SHOWN`, or "colour+object"
     fits: Fits  # of the best region of each level
     probability: float | None
     found: bool
-    excess: float | None = None  # spreads above chance; None where the verdict is not reached by these
+    excess: float | None = None  # spreads above what is found; None where the verdict is not reached by these
 
 
-def _excess(answer: QueryResult) -> float | None:
-    return answer.judgement.margin if answer.judgement.reached == "chance" else None
+def _verdict(room: Room, text: str, kind: str, answer: QueryResult) -> Verdict:
+    excess = answer.judgement.margin if answer.judgement.reached in IN_SPREADS else None
+    return Verdict(room.tier, room.seed, text, kind, answer.fits, answer.probability, answer.found, excess)
 
 
-def measure_verdicts(room: Room, variant: Variant) -> list[Verdict]:
+def measure_verdicts(room: Room, variant: Variant, by_chance: bool = False) -> list[Verdict]:
     """Every phrase of one room, present and absent, asked of the field of a variant."""
     engine = room.engine(variant)
+    if by_chance:
+        field = replace(engine.field, calibration=None)
+        engine = QueryEngine(replace(engine.scene, language=field), lambda _: room.encoder)
     parts, absent_parts = _part_words(room)
     asked = [(p.text, p.kind) for p in room.truth.phrases if p.kind in ("object", "colour+object")]
     asked += product(room.truth.absent(EVERYTHING), ["absent"])
@@ -361,10 +377,39 @@ def measure_verdicts(room: Room, variant: Variant) -> list[Verdict]:
     answers = engine.run_many([text for text, _ in asked])
     said = [(text, kind, answer) for (text, kind), answer in zip(asked, answers, strict=True)]
     said += [(text, kind, run_phrase(engine, text).answer) for text, kind in _inside(room, engine)]
-    return [
-        Verdict(room.tier, room.seed, text, kind, one.fits, one.probability, one.found, _excess(one))
-        for text, kind, one in said
-    ]
+    return [_verdict(room, *one) for one in said]
+
+
+@dataclass(frozen=True, eq=False)
+class Showing:
+    """A room with what was shown there: one thing of every name, by the vector of the name."""
+
+    room: Room
+    engine: QueryEngine
+    shown: Mapping[bytes, TaughtWord]
+    there: AbstractSet[bytes]  # vectors of everything that anything in the room is called by
+
+
+def show_things(room: Room, variant: Variant) -> Showing:
+    engine, shown = room.engine(variant), dict[bytes, TaughtWord]()
+    for number, region in room.truth.regions.items():
+        members = room.labels[-1] == number
+        known = region.level == "whole" and region.thing and not engine.unknown_words(region.thing)
+        if known and members.sum() >= MIN_GAUSSIANS:
+            vector = engine.text_vectors([region.thing]).tobytes()
+            if vector not in shown:
+                shown[vector] = engine.teach(region.thing, members, "whole")
+    _, vectors = engine.known_vectors(sorted(room.truth.words))
+    return Showing(room, engine, shown, {vector.tobytes() for vector in vectors})
+
+
+def ask_elsewhere(rooms: Sequence[Showing]) -> Iterator[Verdict]:
+    """Everything that was shown in one room, asked of each other one."""
+    for here, other in permutations(rooms, 2):
+        for vector, word in here.shown.items():
+            other.engine.taught = {word.key: word}
+            kind = "shown" if vector in other.there else "absent shown"
+            yield _verdict(other.room, word.name, kind, other.engine.run(word.name))
 
 
 def _part_words(room: Room) -> tuple[list[str], list[str]]:
@@ -430,7 +475,7 @@ def verdict_table(rows: Sequence[Verdict]) -> str:
     at = (f"accepted at {100 * share:.0f} % rejected" for share in SHARES)
     head = ("tier", "asked for", "phrases", "accepted %", "absent rejected %", "ROC area %", *at)
     lines = []
-    asked = {"thing": PAIRS["thing"], "colour + thing": ("colour+object", "absent"), **PAIRS}
+    asked = {"thing": PAIRS["thing"], "colour + thing": ("colour+object", "absent"), **PAIRS, **SHOWN}
     for tier, own in grouped(rows, "tier").items():
         for name, pair in asked.items():
             here = [row for row in own if row.kind in pair]
@@ -495,3 +540,14 @@ def curve_table(rows: Sequence[Verdict], asked: str = "thing") -> str:
         for p in curve(rows, asked)
     )
     return markdown((f"probability of a {asked} said", "phrases", "mean said %", "there %"), lines)
+
+
+def chance_table(rows: Sequence[Verdict]) -> str:
+    """Markdown: the share of phrases for nothing here that fit so well, beside what is said of them."""
+    at_bar, slope = RULE.by_chance
+    lines = [("said", "", *(f"{100 * sigmoid(logit(np.array(at_bar)) - slope * x):.1f}" for x in MARGINS))]
+    for asked, (_, absent) in PAIRS.items():
+        own = np.array([row.excess for row in rows if row.kind == absent and row.excess is not None])
+        if len(own):
+            lines.append((asked, str(len(own)), *(f"{100 * np.mean(own >= x):.1f}" for x in MARGINS)))
+    return markdown(("absent %, by spreads above the bar", "phrases", *map(str, MARGINS)), lines)

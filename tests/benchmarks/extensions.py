@@ -1,7 +1,6 @@
 """Reports on what else is made of rooms whose truth is known.
 
 * maps, meshes, clean: occupied and free cells, surfaces, and floaters found and removed;
-* found: the first pass of a search over many scenes against the engine's own answers;
 * changed: two captures of one room compared, unchanged and with things moved, removed, brought and painted,
   against what was done.
 """
@@ -11,8 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from statistics import median
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -31,15 +28,6 @@ from langsplat_core.extensions.geometry.mesh import fuse
 from langsplat_core.extensions.geometry.occupancy import find_occupancy, floor_map, map_axes
 from langsplat_core.extensions.geometry.planes import find_room
 from langsplat_core.extensions.library.changes import Change, changes
-from langsplat_core.extensions.library.index import (
-    digest,
-    fits_in,
-    read_library,
-    write_library,
-)
-from langsplat_core.io.scenes import save_scene
-from langsplat_core.query.grammar import named
-from langsplat_core.query.rule import judge, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import join_gaussians
@@ -295,62 +283,6 @@ def _judged(scene: Scene, judging: list[tuple[Any, ...]]) -> float:
 
 
 # Search over many scenes.
-
-
-@dataclass(frozen=True)
-class Found(InRooms):
-    """Every phrase in every room by the index alone, against the engine."""
-
-    masks: tuple[MaskOrigin, ...] = ("truth", "graph")  # where outlines come from
-
-    def run(self) -> None:
-        rows = self.each(lambda room: [row for masks in self.masks for row in compare(room, masks)])
-        text = agreement_table(rows)
-        publish(self, "library", "Search over many scenes", text, [row for row in rows if row.far])
-
-
-@dataclass(frozen=True)
-class Compared:
-    seed: int
-    masks: str
-    text: str
-    index: str  # verdict
-    engine: str
-    error: float  # largest difference of a fit, spreads
-
-    @property
-    def far(self) -> bool:
-        """Return whether the verdicts differ."""
-        return self.index != self.engine
-
-
-def compare(room: Room, masks: MaskOrigin) -> Iterator[Compared]:
-    """All phrases that are there and that are not."""
-    engine = room.engine(Variant("the method", masks))
-    with TemporaryDirectory() as folder:
-        path = Path(folder, "scene.ply")
-        save_scene(path, replace(engine.scene, cameras=tuple(room.held_out)))
-        write_library(Path(folder, "index"), [digest(path, path.name, lambda _: room.encoder)])
-        group = read_library(Path(folder, "index"), Path(folder)).groups[0]
-        for answer in engine.run_many([text for text in room.texts if not engine.unknown_words(text)]):
-            (fits,), (common,) = fits_in(group, engine.text_vectors([answer.phrase])[0])
-            scene, kind = group.scenes[0], named(answer.phrase)
-            judged = scene.bars, scene.calibration, float(common)
-            verdict = judge(triple(fits), kind, "auto", *judged).outcome
-            error = float(np.abs(fits - answer.fits).max())
-            yield Compared(room.seed, masks, answer.phrase, verdict, answer.verdict, error)
-
-
-def agreement_table(rows: Sequence[Compared]) -> str:
-    lines = []
-    for masks, own in grouped(rows, "masks").items():
-        there = [row for row in own if row.engine != "not here"]
-        missed = sum(row.index == "not here" for row in there)
-        errors = [row.error for row in own]
-        counts = (len(own), len(there), missed, sum(row.far for row in own))
-        lines.append((masks, *counts, f"{median(errors):.4f}", f"{max(errors):.4f}"))
-    names = ["masks", "asked", "found or weak", "missed", "other verdict", "median error", "largest error"]
-    return markdown(names, lines)
 
 
 # What changed between two captures of a room.

@@ -38,11 +38,14 @@ from tests.benchmarks.answers import (
     Lifting,
     Rooms,
     Verdict,
+    ask_elsewhere,
+    chance_table,
     curve,
     curve_table,
     measure_methods,
     measure_verdicts,
     method_table,
+    show_things,
     variants,
     verdict_table,
 )
@@ -374,6 +377,12 @@ def test_calibration_curve_weighs_present_and_absent_alike():
     assert curve([row("object", None)]) == []
 
 
+def test_chance_table_counts_absent_phrases_above_the_bar():
+    rows = [replace(row(kind, None), excess=x) for kind in ("absent", "object") for x in (-3, -1, 0, 0.7)]
+    assert cells(chance_table(rows), 2)[2:] == ["74.2", "28.0", "12.5", "5.0", "1.9", "0.7"]
+    assert cells(chance_table(rows), 3) == ["thing", "4", "75.0", "75.0", "50.0", "50.0", "25.0", "0.0"]
+
+
 def test_verdicts_write_tables_and_a_calibration(tmp_path, monkeypatch):
     rows = [
         Verdict("clutter", 301, "x", kind, tuple(m), float(sigmoid(20 * np.float64(m[2]))), m[2] > 0.1)
@@ -575,6 +584,11 @@ def test_every_number_of_a_report_has_a_range(name):
 def test_verdicts_and_phrases_measure_the_same_room(run, tmp_path):
     rows = measure_verdicts(run.room, Variant("the method", "truth", codec=TINY.codec))
     assert {"object", "absent", "part", "absent part"} <= {row.kind for row in rows}
+    rows = measure_verdicts(run.room, Variant("the method", "truth", codec=TINY.codec), by_chance=True)
+    assert all(row.excess is not None and row.probability is None for row in rows)
+    rows = list(ask_elsewhere([show_things(run.room, Variant("the method", "truth", codec=TINY.codec))] * 2))
+    assert {row.kind for row in rows} == {"shown"}
+    assert np.mean([row.found for row in rows]) > 0.5
     rows = measure_counts(run.room, Variant("the method", "truth", codec=TINY.codec))
     assert {row.score.way for row in rows} == {"published", "ours"}
     assert {min(row.true, 2) for row in rows} == {0, 1, 2}
