@@ -5,9 +5,9 @@ Core functions take a `Progress`; the command line and the window supply one eac
 
 import json
 import logging
+import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 log = logging.getLogger("langsplat")
@@ -76,9 +76,8 @@ class WorkCancelledError(Exception):
     """Raised by a `Progress` to stop the work; what was stored so far stays valid."""
 
 
-@contextmanager
-def line_progress() -> Iterator[Progress]:
-    """Show progress to other programs: a line of JSON on stderr for every new report.
+def line_progress() -> Progress:
+    """Return progress for other programs: a line of JSON on stderr for every new report.
 
     ``{"stage": "training", "fraction": 0.2, "note": "step 9", "metrics": {"loss": 0.03}}``
     """
@@ -94,13 +93,16 @@ def line_progress() -> Iterator[Progress]:
             last = line
             print(line, file=sys.stderr, flush=True)
 
-    yield Progress(show)
+    return Progress(show)
+
+
+AS_LINES = "LANGSPLAT_PROGRESS"  # environment: "lines", as the window asks of the commands that it runs
 
 
 class TerminalProgress:
-    """Progress as one bar per stage on stderr, a context manager."""
+    """Progress on stderr, a context manager: one bar per stage, or lines for other programs."""
 
-    def __init__(self) -> None:
+    def __init__(self, lines: bool = False) -> None:
         from rich.console import Console  # a tenth of a second that nothing else needs
         from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as RichBar
@@ -116,9 +118,10 @@ class TerminalProgress:
         )
         self._tasks: dict[str, TaskID] = {}
         self._stage = ""  # the last one
+        self._lines = lines or os.environ.get(AS_LINES) == "lines"
 
     def __enter__(self) -> Progress:
-        return Progress(self._show)
+        return line_progress() if self._lines else Progress(self._show)
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         if error is None:

@@ -25,7 +25,7 @@ from langsplat_core.config import AutoencoderConfig, TrainConfig, check_settings
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.train import train_scene
-from langsplat_core.progress import Progress, Report, TerminalProgress, line_progress
+from langsplat_core.progress import Progress, Report, TerminalProgress
 from langsplat_core.scene import Scene
 from tests.support.processes import bound_by_permissions, files_of_at_most, refusal
 from tests.support.scenes import random_gaussians
@@ -71,7 +71,7 @@ def test_a_long_line_keeps_its_ends() -> None:
 
 
 def test_progress_as_lines_for_other_programs(capsys):
-    with line_progress() as progress:
+    with TerminalProgress(lines=True) as progress:
         progress("a\n", 0.25, "one", loss=0.25)
         progress("a\n", 0.2501, "one", loss=0.250001)
         progress("b", 7.0)

@@ -122,6 +122,11 @@ def _step(step: editing.Step, act: editing.Action, *keys: str) -> Command:
     return Command(step, act, keys, repeats=True, is_edit=True, apart=step == "undo", now=now)
 
 
+def _export_as(title: str) -> Command:
+    act = partial(saving.ask_export, title=title)
+    return Command(f"export: {title} ...", act, now=lambda viewer: f"{title} ...")
+
+
 def _side(side: Side, key: str) -> Command:
     where = {"top": "above", "bottom": "below"}.get(side, f"the {side}")
     return Command(f"look from {where}", lambda viewer: viewpoint.look_from(viewer, side), (key,))
@@ -189,7 +194,6 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("save the project as ...", saving.save_as, ("Ctrl+Shift+S",)),
         Command("save a picture", saving.save_picture, ("P",), "Save picture", icon="CAMERA", apart=True),
         Command("save the view", saving.save_view, (), "Save view"),
-        Command("export a web page that can be searched", saving.save_page),
         Command("save a picture of the film's size", saving.save_sized_picture, (), "Picture of this size"),
         Command("save a film of the path", saving.save_film, (), "Save film"),
         Command("save the camera path", saving.save_path, (), "Save path"),
@@ -310,6 +314,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("larger text", lambda v: settings.scale_text(v, 0.25), apart=True),
         Command("smaller text", lambda v: settings.scale_text(v, -0.25)),
     ),
+    "Export": tuple(map(_export_as, saving.exports())),  # in the menu File
     "": tuple(_panel(title) for title in PANEL_TITLES),
     "Help": (
         Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),
@@ -352,7 +357,13 @@ SYNONYMS = {
     "start page": "home welcome recent close demo example bundled",
     "train a scene": "photographs photos images video reconstruct create make new colmap",
     "save a picture": "screenshot image png export capture snapshot render photo",
-    "export a web page that can be searched": "save html browser share website offline",
+    "export: web page ...": "save html browser share website offline",
+    "export: scene ...": "save convert format ply spz sog gltf splat write as",
+    "export: cleaned copy ...": "floaters remove tidy",
+    "export: compacted copy ...": "compress smaller prune shrink reduce",
+    "export: mesh ...": "triangles surface glb geometry print",
+    "export: map for a robot ...": "occupancy ros navigation voxels collider",
+    "export: labels ...": "segmentation classes instances annotations",
     "save a film of the path": "video movie mp4 gif webp animation export record render",
     "quit": "exit close leave end",
     "search": "find query ask phrase text words language where",

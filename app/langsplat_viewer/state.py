@@ -1,7 +1,7 @@
 """The viewer's state: the session, what follows from it, and what the window shows beside the scene."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
@@ -181,6 +181,16 @@ class TrainingForm:
     gaussians: str = ""  # a scene that gets a language field; empty: its Gaussians are trained, too
 
 
+@dataclass(frozen=True)
+class ExportForm:
+    """Fields of the dialog that exports."""
+
+    title: str  # of what is written, see `actions.saving.EXPORTS`
+    suffix: str  # of the file, "" for a folder
+    values: Mapping[str, float] = field(default_factory=dict)  # of options of the command line, True where on
+    only_selected: bool = False
+
+
 Gizmo = Literal["off", "move", "rotate", "scale", "box"]
 
 
@@ -289,6 +299,7 @@ class ViewerState(SceneState):
 
     training_form: TrainingForm = field(default_factory=TrainingForm)
     edit_form: EditForm = field(default_factory=EditForm)
+    export_form: ExportForm | None = None  # while the dialog is open
     drafts: dict[str, str] = field(default_factory=dict)  # half-typed texts of the panels, by their boxes
     messages: list[Message] = field(default_factory=list)
     echoes: bool = False  # what is said is said in the terminal, too: the process is to end

@@ -5,14 +5,14 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, Protocol, TypeVar
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError, printable_line
-from langsplat_core.progress import Progress, Report
+from langsplat_core.progress import AS_LINES, Progress, Report
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
 from langsplat_core.scene import LanguageField, Scene
@@ -30,11 +30,11 @@ KEPT = 20  # lines of what it says that are kept
 
 
 @dataclass(eq=False)
-class TrainingProgress:
-    """Progress of a training run. Written by the listening thread, read by the window's."""
+class ProcessProgress:
+    """Progress of a command. Written by the listening thread, read by the window's."""
 
     stages: dict[str, float] = field(default_factory=dict)  # name -> fraction in [0, 1], in their order
-    losses: list[float] = field(default_factory=list)  # of the Gaussians, as far as they are trained
+    losses: list[float] = field(default_factory=list)  # of a training, as far as it is
     said: list[str] = field(default_factory=list)  # lines that are no progress, the latest last
 
     def hear(self, line: str) -> None:
@@ -52,38 +52,40 @@ class TrainingProgress:
             self.losses = [*self.losses, loss]
 
 
-def command(form: TrainingForm) -> list[str]:
-    """Return the command line of a training, of this interpreter or of the program in a one-folder build."""
-    program = [sys.executable, "-m", "langsplat_core"]
+def program() -> list[str]:
+    """Return what runs `langsplat`: this interpreter, or the program in a one-folder build."""
     if getattr(sys, "frozen", False):
-        program = [str(Path(sys.executable).with_stem("langsplat"))]
+        return [str(Path(sys.executable).with_stem("langsplat"))]
+    return [sys.executable, "-m", "langsplat_core"]
+
+
+def command(form: TrainingForm) -> list[str]:
+    """Return the command line of a training."""
     return [
-        *(*program, "train", form.dataset, "--out", form.out),
-        *("--preset", form.preset, "--clip.model", form.encoder, "--progress", "lines"),
+        *(*program(), "train", form.dataset, "--out", form.out),
+        *("--preset", form.preset, "--clip.model", form.encoder),
         *("--radiance.checkpoint-every", str(PREVIEW_EVERY)),
         *(("--gaussians", form.gaussians) if form.gaussians else ()),
     ]
 
 
-class Training:
-    """Training in a process of its own, and its progress."""
+class CommandProcess:
+    """A command of `langsplat` in a process of its own, and its progress."""
 
-    def __init__(self, form: TrainingForm, wake: Callable[[], None]) -> None:
+    def __init__(self, words: Sequence[str], wake: Callable[[], None]) -> None:
         """`wake` is called from another thread when there is news. OSError where it cannot be started."""
-        self.out = Path(form.out)
-        self.progress = TrainingProgress()
+        self.progress = ProcessProgress()
         self.interrupted = False
-        self.previewed: Stamps = ()  # the checkpoint that is looked at
         self._wake = wake
         # Ctrl-C in the terminal is the window's; the process gets its own signal from `interrupt`.
         self.process = subprocess.Popen(
-            command(form),
+            words,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             errors="backslashreplace",
-            env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            env=os.environ | {"PYTHONUNBUFFERED": "1", AS_LINES: "lines"},
             start_new_session=True,
         )
         assert self.process.stdout is not None
@@ -115,6 +117,15 @@ class Training:
             self.process.wait(patience)
         except subprocess.TimeoutExpired:
             self.process.kill()
+
+
+class Training(CommandProcess):
+    """Training in a process of its own."""
+
+    def __init__(self, form: TrainingForm, wake: Callable[[], None]) -> None:
+        super().__init__(command(form), wake)
+        self.out = Path(form.out)
+        self.previewed: Stamps = ()  # the checkpoint that is looked at
 
 
 T = TypeVar("T")

@@ -4,7 +4,7 @@ import contextlib
 import io
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -16,7 +16,7 @@ from langsplat_core.cli.run import one_line
 from langsplat_core.config import PAPER, TrainConfig, TrainPreset, TrainProfile, check_settings, with_preset
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.io.hostile import read_text
-from langsplat_core.progress import Progress, TerminalProgress, line_progress, silent
+from langsplat_core.progress import TerminalProgress, silent
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,8 @@ class Train:
         from langsplat_core.pipeline.train import train_scene
 
         processes = join_processes()
-        lines = self.progress == "lines"
-        shown: AbstractContextManager[Progress] = line_progress() if lines else TerminalProgress()
-        with shown if processes.is_main else nullcontext(silent) as progress:
+        shown = TerminalProgress(self.progress == "lines") if processes.is_main else nullcontext(silent)
+        with shown as progress:
             report = train_scene(
                 self.dataset,
                 self.out,

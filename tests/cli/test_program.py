@@ -291,11 +291,11 @@ REPORTS = """
 import logging, sys
 from dataclasses import dataclass
 from langsplat_core.cli.run import main, parsed
-from langsplat_core.progress import line_progress, TerminalProgress
+from langsplat_core.progress import TerminalProgress
 @dataclass(frozen=True)
 class Reports:
     def run(self):
-        for progress in (line_progress(), TerminalProgress()):
+        for progress in (TerminalProgress(lines=True), TerminalProgress()):
             with progress as report:
                 report("working", 0.5)
         logging.getLogger("langsplat").warning("a warning")

@@ -13,7 +13,7 @@ from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.inventory import Suggestions
 from langsplat_core.semantics.features import ImageFeatures
-from langsplat_viewer.actions import editing, opening, settings, viewpoint
+from langsplat_viewer.actions import editing, opening, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import from_side
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.panels import select
@@ -415,6 +415,25 @@ def pin_a_note(s: Any) -> None:
         assert len(s.state.session.notes) == left
     opening.open_file(s.viewer, s.folder / "blobs-001.langsplat")
     s.until(lambda: s.state.session.notes == (note,))
+
+
+def export_from_the_menu(s: Any) -> None:
+    """A dialog asks for format and file, and says the size first; the scene is written meanwhile."""
+    s.ctx.item_click("//**/##MenuBar/File")
+    s.ctx.item_click("//$FOCUSED/Export")
+    s.click("//**/Scene ...")
+    s.click("//Export/.spz")
+    s.shot("export")
+    s.click("//Export/Export ...", frames=4)
+    s.key("enter", frames=2)
+    assert s.viewer.recorder.current is not None
+    s.until((s.folder / "blobs-scene-001.spz").exists)
+    assert len(load_scene(s.folder / "blobs-scene-001.spz").gaussians) == 360
+    for leave in (lambda: s.click("//Export/Cancel"), lambda: s.key("escape", frames=3)):
+        saving.ask_export(s.viewer, "mesh")
+        s.rest(3)
+        leave()
+        assert s.state.export_form is None
 
 
 def reload_what_changed(s: Any) -> None:

@@ -1,5 +1,7 @@
 """Selecting, hiding, deleting, transforming and cropping; and what is asked before edits are lost."""
 
+import sys
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -8,16 +10,18 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
+from langsplat_core.cli.app import parse
 from langsplat_core.errors import InputError
-from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import look_at
 from langsplat_core.scene.transform import AXES, IDENTITY, moving, rotating, scaling
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.actions.editing import take
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
+from langsplat_viewer.projects import BUNDLED
 from langsplat_viewer.session import Move
-from langsplat_viewer.state import EditForm, QueryAnswer
+from langsplat_viewer.state import EditForm, ExportForm, QueryAnswer
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
 from tests.support.windowless import (
     SCENES,
@@ -313,13 +317,77 @@ def kept_in(folder: Path) -> int:
     return len(load_scene(folder / "blobs-edited-001.ply").gaussians)
 
 
-def test_web_page_is_written_by_the_window(pruned, tmp_path):
-    saving.save_page(pruned, tmp_path)
+def form_of(viewer, title: str, **values: object) -> ExportForm:
+    """The dialog's fields as they are at first, but for `values`."""
+    saving.ask_export(viewer, title)
+    return replace(viewer.state.export_form, **values)
+
+
+@pytest.mark.parametrize("title", saving.EXPORTS)
+def test_exports_are_commands_of_the_command_line(opened, title):
+    row, form = saving.EXPORTS[title], form_of(opened, title)
+    assert title in saving.exports()
+    switches = [option.flag for option in row.options if option.default is False]
+    values = [f"{flag}={value:g}" for flag, value in form.values.items() if flag not in switches]
+    for suffix in row.sizes:
+        words = row.words.format(scene="a.ply", out=f"b{suffix}").split()
+        parse([*words, *values, *switches, *(["--encoder=demo"] if row.asks else [])])
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb", ".splat"])
+def test_export_size_is_said_before_it_is_written(viewer, tmp_path, suffix):
+    viewer.services = replace(viewer.services, load_scene=load_scene)
+    open_scene(viewer, BUNDLED)
+    said, unit = saving.export_size(viewer, form_of(viewer, "scene", suffix=suffix)).split()[1:]
+    save_scene(tmp_path / f"a{suffix}", viewer.state.scene, tell=False)
+    written = sum(path.stat().st_size for path in tmp_path.iterdir())
+    assert float(said) == pytest.approx(written / 1e6, rel=0.1)
+    assert unit == "MB"
+
+
+@pytest.mark.parametrize(
+    ("title", "name", "what"),
+    [("web page", "a.html", "opens in any browser"), ("scene", "a.spz", "240 Gaussians")],
+)
+def test_edited_scene_is_exported(pruned, tmp_path, title, name, what):
+    saving.run_export(pruned, form_of(pruned, title, suffix=Path(name).suffix), tmp_path / name)
     recorded(pruned)
     said = pruned.state.messages[-1]
-    assert said.file == tmp_path / "blobs-001.html"
-    assert "opens in any browser" in said.text
-    assert said.file.read_text().startswith("<!doctype html>")
+    assert said.file == tmp_path / name
+    assert f"saved {tmp_path / name}" in said.text
+    assert what in said.text
+
+
+SLOW = "import sys, time; print(sys.argv, flush=True); time.sleep(60)"
+FAILS = "import sys; sys.exit('langsplat: no cameras; mend that')"
+
+
+def test_cancelled_export_ends_its_command(opened, tmp_path, monkeypatch):
+    monkeypatch.setattr(saving, "program", lambda: [sys.executable, "-c", SLOW])
+    began = time.monotonic()
+    saving.run_export(opened, form_of(opened, "mesh"), tmp_path / "a.glb")
+    opened.recorder.cancel()
+    recorded(opened)
+    assert time.monotonic() - began < 30
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_failed_export_of_a_command_says_why(opened, tmp_path, monkeypatch):
+    monkeypatch.setattr(saving, "program", lambda: [sys.executable, "-c", FAILS])
+    saving.run_export(opened, form_of(opened, "mesh"), tmp_path / "a.glb")
+    recorded(opened)
+    assert errors(opened) == ["no cameras; mend that"]
+    saving.run_export(opened, form_of(opened, "scene"), opened.state.path)
+    recorded(opened)
+    assert "would replace the original scene" in errors(opened)[-1]
+
+
+def test_export_of_nothing_or_without_a_field_is_refused(viewer, opened):
+    assert "no Gaussians" in saving.export_problem(opened, form_of(opened, "mesh", only_selected=True))
+    open_scene(viewer, "plain.ply")
+    assert "langsplat train" in saving.export_problem(viewer, form_of(viewer, "labels"))
+    saving.choose_export(viewer)
+    assert viewer.state.choice is None
 
 
 def test_export_writes_parts_with_their_field(pruned, tmp_path):

@@ -20,7 +20,7 @@ from langsplat_viewer import viewer as training_process
 from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.disk import IN_TRAINING, PREVIEW, write_preview
 from langsplat_viewer.state import TrainingForm
-from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, command
+from langsplat_viewer.viewer import PREVIEW_EVERY, ProcessProgress, command
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
 from tests.support.windowless import SCENES, act, errors, open_scene, settle
@@ -144,14 +144,14 @@ def test_training_command_is_parsed_by_the_program():
     words = command(TrainingForm("photos", "s.ply", "quick", "demo", "trained.ply"))
     assert words[1:3] == ["-m", "langsplat_core"]
     parsed = parse(words[3:])
-    assert (parsed.dataset, parsed.out, parsed.progress) == (Path("photos"), Path("s.ply"), "lines")
+    assert (parsed.dataset, parsed.out) == (Path("photos"), Path("s.ply"))
     assert (parsed.config.radiance.steps, parsed.config.clip.model) == (500, "demo")
     assert parsed.config.radiance.checkpoint_every == PREVIEW_EVERY
     assert parsed.gaussians == Path("trained.ply")
 
 
 def test_other_output_is_kept_as_words():
-    progress = TrainingProgress()
+    progress = ProcessProgress()
     for line in ("plain words\n", '{"stage": 3}', '"text"', "", "[1]", '{"stage": "a", "fraction": 0.5}'):
         progress.hear(line)
     assert progress.said == ["plain words", '{"stage": 3}', '"text"', "[1]"]
@@ -162,7 +162,7 @@ def test_other_output_is_kept_as_words():
 
 
 def test_loss_is_heard_once_per_report():
-    progress = TrainingProgress()
+    progress = ProcessProgress()
     for fraction, loss in ((0.0, {}), (0.1, {"loss": 0.25}), (0.11, {"loss": 0.25}), (0.2, {"loss": 0.125})):
         progress.hear(json.dumps({"stage": "training Gaussians", "fraction": fraction, "metrics": loss}))
     assert progress.losses == [0.25, 0.125]

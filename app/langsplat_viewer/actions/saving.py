@@ -6,22 +6,26 @@ Everything goes to new files, never over old ones, but a project to the file tha
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from concurrent.futures import wait
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
 
+from langsplat_core import registry
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.cameras import write_cameras
-from langsplat_core.io.scenes import save_scene
+from langsplat_core.io.scenes import check_keeps, save_scene, scene_files
 from langsplat_core.io.shapes import write_points
 from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.progress import Progress
+from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
 from langsplat_viewer.actions.editing import adopt, has_selection
@@ -42,8 +46,8 @@ from langsplat_viewer.projects import (
 )
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.session import Bookmark, Session
-from langsplat_viewer.state import FileChoice, Leaving, flight_of
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.state import ExportForm, FileChoice, Leaving, flight_of
+from langsplat_viewer.viewer import CommandProcess, Viewer, program
 
 
 def _new_file(viewer: Viewer, folder: Path, suffix: str, more: str = "") -> Path:
@@ -99,30 +103,6 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
         return path, f"saved {path}"
 
     _record(viewer, f"picture of {width} x {height}", work)
-
-
-def save_page(viewer: Viewer, folder: Path = Path()) -> None:
-    """Have the scene, without what was deleted, written as a web page that can be searched, a new file.
-
-    It opens with the current view, and has the bookmarks and notes.
-    """
-    state, session = viewer.state, viewer.state.session
-    if not viewer.has_scene("write its web page") or not (state.scene and state.view and state.extent):
-        return
-    scene, kept = replace(state.scene, language=viewer.language), state.marks.kept
-    stands = {"as exported": replace(state.view, orthographic=False)}
-    stands |= {bookmark.name: bookmarked_view(bookmark, state.extent) for bookmark in session.bookmarks}
-    first = [replace(view.camera(*state.size), name=name) for name, view in stands.items()]
-    notes = [(note.text, note.at) for note in session.notes]
-
-    def work(progress: Progress) -> tuple[Path, str]:
-        path = _new_file(viewer, folder, ".html")
-        left = scene if kept.all() else scene.take(np.flatnonzero(kept))
-        engine = viewer.services.engine(left) if left.language is not None else None
-        report = write_page(path, left, engine, path.stem, progress, first, notes)
-        return path, f"saved {path}: {report.bytes / 1e6:.1f} MB, opens in any browser"
-
-    _record(viewer, "web page", work)
 
 
 def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
@@ -234,6 +214,231 @@ def finish_writing(viewer: Viewer) -> None:
     """Wait until what is being written is there: the window closes, and the worker's thread ends with it."""
     if viewer.state.writing is not None:
         wait([viewer.state.writing], LONGEST_WAIT)
+
+
+# What the command line makes of a scene, the window has it make, in a process of its own.
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of a command that the window shows."""
+
+    flag: str
+    label: str
+    default: float  # False: a switch
+    limits: tuple[float, float] = (0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class ExportRow:
+    """Something that a command of the command line makes of a scene."""
+
+    about: str
+    words: str  # the command, with places for the scene and what is written
+    # suffix, "" of a folder -> bytes at all, for each Gaussian, and for each coefficient of its colours
+    # (measured on the bundled scene)
+    sizes: Mapping[str, tuple[float, float, float]]
+    options: tuple[Option, ...] = ()
+    has_companions: bool = False
+    at_most: bool = False  # what is written may be much less
+    asks: bool = False  # it takes a text encoder in place of the scene's
+    needs_field: bool = False
+
+
+SCENES = {
+    ".ply": (0, 56, 12), ".spz": (0, 14, 2), ".sog": (0, 20, 0.5), ".glb": (0, 48, 12), ".gltf": (0, 64, 16),
+    ".splat": (0, 32, 0),
+}  # fmt: skip
+LOSS = Option("--max-psnr-loss", "Loss allowed, dB", 0.1, (0.01, 3.0))
+EXPORTS = {
+    "web page": ExportRow(
+        "One file that any browser shows and searches, without a network.",
+        "export {scene} {out}",
+        {".html": (1.2e6, 52, 3)},
+        asks=True,
+    ),
+    "scene": ExportRow(
+        ".ply keeps everything; .spz and .sog are a fifth, and rounded; .splat is without view dependence.",
+        "convert {scene} {out}",
+        SCENES,
+        has_companions=True,
+    ),
+    "cleaned copy": ExportRow(
+        "Without floaters: small regions that touch nothing, and veils in free space.",
+        "clean {scene} {out}",
+        SCENES,
+        (LOSS,),
+        has_companions=True,
+        at_most=True,
+    ),
+    "compacted copy": ExportRow(
+        "Without Gaussians and colours that the views do not need.",
+        "compact {scene} --out {out}",
+        SCENES,
+        (LOSS,),
+        has_companions=True,
+        at_most=True,
+    ),
+    "mesh": ExportRow(
+        "The surface as triangles with colours: .glb in metres with y up, .ply in the scene's units.",
+        "mesh {scene} {out}",
+        {".glb": (15e6, 0, 0), ".ply": (15e6, 0, 0)},
+        (Option("--watertight", "Close all holes", False),),
+        at_most=True,
+    ),
+    "map for a robot": ExportRow(
+        "Occupancy grid, labelled voxels and a collider, into a folder.",
+        "map {scene} {out}",
+        {"": (5e6, 0, 0)},
+        (
+            Option("--resolution", "Metres of a cell", 0.05, (0.01, 0.5)),
+            Option("--metres-per-unit", "Metres of a unit", 1.0, (0.001, 1000.0)),
+        ),
+        asks=True,
+    ),
+    "labels": ExportRow(
+        "The scene with instance, part and class of each Gaussian, and the words for them.",
+        "describe {scene} --labels {out}",
+        {".ply": (6e4, 68, 12)},
+        has_companions=True,
+        needs_field=True,
+        asks=True,
+    ),
+}
+
+
+def exports() -> tuple[str, ...]:
+    """Return the titles of what can be written here: an extension may be absent."""
+    known = {"export", "convert", "describe", *registry.references("commands")}
+    return tuple(title for title, row in EXPORTS.items() if row.words.split()[0] in known)
+
+
+def ask_export(viewer: Viewer, title: str) -> None:
+    """Open the dialog that exports, with something to write."""
+    state = viewer.state
+    if not viewer.has_scene("export it") or state.scene is None:
+        return
+    row, given = EXPORTS[title], state.scene.metres_per_unit
+    shown = (one for one in row.options if one.flag != "--metres-per-unit" or given is None)
+    values = {option.flag: option.default for option in shown}
+    state.export_form = ExportForm(title, next(iter(row.sizes)), values)
+
+
+def _exported(viewer: Viewer, form: ExportForm) -> Array:
+    """(N,) bool of what is written."""
+    marks = viewer.state.marks
+    return marks.selected if form.only_selected else marks.kept
+
+
+def export_problem(viewer: Viewer, form: ExportForm) -> str:
+    """Return why something cannot be written, "" where it can."""
+    scene = viewer.state.scene
+    if EXPORTS[form.title].needs_field and scene is not None and scene.language is None:
+        return no_field(scene)
+    return "" if _exported(viewer, form).any() else "it would hold no Gaussians"
+
+
+def export_size(viewer: Viewer, form: ExportForm) -> str:
+    """Return about how large the files will be, in words."""
+    state, row = viewer.state, EXPORTS[form.title]
+    assert state.scene is not None
+    assert state.path is not None
+    count, (at_all, each, by_colour) = int(_exported(viewer, form).sum()), row.sizes[form.suffix]
+    size = at_all + count * (each + by_colour * state.scene.gaussians.sh.shape[1])
+    size *= (0.05 / form.values.get("--resolution", 0.05)) ** 2
+    if row.has_companions:
+        beside = sum(file.stat().st_size for file in scene_files(state.path)[1:] if file.exists())
+        size += beside * count / max(len(state.scene.gaussians), 1)
+    return f"{'At most' if row.at_most else 'About'} {size / 1e6:.{0 if size >= 1e7 else 1}f} MB"
+
+
+def choose_export(viewer: Viewer) -> None:
+    """Have a dialog ask for the file or folder, and write it."""
+    form, viewer.state.export_form = viewer.state.export_form, None
+    if form is None or export_problem(viewer, form):
+        return
+
+    def then(viewer: Viewer, out: Path) -> None:
+        run_export(viewer, form, out)
+
+    title, folder = f"Export: {form.title}", folder_of(viewer)
+    if form.suffix:
+        new = _new_file(viewer, folder, form.suffix, f"-{form.title.split()[0]}")
+        ask_for(viewer, FileChoice(title, then, "save", (form.suffix,), new))
+    else:
+        ask_for(viewer, FileChoice(title, then, "folder"))
+
+
+def run_export(viewer: Viewer, form: ExportForm, out: Path) -> None:
+    """Have the recorder's thread run the command, on the scene's file or, if it was edited, a copy."""
+    state, row, path = viewer.state, EXPORTS[form.title], viewer.state.path
+    assert state.scene is not None
+    assert path is not None
+    rows, scene = _exported(viewer, form), replace(state.scene, language=viewer.language)
+    taught = state.scene.language is not None and viewer.engine is not None and bool(viewer.engine.taught)
+    is_own = rows.all() and not (state.session.moves or taught or viewer.watch.changed) and path.exists()
+    switches = [flag for flag, value in form.values.items() if value is True]
+    words = [
+        *switches,
+        *(f"{flag}={value:g}" for flag, value in form.values.items() if not isinstance(value, bool)),
+    ]
+    if row.asks and viewer.services.encoder_id:
+        words.append(f"--encoder={viewer.services.encoder_id}")
+
+    write_page_of = _page(viewer)
+
+    def work(progress: Progress) -> tuple[Path, str]:
+        check_keeps(out, path)
+        if form.title == "web page":
+            return out, write_page_of(out, scene.take(np.flatnonzero(rows)), progress)
+        with TemporaryDirectory(prefix="langsplat-") as folder:
+            source = path
+            if not is_own:
+                progress("copying the scene", 0.0)
+                source = Path(folder) / f"{path.stem}.ply"
+                save_scene(source, replace(scene.take(np.flatnonzero(rows)), path=source))
+            named = [word.format(scene=source, out=out) for word in row.words.split()]
+            process = CommandProcess([*program(), *named, *words], viewer.recorder.wake)
+            try:
+                while process.exit_code is None:
+                    stage, fraction = [("starting", 0.0), *process.progress.stages.items()][-1]
+                    progress(f"{form.title}: {stage}", fraction)
+                    time.sleep(0.1)
+            finally:
+                process.end()
+        return out, _said(process, out)
+
+    _record(viewer, form.title, work)
+
+
+def _page(viewer: Viewer) -> Callable[[Path, Scene, Progress], str]:
+    """Return what writes a web page that opens with the current view, and has the bookmarks and notes.
+
+    Those are what the command line does not know. It returns what is said of the page.
+    """
+    state, services = viewer.state, viewer.services
+    assert state.view is not None
+    assert state.extent is not None
+    stands = {"as exported": replace(state.view, orthographic=False)}
+    stands |= {mark.name: bookmarked_view(mark, state.extent) for mark in state.session.bookmarks}
+    first = [replace(view.camera(*state.size), name=name) for name, view in stands.items()]
+    notes = [(note.text, note.at) for note in state.session.notes]
+
+    def write(out: Path, scene: Scene, progress: Progress) -> str:
+        engine = None if scene.language is None else services.engine(scene)
+        report = write_page(out, scene, engine, out.stem, progress, first, notes)
+        return f"saved {out}: {report.bytes / 1e6:.1f} MB, opens in any browser"
+
+    return write
+
+
+def _said(process: CommandProcess, out: Path) -> str:
+    """Return what a command says of the file that it wrote; InputError with the reason where it failed."""
+    said = process.progress.said
+    if process.exit_code != 0:
+        raise InputError((said or ["no reason given"])[-1].removeprefix("langsplat: "))
+    own = [line.removeprefix(f"{out}: ") for line in said if line.startswith(f"{out}: ")]
+    return "; ".join([f"saved {out}", *(own or [line for line in said[-3:] if str(out) not in line])])
 
 
 # Projects.

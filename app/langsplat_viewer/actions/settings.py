@@ -219,10 +219,11 @@ def escape(viewer: Viewer) -> None:
     Queries that failed leave the list.
     """
     state, tools = viewer.state, viewer.state.tools
-    lay_over = state.show_help or state.show_palette or state.choice or state.leaving or state.show_start
+    forms = state.choice or state.export_form or state.leaving
+    lay_over = state.show_help or state.show_palette or forms or state.show_start
     state.show_start &= state.scene is None
     state.show_help = state.show_palette = state.pins_notes = state.letters_muted = False
-    state.choice = state.leaving = None
+    state.choice = state.export_form = state.leaving = None
     if state.session.ruler.measures:
         toggle_measuring(viewer)
     failed = {query.phrase for query in state.session.queries if state.answer(query).problem}

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from itertools import takewhile
 from os.path import exists
 from pathlib import Path
@@ -24,7 +25,7 @@ from langsplat_viewer.disk import completions
 from langsplat_viewer.jobs import Worker
 from langsplat_viewer.panels import ui
 from langsplat_viewer.projects import BUNDLED, thumbnail_of
-from langsplat_viewer.state import FileChoice, Message
+from langsplat_viewer.state import ExportForm, FileChoice, Message
 from langsplat_viewer.viewer import Viewer
 
 # The start page.
@@ -113,7 +114,7 @@ def _card(path: Path, texture: moderngl.Texture | None, width: float) -> bool:
 
 # Toasts: what was said last, for a while.
 
-TOAST_EM, MOST_TOASTS = 30.0, 3
+TOAST_EM, BAR_EM, MOST_TOASTS = 30.0, 20.0, 3
 
 
 class Toasts:
@@ -131,7 +132,7 @@ class Toasts:
         self._last = said[-1] if said else None
         since = (*self._shown, *((message, now) for message in new))
         self._shown = [(message, at) for message, at in since if now - at < self.seconds][-MOST_TOASTS:]
-        if not self._shown:
+        if not self._shown and viewer.recorder.current is None:
             return
         foot = ImVec2(area.left + area.width / 2, area.top + area.height - hello_imgui.em_size(2))
         imgui.set_next_window_pos(foot, imgui.Cond_.always, ImVec2(0.5, 1))
@@ -143,6 +144,8 @@ class Toasts:
             self._toast(viewer, message)
             imgui.pop_id()
         imgui.pop_text_wrap_pos()
+        imgui.dummy(ImVec2(hello_imgui.em_size(BAR_EM if viewer.recorder.current else 0), 0))
+        ui.recorder_bar(viewer)
         if imgui.is_window_hovered():
             self._shown = [(message, now) for message, _ in self._shown]
             if imgui.is_mouse_clicked(0) and not imgui.is_any_item_hovered():
@@ -256,6 +259,63 @@ def _path_box(viewer: Viewer, choice: FileChoice) -> None:
     for offer in completions(drafts.get("##path", ""), folder, suffixes):
         if imgui.selectable(offer, False, imgui.SelectableFlags_.no_auto_close_popups)[0]:
             drafts["##path"] = offer
+
+
+# What is exported, and how.
+
+EXPORT_EM = 27.0
+
+
+def draw_export(viewer: Viewer) -> None:
+    """Draw the dialog that exports: what, its options, and about how large it will be."""
+    form = viewer.state.export_form
+    ui.ask_for_popup("Export", form is not None)
+    imgui.set_next_window_size(ImVec2(ui.fitting(EXPORT_EM, 1).x, 0))
+    flags = imgui.WindowFlags_.no_saved_settings | imgui.WindowFlags_.no_resize
+    if not imgui.begin_popup_modal("Export", None, flags)[0]:
+        return
+    if form is not None:
+        _export(viewer, form)
+    if imgui.button("Cancel") or imgui.is_key_pressed(imgui.Key.escape):
+        settings.put(viewer.state, export_form=None)
+    if viewer.state.export_form is None:
+        imgui.close_current_popup()
+    imgui.end_popup()
+
+
+def _export(viewer: Viewer, form: ExportForm) -> None:
+    titles = saving.exports()
+    imgui.set_next_item_width(-1)
+    changed, chosen = imgui.combo(
+        "##what", titles.index(form.title), [title.capitalize() for title in titles]
+    )
+    if changed:
+        saving.ask_export(viewer, titles[chosen])
+        return
+    row, values = saving.EXPORTS[form.title], dict(form.values)
+    ui.small_wrapped(row.about, ui.muted())
+    suffix, only = form.suffix, form.only_selected
+    if len(row.sizes) > 1:
+        suffix = ui.radio({name: name for name in row.sizes}, suffix)
+    for option in row.options:
+        if option.flag in values and option.default is False:
+            values[option.flag] = imgui.checkbox(option.label, bool(values[option.flag]))[1]
+        elif option.flag in values:
+            value = ui.slider(option.label, values[option.flag], option.limits, "%.3g", logarithmic=True)
+            values[option.flag] = value
+    selected = int(viewer.state.marks.selected.sum())
+    if selected or only:
+        only = imgui.checkbox(f"Only the selection ({selected:,} Gaussians)", only)[1]
+    form = replace(form, suffix=suffix, values=values, only_selected=only)
+    settings.put(viewer.state, export_form=form)
+    problem = saving.export_problem(viewer, form)
+    if problem:
+        ui.small_wrapped(problem, ui.bad())
+    else:
+        imgui.text_unformatted(f"{saving.export_size(viewer, form)} on disk")
+    if ui.button("Export ...", enabled=not problem):
+        saving.choose_export(viewer)
+    imgui.same_line()
 
 
 # A file that has changed.

@@ -153,6 +153,7 @@ def draw_over(
     toasts.draw(viewer, area)
     dialogs.draw_changed(viewer, area)
     dialogs.draw_unsaved(viewer)
+    dialogs.draw_export(viewer)
     files.draw(viewer)
     menus.draw_help(viewer)
     menus.draw_palette(viewer)

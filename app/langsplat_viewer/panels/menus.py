@@ -20,13 +20,17 @@ def draw_menus(viewer: Viewer) -> None:
             _items(viewer, [first])
             if menu == "File":
                 _recent(viewer)
-            _items(viewer, others)
+            _items(viewer, others[:-1])
+            if menu == "File" and imgui.begin_menu("Export", viewer.state.scene is not None):
+                _items(viewer, BY_MENU["Export"])
+                imgui.end_menu()
+            _items(viewer, others[-1:])
             if menu == "Window":
                 _panels()
             imgui.end_menu()
 
 
-def _items(viewer: Viewer, commands: list[Command]) -> None:
+def _items(viewer: Viewer, commands: Sequence[Command]) -> None:
     for command in commands:
         if command.apart:
             imgui.separator()
