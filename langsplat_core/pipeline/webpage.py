@@ -45,6 +45,7 @@ from langsplat_core.query.answers import place_of
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.query.instances import BOXED, oriented_box
 from langsplat_core.query.inventory import suggest
+from langsplat_core.query.relations import ASIDE, NEAR, WHOLE, Body, body, stands, upright
 from langsplat_core.query.rule import RULE
 from langsplat_core.raster.opengl import WEB, shader, splat_shaders
 from langsplat_core.raster.render import render
@@ -55,11 +56,12 @@ from langsplat_core.semantics.encoders import PhraseEncoder
 from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary
 
 # In an order in which each imports only those before it, so that their code can stand in one script.
-MODULES = ("words", "rule", "encoder", "language", "data", "camera", "draw", "page")
+MODULES = ("words", "rule", "encoder", "camera", "space", "language", "data", "draw", "page")
 BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, without its imports and exports
-WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS")  # which tell a part from a thing
+WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS", "ALSO_NOUNS")
 STILL = 1280  # pixels of the longer side of the picture in the page
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
+TOUCHING: tuple[grammar.Side, ...] = ("on", "in", "near")  # relations that follow from points
 CHUNK = 256  # Gaussians that share the range of a quantised column
 FLATTEST, OPAQUE = -46.0, 20.0  # bounds of the logarithm of a scale, whatever a file holds; of a logit
 
@@ -243,7 +245,16 @@ def language_tables(
         "bars": bars,
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
         "rule": RULE.as_json() | {"least_likeness": taught.LEAST},
-        "grammar": {name.lower(): sorted(getattr(grammar, name)) for name in WORD_LISTS},
+        "grammar": {
+            **{name.lower(): sorted(getattr(grammar, name)) for name in WORD_LISTS},
+            "prepositions": {" ".join(words): kind for words, kind in grammar.PREPOSITIONS.items()},
+            "superlatives": grammar.SUPERLATIVES,
+        },
+        "space": {
+            "kinds": TOUCHING,
+            "aside": ASIDE,
+            "frame": upright(engine.scene.up()).ravel().tolist(),
+        },
         "examples": suggested.examples,
         "phrases": suggested.phrases,
     }
@@ -274,6 +285,8 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
         boxes += [box.ravel() for _, box in found]
         around = [oriented_box(means[own[:: -(-len(own) // BOXED)]]).corners for own in each]
         corners += [(eight - centre).ravel() for eight in around]
+        if level == WHOLE:
+            bodies = [body(means[own] - centre, upright(scene.up())) for own in each]
     share = regions.mixtures(codes, engine.field.codec.size + 1)[:, :-1].tocoo()
     return {
         "share_of": share.row.astype(np.uint32),
@@ -284,7 +297,22 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
         "places": scene.in_world(np.reshape(places, (count, 3))),
         "boxes": scene.in_world(np.reshape(boxes, (count, 2, 3))).reshape(count, 6),
         "corners": np.array(corners, np.float32).reshape(count, 24),
+        "bodies": np.array([(one.low, one.high) for one in bodies], np.float32).reshape(-1, 6),
+        "pairs": np.array(_touching(bodies), np.uint32).reshape(-1, 3),
     }
+
+
+def _touching(bodies: Sequence[Body]) -> list[tuple[int, int, int]]:
+    """Return every relation that follows from points: its number in `TOUCHING`, what stands so, to what."""
+    low, high = (np.array([getattr(one, end) for one in bodies]) for end in ("low", "high"))
+    found = []
+    for number, one in enumerate(bodies):
+        apart = np.linalg.norm(np.maximum(0, np.maximum(low - one.high, one.low - high)), axis=1)
+        for other in np.flatnonzero(apart <= NEAR * one.size).tolist():
+            if other != number:
+                kinds = (k for k, kind in enumerate(TOUCHING) if stands(kind, one, bodies[other], None))
+                found += [(kind, number, other) for kind in kinds]
+    return found
 
 
 def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:

@@ -257,7 +257,7 @@ MAX_ATOMS = 12  # each is asked for itself
 _DISTANCES: dict[str, Literal["nearest", "farthest"]] = {
     "nearest": "nearest", "closest": "nearest", "farthest": "farthest", "furthest": "farthest",
 }  # fmt: skip
-_SUPERLATIVES: dict[str, Extreme] = {
+SUPERLATIVES: dict[str, Extreme] = {
     **_DISTANCES,
     "biggest": "biggest", "largest": "biggest", "smallest": "smallest", "tiniest": "smallest",
     "highest": "highest", "topmost": "highest", "uppermost": "highest", "lowest": "lowest",
@@ -274,13 +274,13 @@ _SIDES: dict[str, Side] = {
     "beneath": "below", "behind": "behind", "in back of": "behind", "in front of": "in front of",
 }  # fmt: skip
 _NUMBERS = ["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
-_PREPOSITIONS: dict[tuple[str, ...], Side | Literal["nearest", "farthest", "of"]] = {
+PREPOSITIONS: dict[tuple[str, ...], Side | Literal["nearest", "farthest", "of"]] = {
     ("of",): "of",
     **{(word, to): kind for word, kind in _DISTANCES.items() for to in ("to", "from")},
     **{tuple(text.split()): kind for text, kind in _SIDES.items()},
 }
 _EMPTY = STOP_WORDS | ADJECTIVES
-_LONGEST = max(map(len, _PREPOSITIONS))
+_LONGEST = max(map(len, PREPOSITIONS))
 _EXCLUSIONS = tuple(
     tuple(text.split())
     for text in (
@@ -392,7 +392,7 @@ def _names(tokens: list[str]) -> bool:
 def _clause(tokens: list[str]) -> Phrase:
     tokens = _without_articles(tokens)
     low = [token.lower() for token in tokens]
-    kind = _SUPERLATIVES.get(low[0])
+    kind = SUPERLATIVES.get(low[0])
     if kind and _names(tokens[1:]):
         what = _related(tokens[1:])
         if kind in ("nearest", "farthest") and isinstance(what, Relation) and what.kind == "near":
@@ -408,7 +408,7 @@ def _clause(tokens: list[str]) -> Phrase:
         return Counted(count, what if count == 1 else _one_of(what))
     for side, extreme in (("left", "leftmost"), ("right", "rightmost")):
         if low[-3:] == ["on", "the", side] and _names(tokens[:-3]):
-            return Superlative(_SUPERLATIVES[extreme], _related(tokens[:-3]))
+            return Superlative(SUPERLATIVES[extreme], _related(tokens[:-3]))
     return _related(tokens)
 
 
@@ -428,7 +428,7 @@ def _one_of(tree: Phrase) -> Phrase:
 def _related(tokens: list[str]) -> Phrase:
     for at in range(1, len(tokens)):
         for length in range(min(_LONGEST, len(tokens) - at - 1), 0, -1):
-            kind = _PREPOSITIONS.get(tuple(token.lower() for token in tokens[at : at + length]))
+            kind = PREPOSITIONS.get(tuple(token.lower() for token in tokens[at : at + length]))
             before, after = tokens[:at], tokens[at + length :]
             named = _names(before) or (kind == "of" and is_part(before[-1]))
             if kind and named and _names(after) and not (kind == "of" and _holds(before)):

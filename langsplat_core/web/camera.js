@@ -31,6 +31,9 @@ function project(camera, point) {
   return [(camera.fx * x) / z + camera.cx, (camera.fy * y) / z + camera.cy, z];
 }
 
+// The points of a box's (8, 3) corners.
+const cornersOf = (box) => Array.from({ length: 8 }, (_, k) => Array.from(box.slice(3 * k, 3 * k + 3)));
+
 const STEP = 24; // pixels of a drag that a press of an arrow key is worth
 const FLIGHT = 700; // ms
 const FLYING = { w: [2, 1], s: [2, -1], a: [0, -1], d: [0, 1] }; // axis of the camera, and direction
@@ -221,7 +224,7 @@ class Controls {
 
   // Look at a box's (8, 3) corners from where the camera stands, as near as they fill half of the view.
   face(corners) {
-    const points = Array.from({ length: 8 }, (_, k) => Array.from(corners.slice(3 * k, 3 * k + 3)));
+    const points = cornersOf(corners);
     const middle = points.reduce((sum, point) => add(sum, point, 1 / 8), [0, 0, 0]);
     const reach = Math.max(...points.map((point) => Math.hypot(...add(point, middle, -1))));
     const [, , width, height] = this.free();
@@ -260,4 +263,4 @@ class Controls {
 }
 // [/page]
 
-export { Controls, add, inner, project, unit };
+export { Controls, add, axes, cornersOf, inner, project, unit };

@@ -205,15 +205,15 @@ class Painter {
     return { framebuffer, textures, width, height };
   }
 
-  // Show (M C) values of the Gaussians, C components each, beside their colours.
-  show(values, components) {
+  // Show up to three layers of values of the Gaussians beside their colours.
+  show(layers) {
     const { gl } = this;
     this.values.fill(0);
-    for (let i = 0; i < this.count; ++i) {
-      for (let c = 0; c < components; ++c) {
-        this.values[4 * i + c] = values[components * i + c];
+    layers.forEach((layer, c) => {
+      for (let i = 0; i < this.count; ++i) {
+        this.values[4 * i + c] = layer[i];
       }
-    }
+    });
     gl.bindTexture(gl.TEXTURE_2D, this.extra);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.columns, this.rows, gl.RGBA, gl.FLOAT, this.values);
   }
@@ -343,7 +343,7 @@ class Painter {
       ranges: appearance.ranges.flat(),
       has_selection: 0,
       selection: 3,
-      own_colours: 0,
+      own_colours: +appearance.own,
       heat_opacity: picture.heat_opacity,
       dim: appearance.dim ?? picture.dim,
       threshold: picture.threshold,

@@ -1,10 +1,16 @@
 // The text half of CLIP, for the words that it was taught: the plain twin of semantics/clip_plain.py.
 
 import { sigmoid } from "./rule.js";
+import { nearest } from "./words.js";
 
 // [page]
-// What a browser says of a phrase that cannot be asked.
-class PhraseError extends Error {}
+// What a browser says of a phrase that cannot be asked, the word that is unknown, and a known one like it.
+class PhraseError extends Error {
+  constructor(message, word = "", near = "") {
+    super(message);
+    Object.assign(this, { word, near });
+  }
+}
 
 // The dot product of `size` numbers of two arrays, from a place in each.
 function dot(a, firstOfA, b, size, firstOfB = 0) {
@@ -54,7 +60,8 @@ class ClipText {
     for (const word of key.match(/[\p{L}\p{N}]+(?:'[\p{L}\p{N}]+)?/gu) || []) {
       const known = [word, word.split("'")[0]].find((form) => Object.hasOwn(this.words, form));
       if (known === undefined) {
-        throw new PhraseError(`This page's encoder was never taught “${word}”${this.suggestion(word)}.`);
+        const near = nearest(word, Object.keys(this.words));
+        throw new PhraseError(`This page's encoder was never taught “${word}”.`, word, near);
       }
       ids.push(...this.words[known]);
     }
@@ -62,13 +69,6 @@ class ClipText {
       throw new PhraseError("Use fewer, plain words.");
     }
     return [...ids, this.end];
-  }
-
-  suggestion(word) {
-    const near = Object.keys(this.words)
-      .filter((known) => known.slice(0, 3) === word.slice(0, 3))
-      .slice(0, 2);
-    return near.length ? `; it knows ${near.map((known) => `“${known}”`).join(" and ")}` : "";
   }
 
   embedded(ids) {

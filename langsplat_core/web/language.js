@@ -2,11 +2,21 @@
 // the fields of Python's QueryResult.
 
 import { ClipText, PhraseError, dot } from "./encoder.js";
-import { decide, fitOf, heatRange, levelRange, regionRelevancies, sigmoid, verdict } from "./rule.js";
-import { namedBy, phraseKey, thingAndPart, tidy } from "./words.js";
+import {
+  combined,
+  decide,
+  fitOf,
+  heatRange,
+  levelRange,
+  regionRelevancies,
+  sigmoid,
+  verdict,
+} from "./rule.js";
+import { Space, wholeOf } from "./space.js";
+import { namedBy, nearest, parse, phraseKey, splitPhrases, thingAndPart, tidy } from "./words.js";
 
 // [page]
-const LISTS = ["articles", "stop_words", "adjectives", "parts"];
+const LISTS = ["articles", "stop_words", "adjectives", "parts", "also_nouns"];
 const GRID = { neighbours: 16, most: 64, side: 5 }; // as of query/answers.py, smoothed
 
 // Means of values (K) around points (3 K), smoothed on a grid that grows with them.
@@ -59,12 +69,98 @@ class Language {
     [this.codewords, this.dim] = tensors.codebook.shape;
     this.gaussians = tensors.codes.shape[1];
     this.regions = { counts: meta.counts, parents: this.tensors.parents, sizes: this.tensors.sizes };
+    this.space = new Space(meta, this.tensors);
     this.keys = new Map(meta.keys.map((key, row) => [key, row]));
     this.taught = new Map(meta.taught.map((word, row) => [phraseKey(word.name), { ...word, row }]));
-    this.lists = Object.fromEntries(LISTS.map((name) => [name, new Set(meta.grammar[name])]));
+    const { prepositions, superlatives, articles } = meta.grammar;
+    const longest = Object.keys(prepositions).sort((a, b) => b.length - a.length);
+    this.lists = {
+      ...Object.fromEntries(LISTS.map((name) => [name, new Set(meta.grammar[name])])),
+      prepositions,
+      superlatives,
+      leading: new RegExp(`^(?:(?:${articles.join("|")}) )+`, "i"),
+      related: new RegExp(`^(.+?) (${longest.join("|")}) (.+)$`, "i"),
+    };
     if (meta.encoder) {
       this.encoder = new ClipText(meta.encoder, (name) => this.tensors[`encoder.${name}`], this.dim);
     }
+  }
+
+  // Answers to the phrases of a line, in their order, three at most. camera: from where left, right, nearest and
+  // so on are said. PhraseError where one of them cannot be asked.
+  answers(line, levelName, camera) {
+    return splitPhrases(line, this.lists)
+      .slice(0, 3)
+      .map((phrase) => {
+        try {
+          const tree = this.taught.has(phraseKey(phrase)) ? { text: phrase } : parse(phrase, this.lists);
+          return { ...this.follow(tree, levelName, camera), phrase };
+        } catch (error) {
+          if (error instanceof PhraseError && this.keys.has(phraseKey(phrase))) {
+            return this.ask(phrase, levelName);
+          }
+          throw error;
+        }
+      });
+  }
+
+  // The answer to a tree of phrases (words.js, parse): of what is asked for, the regions in whose wholes the
+  // relation holds.
+  follow({ text, kind, what, anchor }, levelName, camera) {
+    if (!kind) {
+      return this.ask(text, levelName);
+    }
+    const other = anchor && this.thing(anchor, "auto", camera);
+    const others = other ? this.wholesOf(other) : [];
+    if (kind === "inside") {
+      const part = this.part(what.text, anchor, others, levelName);
+      return this.restricted(part, this.wholesOf(part), other);
+    }
+    const asked = this.thing(what, levelName, camera);
+    const things = this.wholesOf(asked);
+    if (kind === "without") {
+      const left = things.filter((thing) => !others.includes(thing));
+      return other.verdict.found ? this.restricted(asked, left, asked) : asked;
+    }
+    return this.restricted(asked, this.space.chosen(kind, things, others, camera), other ?? asked);
+  }
+
+  // The wholes that the regions of an answer are parts of, or are.
+  wholesOf({ inside }) {
+    return [...new Set(inside.map((region) => wholeOf(this.regions, region)))];
+  }
+
+  // The answer to a part of a thing, or on the wholes of a thing with structure.
+  part(name, thing, wholes, levelName) {
+    const { rule, levels, calibration } = this.meta;
+    const phrase = thing.kind ? name : `${thing.text} ${name}`;
+    const whole = (_, region) => (wholes.includes(wholeOf(this.regions, region)) ? 1 : rule.nothing);
+    const on = thing.kind ? Array.from(this.regions.sizes, whole) : this.knownFits(thing.text);
+    const [own, both] = [name, phrase].map((text) => this.knownFits(text));
+    if (!own || !on || !calibration) {
+      return this.ask(phrase, levelName);
+    }
+    const level = levels.indexOf(levelName);
+    const decision = decide(rule, this.regions, own, "inside", level, this.meta, on, both);
+    return this.answer(phrase, decision, this.relevancies(this.vector(phraseKey(both ? phrase : name))));
+  }
+
+  // As `follow`, but a thing is looked for among wholes, unless it fits none.
+  thing(tree, levelName, camera) {
+    const free = levelName === "auto" && !tree.kind && namedBy(tree.text, this.lists) === "thing";
+    const whole = this.follow(tree, free ? "whole" : levelName, camera);
+    return free && whole.peak < this.meta.rule.floor ? this.follow(tree, levelName, camera) : whole;
+  }
+
+  // An answer within some wholes; nothing is found where `needed` is not.
+  restricted(answer, wholes, needed) {
+    const { rule } = this.meta;
+    const inside = answer.inside.filter((region) => wholes.includes(wholeOf(this.regions, region)));
+    const within = new Set(inside);
+    const regionFits = answer.regionFits.map((fit, region) => (within.has(region) ? fit : rule.nothing));
+    const best = inside.reduce((a, b) => (a < 0 || regionFits[b] > regionFits[a] ? b : a), -1);
+    const verdict = combined(rule, answer.verdict, needed.verdict, best < 0);
+    return this.answer(answer.phrase, { ...answer, inside, best, regionFits, verdict }, answer.codes);
   }
 
   // The answer to a phrase at "auto" or a level's name. PhraseError where it cannot be asked.
@@ -99,9 +195,8 @@ class Language {
     }
     if (!this.encoder) {
       const count = this.keys.size;
-      throw new PhraseError(
-        `“${key}” is none of the ${count} phrases in this page, which the box completes.`,
-      );
+      const near = nearest(key, this.keys.keys());
+      throw new PhraseError(`“${key}” is none of the ${count} phrases in this page.`, key, near);
     }
     return this.encoder.encode(key);
   }
@@ -252,19 +347,12 @@ class Language {
     return answer.inside.reduce((least, region) => Math.min(least, even[region]), answer.peak);
   }
 
-  // (M, 3) colours in [0, 1] of the language features at a level; grey where nothing was observed.
+  // Red, green and blue in [0, 1] of the language features at a level; grey where nothing was observed.
   latents(level) {
     const { codes, palette } = this.tensors;
-    const colours = new Float32Array(3 * this.gaussians).fill(0.5);
-    for (let i = 0; i < this.gaussians; ++i) {
-      const code = codes[level * this.gaussians + i];
-      if (code < this.codewords) {
-        for (let channel = 0; channel < 3; ++channel) {
-          colours[3 * i + channel] = palette[3 * code + channel] / 255;
-        }
-      }
-    }
-    return colours;
+    const own = codes.subarray(level * this.gaussians, (level + 1) * this.gaussians);
+    const colour = (code, channel) => (code < this.codewords ? palette[3 * code + channel] / 255 : 0.5);
+    return [0, 1, 2].map((channel) => Float32Array.from(own, (code) => colour(code, channel)));
   }
 
   // Phrases that go on from what was typed (query/inventory.py, completions).

@@ -2,7 +2,7 @@
 
 import { readPage } from "./data.js";
 import { Language, PhraseError } from "./language.js";
-import { Controls, add, inner, project, unit } from "./camera.js";
+import { Controls, add, cornersOf, inner, project, unit } from "./camera.js";
 import { Painter } from "./draw.js";
 
 // [page]
@@ -20,8 +20,6 @@ const SLOW = 60; // ms of an image while the camera moves, above which fewer pix
 const COARSEST = 0.3;
 const REST = 180; // ms
 const MOST_BOXES = 24;
-const FAINT = 0.1; // opacity, as of scene/surface.py
-const INNER = [0.02, 0.98]; // quantiles that a box holds, as of query/instances.py
 // Pairs of the corners of a box, which are numbered by three bits, along its twelve edges.
 const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((corner) => {
   return [1, 2, 4].filter((bit) => !(corner & bit)).map((bit) => [corner, corner | bit]);
@@ -33,7 +31,7 @@ class Page {
       meta,
       level: "auto",
       display: "rgb",
-      answer: null,
+      answers: [],
       share: 1,
       moving: false,
       shown: [],
@@ -86,7 +84,7 @@ class Page {
       about = `${this.language.keys.size.toLocaleString("en")} phrases can be asked.`;
     }
     if (language) {
-      about += ` A phrase is asked whole. Answers: ${language.basis}.`;
+      about += ` Answers: ${language.basis}.`;
     }
     byId("about").textContent = `${gaussians}. ${about} Made with the LangSplat viewer.`;
     for (const id of ["search", "examples", "levels", "displays", "verdict"]) {
@@ -156,7 +154,7 @@ class Page {
   }
 
   listenToButtons() {
-    byId("face").addEventListener("click", () => this.controls.face(this.shown[0]));
+    byId("face").addEventListener("click", () => this.controls.face(this.shown[0].corners));
     byId("boxes").addEventListener("change", () => this.redraw());
     byId("views").addEventListener("change", () => this.view(+byId("views").value));
     byId("before").addEventListener("click", () => this.view(this.current - 1));
@@ -253,18 +251,18 @@ class Page {
     const said = new URLSearchParams(location.hash.slice(1));
     const [level, show, view] = ["level", "show", "view"].map((name) => said.get(name));
     this.level = Object.hasOwn(LEVELS, level) ? level : "auto";
-    this.display = "rgb";
-    if (this.language) {
-      this.take((said.get("phrase") ?? "").slice(0, 400));
-      this.display =
-        Object.hasOwn(DISPLAYS, show) && (this.answer || !OF_ANSWERS.includes(show)) ? show : "rgb";
-    }
-    this.update();
     const numbers = (said.get("at") ?? "").split(",").map(Number);
     this.current = this.meta.views[view] ? +view : 0;
     byId("views").value = this.current;
     const known = numbers.length === 10 && numbers.every((number) => Math.abs(number) < 1e6);
     this.controls.go(this.meta.views[this.current], known ? numbers : null);
+    this.display = "rgb";
+    if (this.language) {
+      this.take((said.get("phrase") ?? "").slice(0, 400));
+      const shows = this.answers.length || !OF_ANSWERS.includes(show);
+      this.display = Object.hasOwn(DISPLAYS, show) && shows ? show : "rgb";
+    }
+    this.update();
   }
 
   // Options under the search box; the arrow keys mark one, which enter then asks.
@@ -302,31 +300,30 @@ class Page {
     byId("clear").hidden = !phrase;
     this.offer([]);
     this.phrase = phrase;
-    if (!phrase.trim()) {
-      this.answer = null;
-      if (OF_ANSWERS.includes(this.display)) {
-        this.display = "rgb";
-      }
-    } else if (!this.answer && this.display === "rgb") {
+    if (!phrase.trim() && OF_ANSWERS.includes(this.display)) {
+      this.display = "rgb";
+    } else if (phrase.trim() && !this.answers.length && this.display === "rgb") {
       this.display = "relevancy";
     }
     this.ask();
   }
 
   ask() {
-    this.problem = "";
+    this.problem = null;
+    this.answers = [];
     if (this.phrase?.trim()) {
       try {
-        this.answer = this.language.ask(this.phrase, this.level);
+        this.answers = this.language.answers(this.phrase, this.level, this.controls.view);
       } catch (error) {
         if (!(error instanceof PhraseError)) {
           throw error;
         }
-        this.answer = null;
-        this.problem = error.message;
+        this.problem = error;
       }
     }
-    this.shown = this.boxes(this.answer);
+    this.shown = this.answers.flatMap((answer) =>
+      this.boxes(answer).map((corners, rank) => ({ corners, name: rank ? "" : answer.phrase })),
+    );
     this.update();
   }
 
@@ -343,7 +340,8 @@ class Page {
 
   // Bring panel and values of the Gaussians up to date with phrase, level and display.
   update() {
-    const { answer } = this;
+    const { answers, problem } = this;
+    const hot = this.hot();
     const said = byId("verdict");
     const levels = this.meta.language?.levels ?? [];
     for (const [id, value] of [
@@ -352,34 +350,47 @@ class Page {
     ]) {
       for (const input of document.querySelectorAll(`#${id} input`)) {
         input.checked = input.value === value;
-        input.disabled = id === "displays" && OF_ANSWERS.includes(input.value) && !answer;
+        input.disabled = id === "displays" && OF_ANSWERS.includes(input.value) && !answers.length;
       }
     }
     for (const button of byId("examples").children) {
-      button.ariaPressed = String(Boolean(answer) && button.textContent === this.phrase);
+      button.ariaPressed = String(answers.length > 0 && button.textContent === this.phrase);
     }
-    said.replaceChildren();
-    said.className = "";
-    byId("answer").hidden = !answer || answer.best < 0 || answer.verdict.outcome === "not here";
-    byId("looks").hidden = byId("answer").hidden || this.display !== "relevancy";
-    if (answer) {
-      this.say(answer, said);
-    } else if (this.problem) {
-      said.append(this.problem);
+    said.replaceChildren(...answers.map((answer) => this.said(answer)));
+    byId("answer").hidden = !this.shown.length;
+    byId("legend").style.visibility = hot.length === 1 ? "visible" : "hidden"; // several have their own colours
+    byId("looks").hidden = !hot.length || this.display !== "relevancy";
+    if (hot.length === 1) {
+      this.legend(hot[0]);
+    }
+    if (problem) {
+      said.append(problem.message);
+    }
+    if (problem?.near) {
+      const meant = this.phrase.toLowerCase().replace(problem.word, problem.near);
+      const button = element("button", `Did you mean “${meant}”?`, { type: "button" });
+      button.addEventListener("click", () => this.search(meant));
+      said.append(" ", button);
     }
     if (this.display === "latent") {
-      this.painter.show(this.language.latents(this.level === "auto" ? 2 : levels.indexOf(this.level)), 3);
-    } else if (answer && this.display !== "rgb") {
-      const { members } = this.language.spread(answer, answer.level);
-      const hot = () => this.language.heats(answer, byId("heat").value, this.meta.picture.heat_base);
-      const shown = this.display === "segmentation" ? members : hot();
-      this.painter.show(this.appearance().strength === 0 ? shown.fill(0) : shown, 1);
+      this.painter.show(this.language.latents(this.level === "auto" ? 2 : levels.indexOf(this.level)));
+    } else if (this.display !== "rgb") {
+      const heats = (answer) => this.language.heats(answer, byId("heat").value, this.meta.picture.heat_base);
+      const members = (answer) => this.language.spread(answer, answer.level).members;
+      this.painter.show(hot.map(this.display === "segmentation" ? members : heats));
     }
     this.redraw();
   }
 
-  // The verdict in the panel, and the ends of the legend.
-  say(answer, said) {
+  // Answers that are shown: a weak one half as hot, what is not here not at all.
+  hot() {
+    return this.answers.filter(
+      ({ best, verdict }) => best >= 0 && this.meta.picture.strength[verdict.outcome] > 0,
+    );
+  }
+
+  // A verdict, as the panel has it.
+  said(answer) {
     const { outcome, probability, byChance } = answer.verdict;
     const { levels, guess } = this.meta.language;
     const share = 100 * Math.max(byChance ?? 0, 0.001); // never none
@@ -388,13 +399,19 @@ class Page {
     const unit = this.meta.metres_per_unit === 1 ? " m" : "";
     const digits = Math.min(Math.max(2 - Math.floor(Math.log10(this.meta.radius)), 2), 20);
     const place = answer.place?.map((length) => length.toFixed(digits)).join(" ");
-    const count = this.shown.length;
+    const count = this.boxes(answer).length;
     const places = `${count} ${count > 1 ? "places" : "place"}`;
     const where = `${places}, level ${levels[answer.level]}; at ${place}${unit}`;
-    const detail = outcome === "not here" ? answer.phrase : where;
-    said.className = OUTCOMES[outcome];
+    const absent = this.answers.length > 1 ? "" : answer.phrase;
+    const detail = outcome === "not here" ? absent : where;
+    const said = element("span", "", { className: OUTCOMES[outcome] });
+    if (this.answers.length > 1) {
+      const colour = this.meta.query_colours[this.hot().indexOf(answer)] ?? [0.5, 0.5, 0.5];
+      said.append(element("i", "● "), `${answer.phrase}: `);
+      said.firstChild.style.color = `rgb(${colour.map((part) => 255 * part)})`;
+    }
     said.append(element("b", outcome + sure), element("small", detail), element("small", guess));
-    this.legend(answer);
+    return said;
   }
 
   // The colours between the ends of the heat, to half of them for a weak match, and a tick at the threshold.
@@ -417,19 +434,19 @@ class Page {
   // What the composing shader is told, as display/displays.py has it: a weak match is half as hot. "not here" shows
   // what it would without a phrase.
   appearance() {
-    const nothing = [0.5, 1];
-    const { answer, display } = this;
+    const { display } = this;
     const { picture } = this.meta;
-    const strength = answer ? picture.strength[answer.verdict.outcome] : 0;
-    const hot =
-      byId("heat").value === "everywhere" ? answer?.heat.map((end) => -end) : [picture.heat_base, 1];
-    const own = display === "segmentation" ? [0, 1] : hot;
-    const [low, high] = strength ? own : nothing;
+    const hot = this.hot();
+    const ranges = hot.map(({ heat, verdict }) => {
+      const ends = byId("heat").value === "everywhere" ? heat.map((end) => -end) : [picture.heat_base, 1];
+      const [low, high] = display === "segmentation" ? [0, 1] : ends;
+      return [low, low + (high - low) / picture.strength[verdict.outcome]];
+    });
     return {
-      display: strength || !OF_ANSWERS.includes(display) ? display : "rgb",
+      display: hot.length || !OF_ANSWERS.includes(display) ? display : "rgb",
       map: byId("map").selectedIndex,
-      strength,
-      ranges: [[low, low + (high - low) / (strength || 1)], nothing, nothing],
+      own: hot.length > 1,
+      ranges: [...ranges, ...Array(3 - ranges.length).fill([0.5, 1])],
     };
   }
 
@@ -455,30 +472,22 @@ class Page {
       }
       things.set(whole, [...(things.get(whole) ?? []), region]);
     }
-    const boxOf = (own) => (own.length > 1 ? this.around(own, answer.level) : this.corners(own[0]));
+    const boxOf = (own) => (own.length > 1 ? this.around(own) : this.corners(own[0]));
     return [...things.values()].slice(0, MOST_BOXES).map(boxOf);
   }
 
-  // Corners of the box around several regions of a level, along the sides of the largest one's.
-  around(regions, level) {
-    const { language, painter } = this;
-    const { sizes } = language.regions;
+  // Corners of the box around those of several regions, along the sides of the largest one's.
+  around(regions) {
+    const { sizes } = this.language.regions;
     const largest = this.corners(regions.reduce((a, b) => (sizes[b] > sizes[a] ? b : a)));
     const sides = [4, 2, 1].map((corner) => {
       const edge = [0, 1, 2].map((axis) => largest[3 * corner + axis] - largest[axis]);
       return unit(edge);
     });
-    const wanted = new Set(regions);
-    const along = [[], [], []];
-    for (let i = 0; i < painter.count; ++i) {
-      const [x, y, z, opacity] = painter.places.subarray(4 * i, 4 * i + 4);
-      if (opacity >= FAINT && wanted.has(language.regionOf(i, level))) {
-        sides.forEach((side, k) => along[k].push(inner(side, [x, y, z])));
-      }
-    }
-    const ends = along.map((values) => {
-      const sorted = Float64Array.from(values).sort();
-      return INNER.map((share) => sorted[Math.round(share * (sorted.length - 1))]);
+    const points = regions.flatMap((region) => cornersOf(this.corners(region)));
+    const ends = sides.map((side) => {
+      const along = points.map((point) => inner(side, point));
+      return [Math.min(...along), Math.max(...along)];
     });
     const corners = Array.from({ length: 8 }, (_, corner) => {
       const lengths = ends.map((pair, k) => pair[(corner >> (2 - k)) & 1]);
@@ -580,10 +589,8 @@ class Page {
         this.tag(context, text, [seen], dots);
       }
     }
-    for (const [rank, corners] of this.shown.entries()) {
-      const seen = Array.from({ length: 8 }, (_, k) =>
-        project(camera, Array.from(corners.slice(3 * k, 3 * k + 3))),
-      );
+    for (const { corners, name } of this.shown) {
+      const seen = cornersOf(corners).map((corner) => project(camera, corner));
       if (seen.some(([, , z]) => z < this.meta.raster.near)) {
         continue;
       }
@@ -594,13 +601,13 @@ class Page {
       }
       for (const [width, colour] of [
         [3.5, "#0009"],
-        [1.5, rank ? "#ffffffb3" : "#ffffff"],
+        [1.5, name ? "#ffffff" : "#ffffffb3"],
       ]) {
         Object.assign(context, { lineWidth: width * dots, strokeStyle: colour });
         context.stroke();
       }
-      if (rank === 0) {
-        this.tag(context, this.answer.phrase, seen, dots);
+      if (name) {
+        this.tag(context, name, seen, dots);
       }
     }
   }
@@ -631,7 +638,7 @@ globalThis.langsplat = (async () => {
   const page = new Page(meta, tensors);
   byId("welcome").remove();
   const image = async (camera, display = "rgb", phrase = "") => {
-    Object.assign(page, { display, phrase, level: "auto", answer: null });
+    Object.assign(page, { display, phrase, level: "auto" });
     if (page.language) {
       page.ask();
     }
@@ -642,7 +649,7 @@ globalThis.langsplat = (async () => {
     page.painter.paint(camera, page.appearance());
     return page.painter.pixels();
   };
-  return { page, image, ask: (phrase, level) => page.language.ask(phrase, level) };
+  return { page, image, ask: (phrase, level) => page.language.answers(phrase, level, page.controls.view)[0] };
 })();
 globalThis.langsplat.catch((error) => {
   byId("loading").textContent = error.message;

@@ -102,6 +102,17 @@ function verdict(rule, found, reached, margin, probability = null) {
   return { outcome, found, reached, margin, probability, byChance };
 }
 
+// The verdict on two things that are both needed, the weaker one; absent: nothing is both.
+function combined(rule, one, other, absent) {
+  const [probability, margin] = ["probability", "margin"].map((name) => {
+    const unknown = one[name] === null || other[name] === null;
+    const least = name === "margin" ? -Infinity : 0;
+    return unknown ? null : absent ? least : Math.min(one[name], other[name]);
+  });
+  const reached = one.reached === other.reached ? one.reached : "several";
+  return verdict(rule, !absent && one.found && other.found, reached, margin, probability);
+}
+
 // The verdict that the best fits of the levels stand for. level: number, or -1 where it is free. common: the
 // phrase's mean fit.
 function judge(rule, fits, named, level, { bars, calibration }, common) {
@@ -110,10 +121,10 @@ function judge(rule, fits, named, level, { bars, calibration }, common) {
     const margin = excess(rule, evidence, named, level, bars);
     return verdict(rule, margin >= 0, "chance", margin);
   }
-  const odds = named === "thing" ? calibration.thing : calibration.part;
+  const odds = calibration[named] ?? calibration.part;
   const logits = odds.constant + odds.whole * fits[2] + odds.finer * Math.max(fits[0], fits[1]);
   const probability = sigmoid(logits);
-  const shown = level < 0 || fits[level] >= 0;
+  const shown = level < 0 || named === "inside" || fits[level] >= 0;
   const margin = logits - logit(Math.min(odds.found, 1 - rule.narrowest));
   return verdict(rule, shown && probability >= odds.found, "calibration", margin, probability);
 }
@@ -129,13 +140,17 @@ function decide(rule, regions, own, named, level, evidence, thing = null, part =
   const every = regionFits(rule, regions, both).map((fit, region) =>
     !on || on[region] ? fit : rule.nothing,
   );
+  const heard =
+    named === "inside" ? anywhere.map((fit, region) => (on[region] ? fit : rule.nothing)) : anywhere;
   const bestOf = (relevancies) =>
     regions.counts.map((_, at) => bestRelevancy(rule, regions, relevancies, at));
-  const fits = bestOf(regionRelevancies(rule, anywhere)).map((score) => fitOf(rule, score));
+  const fits = bestOf(regionRelevancies(rule, heard)).map((score) => fitOf(rule, score));
   const relevancies = regionRelevancies(rule, every);
   const scores = bestOf(relevancies);
   const bests = scores.map((score) => fitOf(rule, score));
-  const given = bests.map((fit, at) => fit + rule.advantage[named][at]);
+  const given = bests.map(
+    (fit, at) => fit + rule.advantage[named === "inside" ? "part of a thing" : named][at],
+  );
   if (thing) {
     given[given.length - 1] = rule.nothing;
   }
@@ -174,4 +189,4 @@ function heatRange(rule, peak, found, best) {
 }
 // [/page]
 
-export { decide, fitOf, heatRange, levelRange, regionRelevancies, sigmoid, verdict };
+export { combined, decide, fitOf, heatRange, levelRange, regionRelevancies, sigmoid, verdict };

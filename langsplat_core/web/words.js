@@ -73,6 +73,82 @@ function thingAndPart(phrase, lists) {
   const words = namedBy(phrase, lists) === "part of a thing" ? phrase.split(" ") : [""];
   return [words.slice(0, -1).join(" "), words[words.length - 1]];
 }
+
+const SEPARATE = /[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)/iu;
+const JOIN = /\s(?:and|or|&|as well as)\s(?!not\b)/iu;
+const EXCLUDE = /^(.+?),?\s(?:(?:but|and)\s)?(?:not|without|except|other than)\s(.+)$/iu;
+
+// Whether words name a thing: more than stop words and descriptions.
+function names(text, { stop_words: stops, adjectives, also_nouns: nouns }) {
+  const words = text.toLowerCase().split(" ");
+  return (
+    words.some((word) => !stops.has(word) && !adjectives.has(word)) || nouns.has(words[words.length - 1])
+  );
+}
+
+// The phrases of a line; what "and" and "or" join are phrases of their own.
+function splitPhrases(line, lists) {
+  return line.split(SEPARATE).flatMap((part) => {
+    const phrases = tidy(part).split(JOIN);
+    return phrases.every((phrase) => names(phrase, lists)) ? phrases : [tidy(part)];
+  });
+}
+
+// What a phrase asks for: { text }, or { kind, what, anchor } of such. A part of query/grammar.py's rules: no
+// numbers, and things that others stand to are one level deep.
+function parse(text, lists) {
+  const bare = text.replace(lists.leading, "");
+  const [, wanted, unwanted] = bare.match(EXCLUDE) ?? [];
+  if (wanted && names(wanted, lists) && names(unwanted, lists) && namedBy(unwanted, lists) !== "part") {
+    return { kind: "without", what: parse(wanted, lists), anchor: parse(unwanted, lists) };
+  }
+  const [first, ...rest] = bare.split(" ");
+  const kind = lists.superlatives[first.toLowerCase()];
+  if (kind && names(rest.join(" "), lists)) {
+    const what = parse(rest.join(" "), lists);
+    const far = what.kind === "near" && ["nearest", "farthest"].includes(kind);
+    return far ? { ...what, kind } : { kind, what, anchor: null };
+  }
+  const [, before, preposition, after] = bare.match(lists.related) ?? [];
+  const relation = lists.prepositions[preposition?.toLowerCase()];
+  if (relation === "of" && namedBy(before, lists) === "part") {
+    return { kind: "inside", what: { text: before }, anchor: parse(after, lists) };
+  }
+  if (!relation && namedBy(bare, lists) === "part of a thing") {
+    const [thing, part] = thingAndPart(bare, lists);
+    return { kind: "inside", what: { text: part }, anchor: { text: thing.replace(/'s$|(?<=s)'$/, "") } };
+  }
+  if (!relation || relation === "of" || !names(before, lists) || !names(after, lists)) {
+    return { text: bare };
+  }
+  return { kind: relation, what: { text: before }, anchor: parse(after, lists) };
+}
+
+// Letters to insert, delete, replace or swap with the next, to make a word another.
+function distance(a, b) {
+  let [before, row] = [[], Array.from({ length: b.length + 1 }, (_, j) => j)];
+  for (let i = 1; i <= a.length; ++i) {
+    const next = [i];
+    for (let j = 1; j <= b.length; ++j) {
+      const swapped = a[i - 1] === b[j - 2] && a[i - 2] === b[j - 1] ? before[j - 2] + 1 : Infinity;
+      next[j] = Math.min(next[j - 1] + 1, row[j] + 1, row[j - 1] + (a[i - 1] === b[j - 1] ? 0 : 1), swapped);
+    }
+    [before, row] = [row, next];
+  }
+  return row[b.length];
+}
+
+// The known word that is written most like another one; "" where none is like it.
+function nearest(word, known) {
+  let [best, least] = ["", word.length / 3 + 1];
+  for (const other of known) {
+    const letters = distance(word, other) + (word[0] === other[0] ? 0 : 0.5);
+    if (letters < least) {
+      [best, least] = [other, letters];
+    }
+  }
+  return best;
+}
 // [/page]
 
-export { namedBy, phraseKey, thingAndPart, tidy, tokens };
+export { namedBy, nearest, parse, phraseKey, splitPhrases, thingAndPart, tidy, tokens };

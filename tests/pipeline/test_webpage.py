@@ -23,6 +23,7 @@ from langsplat_core.display.displays import Channels, Subject, heat_ranges, heat
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.webpage import write_page
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.render import splat_colours, view_of
@@ -207,6 +208,41 @@ def test_page_answers_100_phrases_as_python_does(tab: Tab, engine: QueryEngine, 
         )
         verdicts.add(expected.verdict)
     assert verdicts == {"found", "weak match", "not here"}
+
+
+RELATED = """teddy bear on the table,penguin near the rocket,chair near the table,laptop below the table,
+rug under the table,laptop behind the teddy bear,rocket left of the teddy bear,candle right of the teddy bear,
+biggest toy,leftmost toy,nearest toy,highest painting,toy nearest to the laptop,toy without the penguin,
+duck beak,lid of the teapot,teapot's spout,handle of the teapot near the laptop,present on the floor"""
+
+
+def test_page_reads_phrases_with_structure_as_python_does(tab: Tab, engine: QueryEngine) -> None:
+    visible = engine.scene.gaussians.opacity_logits >= -np.log(254)
+    for phrase in RELATED.replace("\n", "").split(","):
+        expected = run_phrase(engine, phrase, viewpoint=engine.scene.cameras[0]).answer
+        found = tab.ask(phrase, whole=False)
+        assert (found["verdict"], found["level"]) == (expected.verdict, expected.level), phrase
+        np.testing.assert_allclose(found["probability"], expected.probability, atol=1e-3, err_msg=phrase)
+        count = int((expected.members & visible).sum())  # there without what lies off the surface
+        assert count <= found["members"] <= 1.12 * count, phrase
+
+
+def test_several_phrases_are_answered_side_by_side(browser: Any, thin: Path) -> None:
+    with open_tab(browser, thin) as tab:
+        for line, count in (
+            ("teddy bear, banana; candle", 3),
+            ("candle and teapot", 2),
+            ("red and blue ball", 1),
+        ):
+            tab.run("async (line) => (await langsplat).page.search(line)", line)
+            assert tab.run("async () => (await langsplat).page.answers.length") == count
+        tab.page.fill("#phrase", "teddy bera on the tabel")
+        for _ in range(2):
+            tab.page.press("#phrase", "Enter")
+            tab.page.click("#verdict button")  # did you mean
+        assert tab.page.input_value("#phrase") == "teddy bear on the table"
+        assert tab.page.inner_text("#verdict").startswith("found")
+        assert tab.faults == []
 
 
 def no_encoder(name: str) -> Any:

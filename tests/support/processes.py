@@ -196,11 +196,12 @@ class Tab:
         """Return what a function in JavaScript returns."""
         return self.page.evaluate(script, argument)
 
-    def ask(self, phrase: str, level: str = "auto") -> dict[str, Any]:
-        """The page's answer to a phrase, and the number of its members."""
+    def ask(self, phrase: str, level: str = "auto", whole: bool = True) -> dict[str, Any]:
+        """The page's answer to a phrase, asked whole or as typed, and the number of its members."""
         found: dict[str, Any] = self.run(
-            """async ([phrase, level]) => {
-              const { page, ask } = await langsplat, answer = ask(phrase, level);
+            """async ([phrase, level, whole]) => {
+              const { page, ask } = await langsplat;
+              const answer = whole ? page.language.ask(phrase, level) : ask(phrase, level);
               const { values, members } = page.language.spread(answer, answer.level);
               const sum = (numbers) => numbers.reduce((a, b) => a + b, 0);
               return { ...answer, ...answer.verdict, verdict: answer.verdict.outcome,
@@ -208,7 +209,7 @@ class Tab:
                        codes: null, rows: null, smooth: null, members: sum(members),
                        mean: sum(values) / values.length };
             }""",
-            [phrase, level],
+            [phrase, level, whole],
         )
         return found
 
