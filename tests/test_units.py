@@ -420,7 +420,7 @@ def page(case: Case) -> Found:
     widths = np.ptp(packed["ranges"][:3], axis=2).max(1)
     return {
         "near": Length(asdict(case.scene.raster_settings())["near"]),
-        "views": Places([np.array(view["position"]) + case.scene.bounds()[0] for view in views(case.scene)]),
+        "views": Places([camera.position for camera in views(case.scene)]),
         "ranges": Length(np.linalg.norm(widths), by=1.0),
     }
 

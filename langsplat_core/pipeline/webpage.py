@@ -194,7 +194,7 @@ def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
     }
 
 
-def views(scene: Scene, first: Sequence[Camera]) -> tuple[Camera, ...]:
+def views(scene: Scene, first: Sequence[Camera] = ()) -> tuple[Camera, ...]:
     """Return the views of a page: `first` and the scene's cameras; without any, one that frames it."""
     step = -(-len(scene.cameras) // 200)  # views at most
     others = (camera for camera in scene.cameras[:: step or 1] if camera not in first)
