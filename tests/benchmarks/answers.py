@@ -313,9 +313,7 @@ PAIRS = {  # what is looked for -> the kinds of phrases that are there and that 
     "part": ("part", "absent part"),
     "inside": ("part of thing", "absent part of thing"),
 }
-SHOWN = {
-    "thing shown elsewhere": ("shown", "absent shown")
-}  # what answers by likeness, without a calibration
+SHOWN = {"thing shown elsewhere": ("shown", "absent shown")}  # these answer by likeness to examples
 MARGINS = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0)  # spreads above what counts as found
 
 
@@ -332,18 +330,24 @@ class Verdicts(InRooms):
     taught: bool = False  # also show every thing in one room and ask for it in all others
 
     def run(self) -> None:
-        variant = Variant("the method", self.masks, codec=self.codec)
-        rows = self.each(lambda room: measure_verdicts(room, variant, self.by_chance))
+        rooms = self.each(lambda room: [(room, self._engine(room))])
+        rows = [row for room, engine in rooms for row in measure_verdicts(room, engine)]
         if self.taught:
-            rows += ask_elsewhere(self.each(lambda room: [show_things(room, variant)]))
+            rows += ask_elsewhere([show_things(room, engine) for room, engine in rooms])
         if self.fit is not None:
             calibration = fit_calibration(rows)
             write_calibration(self.fit, calibration)
             print(f"{self.fit}: {calibration}")
-        tables = "\n".join(
-            [verdict_table(rows), *(curve_table(rows, asked) for asked in PAIRS), chance_table(rows)]
-        )
+        curves = [curve_table(rows, asked) for asked in PAIRS]
+        tables = "\n".join([verdict_table(rows), *curves, chance_table(rows)])
         publish(self, "verdicts", "Verdicts: accept and reject rates, and calibration", tables, rows)
+
+    def _engine(self, room: Room) -> QueryEngine:
+        engine = room.engine(Variant("the method", self.masks, codec=self.codec))
+        if not self.by_chance:
+            return engine
+        field = replace(engine.field, calibration=None)
+        return QueryEngine(replace(engine.scene, language=field), lambda _: room.encoder)
 
 
 @dataclass(frozen=True)
@@ -363,12 +367,8 @@ def _verdict(room: Room, text: str, kind: str, answer: QueryResult) -> Verdict:
     return Verdict(room.tier, room.seed, text, kind, answer.fits, answer.probability, answer.found, excess)
 
 
-def measure_verdicts(room: Room, variant: Variant, by_chance: bool = False) -> list[Verdict]:
-    """Every phrase of one room, present and absent, asked of the field of a variant."""
-    engine = room.engine(variant)
-    if by_chance:
-        field = replace(engine.field, calibration=None)
-        engine = QueryEngine(replace(engine.scene, language=field), lambda _: room.encoder)
+def measure_verdicts(room: Room, engine: QueryEngine) -> list[Verdict]:
+    """Every phrase of one room, present and absent."""
     parts, absent_parts = _part_words(room)
     asked = [(p.text, p.kind) for p in room.truth.phrases if p.kind in ("object", "colour+object")]
     asked += product(room.truth.absent(EVERYTHING), ["absent"])
@@ -390,8 +390,8 @@ class Showing:
     there: AbstractSet[bytes]  # vectors of everything that anything in the room is called by
 
 
-def show_things(room: Room, variant: Variant) -> Showing:
-    engine, shown = room.engine(variant), dict[bytes, TaughtWord]()
+def show_things(room: Room, engine: QueryEngine) -> Showing:
+    shown: dict[bytes, TaughtWord] = {}
     for number, region in room.truth.regions.items():
         members = room.labels[-1] == number
         known = region.level == "whole" and region.thing and not engine.unknown_words(region.thing)

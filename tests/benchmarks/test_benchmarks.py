@@ -38,12 +38,12 @@ from tests.benchmarks.answers import (
     Lifting,
     Rooms,
     Verdict,
+    Verdicts,
     ask_elsewhere,
     chance_table,
     curve,
     curve_table,
     measure_methods,
-    measure_verdicts,
     method_table,
     show_things,
     variants,
@@ -390,7 +390,7 @@ def test_verdicts_write_tables_and_a_calibration(tmp_path, monkeypatch):
         for kind, margins in zip(pair, logistic(300), strict=True)
         for m in margins.tolist()
     ]
-    monkeypatch.setattr(InRooms, "rooms", lambda *_: ["a room"])
+    monkeypatch.setattr(InRooms, "each", lambda *_: [("a room", None)])
     monkeypatch.setattr(answers, "measure_verdicts", lambda *_: rows)
     out, reading = tmp_path / "out", tmp_path / "reading.json"
     replace(parse(["verdicts", "--seeds", "301", "--out", str(out)]), fit=reading).run()
@@ -582,13 +582,14 @@ def test_every_number_of_a_report_has_a_range(name):
 
 @pytest.mark.long
 def test_verdicts_and_phrases_measure_the_same_room(run, tmp_path):
-    rows = measure_verdicts(run.room, Variant("the method", "truth", codec=TINY.codec))
-    assert {"object", "absent", "part", "absent part"} <= {row.kind for row in rows}
-    rows = measure_verdicts(run.room, Variant("the method", "truth", codec=TINY.codec), by_chance=True)
-    assert all(row.excess is not None and row.probability is None for row in rows)
-    rows = list(ask_elsewhere([show_things(run.room, Variant("the method", "truth", codec=TINY.codec))] * 2))
-    assert {row.kind for row in rows} == {"shown"}
-    assert np.mean([row.found for row in rows]) > 0.5
+    Verdicts(("separate",), (101,), SETTINGS, run.work, tmp_path, codec=TINY.codec, by_chance=True).run()
+    rows = json.loads((tmp_path / "verdicts.json").read_text())["rows"]
+    assert {"object", "absent", "part", "absent part"} <= {row["kind"] for row in rows}
+    assert all(row["excess"] is not None and row["probability"] is None for row in rows)
+    shown = show_things(run.room, run.room.engine(Variant("the method", "truth", codec=TINY.codec)))
+    asked = list(ask_elsewhere([shown, shown]))
+    assert {row.kind for row in asked} == {"shown"}
+    assert np.mean([row.found for row in asked]) > 0.5
     rows = measure_counts(run.room, Variant("the method", "truth", codec=TINY.codec))
     assert {row.score.way for row in rows} == {"published", "ours"}
     assert {min(row.true, 2) for row in rows} == {0, 1, 2}
