@@ -24,7 +24,6 @@ from langsplat_core.io.files import atomic_path, check_output_file, check_output
 from langsplat_core.io.hostile import write_npy
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import load_scene, save_scene, writable_suffixes
-from langsplat_core.io.shapes import write_points
 from langsplat_core.io.sidecar import SUFFIX, write_language
 from langsplat_core.pipeline.stages import kept
 from langsplat_core.scene import Scene
@@ -197,7 +196,6 @@ WRITERS: dict[str, Write] = {
     "Gaussians": lambda folder: write_ply(folder / "s.ply", GAUSSIANS),
     "sidecar": lambda folder: write_language(folder / "s.safetensors", FIELD, GAUSSIANS.means),
     "cameras": lambda folder: write_cameras(folder / "cameras.json", SCENE.cameras),
-    "points": lambda folder: write_points(folder / "points.ply", SCENE),
     "feature store": features,
     "checkpoint": checkpoint,
     "stage": stage,

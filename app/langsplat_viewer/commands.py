@@ -14,7 +14,6 @@ from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
-from langsplat_viewer.actions.saving import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
 from langsplat_viewer.marks import TOOLS, Tool
 from langsplat_viewer.session import Overlay
@@ -110,11 +109,6 @@ def _tool(tool: Tool) -> Command:
     )
 
 
-def _export(button: str, does: str, part: Part, as_points: bool = False) -> Command:
-    act = partial(saving.export, folder=Path(), part=part, as_points=as_points)
-    return Command(does, act, (), button)
-
-
 def _step(step: editing.Step, act: editing.Action, *keys: str) -> Command:
     def now(viewer: Viewer) -> str:
         return editing.named_step(viewer, step)
@@ -123,8 +117,8 @@ def _step(step: editing.Step, act: editing.Action, *keys: str) -> Command:
 
 
 def _export_as(title: str) -> Command:
-    act = partial(saving.ask_export, title=title)
-    return Command(f"export: {title} ...", act, now=lambda viewer: f"{title} ...")
+    act, button = partial(saving.ask_export, title=title), f"Export {title} ..."
+    return Command(f"export: {title} ...", act, (), button, now=lambda viewer: f"{title} ...")
 
 
 def _side(side: Side, key: str) -> Command:
@@ -233,10 +227,12 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("isolate the selection", editing.isolate_selected, ("Shift+H",), "Isolate"),
         Command("show all that is hidden", editing.show_hidden, ("U", "Alt+H"), "Show all"),
         Command("delete the selection", editing.delete_selected, ("Delete",), "Delete"),
-        _export("Selection", "save the selection", "selection"),
-        _export("Points", "save the selection as points", "selection", as_points=True),
-        _export("Rest", "save the rest", "rest"),
-        _export("Scene", "save the scene without what was deleted", "edited"),
+        Command(
+            "export the selection ...",
+            partial(saving.ask_export, title="scene", only_selected=True),
+            button="Export selection ...",
+            apart=True,
+        ),
     ),
     "View": (
         *(_display(button, number) for number, button in enumerate(BUTTONS, 1)),
@@ -358,7 +354,7 @@ SYNONYMS = {
     "train a scene": "photographs photos images video reconstruct create make new colmap",
     "save a picture": "screenshot image png export capture snapshot render photo",
     "export: web page ...": "save html browser share website offline",
-    "export: scene ...": "save convert format ply spz sog gltf splat write as",
+    "export: scene ...": "save convert format ply spz sog gltf splat write as cleaned",
     "export: cleaned copy ...": "floaters remove tidy",
     "export: compacted copy ...": "compress smaller prune shrink reduce",
     "export: mesh ...": "triangles surface glb geometry print",
@@ -371,8 +367,7 @@ SYNONYMS = {
     "undo": "back revert",
     "gizmo: move, rotate, scale, box, off": "transform translate turn resize handles crop box",
     "delete the selection": "remove erase clean cut crop",
-    "save the selection": "export extract cut out ply",
-    "save the scene without what was deleted": "export clean cleaned ply write",
+    "export the selection ...": "save extract cut out ply",
     "compare two displays": "split side by side beside wipe divide",
     "compare with another scene ...": "split side by side beside difference",
     "show or hide the boxes of what was found": "bounding box outline 3d",

@@ -3,6 +3,8 @@
 import os
 import threading
 from collections.abc import Callable
+from glob import escape, glob
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,24 +22,11 @@ MOST_OFFERED = 8
 
 
 def completions(typed: str, folder: Path, suffixes: tuple[str, ...] = ()) -> list[str]:
-    """Return the first folders, and files with these suffixes, whose paths go on from what was typed.
-
-    `folder`: where a relative path begins. Hidden ones are left out. Does not raise.
-    """
-    before, slash, begun = typed.rpartition("/")
-    try:
-        with os.scandir(folder / os.path.expanduser(before + slash)) as entries:
-            found = sorted(
-                (not entry.is_dir(), entry.name)
-                for entry in entries
-                if entry.name.lower().startswith(begun.lower())
-                and (entry.is_dir() or entry.name.lower().endswith(suffixes))
-                and not entry.name.startswith(".")
-                and is_utf8(Path(entry.name))
-            )
-    except (OSError, ValueError):
-        return []
-    return [before + slash + name + ("" if is_file else "/") for is_file, name in found[:MOST_OFFERED]]
+    """Return the first folders, and files with these suffixes, whose paths go on from what was typed."""
+    found = glob(f"{escape(os.path.join(folder, os.path.expanduser(typed)))}*")  # no hidden ones
+    paths = ((path, os.path.isdir(path)) for path in sorted(found) if is_utf8(Path(path)))
+    offered = (path + os.sep * is_dir for path, is_dir in paths if is_dir or path.lower().endswith(suffixes))
+    return list(islice(offered, MOST_OFFERED))
 
 
 # A scene's files that change while it is shown. A thread of its own looks about once a second, so that the

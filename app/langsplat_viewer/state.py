@@ -111,9 +111,7 @@ class FileChoice:
     title: str
     then: Callable[[Any, Path], object]  # what is done with it in a `Viewer`
     kind: Literal["open", "save", "folder"] = "open"
-    suffixes: tuple[
-        str, ...
-    ] = ()  # of the files that are offered; one to save has the first, if none of them
+    suffixes: tuple[str, ...] = ()  # of files to save; those to open may be all that can be
     start: Path = Path()  # the folder that is shown first, and in it the name of a file to save
 
 

@@ -7,29 +7,16 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.io.ply import CHANNELS, POSITION, write_table
+from langsplat_core.io.ply import CHANNELS, POSITION
 from langsplat_core.io.quantised import to_bytes
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import C0
-
-POINT_SUFFIXES = (".ply",)
 
 
 def base_colours(gaussians: Gaussians) -> Array:
     """Return (N, 3) float64 display values in [0, 1]: of every Gaussian, the same from all sides."""
     colours = 0.5 + C0 * gaussians.sh[:, 0].astype(np.float64)
     return np.clip(np.nan_to_num(colours), 0, 1)
-
-
-def write_points(path: Path | str, scene: Scene) -> int:
-    """Write the means of the Gaussians that can be drawn, in the world, as a PLY point cloud, atomically.
-
-    Red, green and blue are bytes. Return the number of points. InputError for another suffix.
-    """
-    path = check_suffix(path, POINT_SUFFIXES)
-    gaussians, valid = scene.gaussians, scene.gaussians.valid()
-    write_table(path, coloured_columns(scene, gaussians.means[valid], base_colours(gaussians)[valid]))
-    return int(valid.sum())
 
 
 def check_suffix(path: Path | str, suffixes: Sequence[str]) -> Path:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plyfile import PlyData
 from safetensors.numpy import load, save
 
 from langsplat_core.arrays import rotation_matrices, sigmoid, unit
@@ -22,7 +21,6 @@ from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
 from langsplat_core.io.quantised import read_splat_scene, write_splat
 from langsplat_core.io.scenes import load_scene, save_scene, writable_suffixes
-from langsplat_core.io.shapes import write_points
 from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.sog import write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
@@ -707,19 +705,3 @@ def test_a_changed_file_gives_the_same_or_a_line(put, kind, caplog):
             with pytest.raises(InputError, match="--strict") if caplog.messages else nullcontext():
                 read(path)
     assert said > 5
-
-
-# Point clouds, read back by other programs.
-
-
-def test_points_have_places_and_colours(tmp_path):
-    gaussians = random_gaussians(40, sh_degree=1)
-    gaussians.means[7] = np.nan
-    gaussians.sh[8, 0] = 9, -9, 0
-    assert write_points(tmp_path / "a.ply", Scene(gaussians)) == 39
-    vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
-    kept = np.delete(np.arange(40), 7)
-    np.testing.assert_array_equal(np.stack([vertex[k] for k in "xyz"], 1), gaussians.means[kept])
-    colours = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
-    want = np.clip(0.5 + 0.28209479177 * gaussians.sh[kept, 0].astype(np.float64), 0, 1)
-    assert np.abs(colours / 255 - want).max() <= 0.5 / 255 + 1e-9

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plyfile import PlyData
 
 from langsplat_core.cli.app import parse
 from langsplat_core.errors import InputError
@@ -22,7 +21,7 @@ from langsplat_viewer.marks import Drawn, Stroke, outlines
 from langsplat_viewer.projects import BUNDLED
 from langsplat_viewer.session import Move
 from langsplat_viewer.state import EditForm, ExportForm, QueryAnswer
-from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
+from tests.support.fakes import CENTRES, PER_BLOB
 from tests.support.windowless import (
     SCENES,
     FakeSurface,
@@ -390,57 +389,36 @@ def test_export_of_nothing_or_without_a_field_is_refused(viewer, opened):
     assert viewer.state.choice is None
 
 
-def test_export_writes_parts_with_their_field(pruned, tmp_path):
+def test_exported_selection_has_its_field(pruned, tmp_path):
     take(pruned, blob("mug"))
-    for part, word in (("selection", "mug"), ("rest", "book")):
-        act(saving.export, pruned, tmp_path, part)
-        path = tmp_path / f"blobs-{part}-001.ply"
-        assert f"saved {path}: 120 Gaussians" == pruned.state.messages[-1].text
-        written, means = load_scene(path), SCENES["blobs.ply"].gaussians.means
-        np.testing.assert_array_equal(written.gaussians.means, means[blob(word)])
-        assert (len(written.language), len(written.cameras)) == (120, 3)
-    assert pruned.state.is_unsaved  # neither is the scene
+    saving.run_export(pruned, form_of(pruned, "scene", only_selected=True), tmp_path / "mug.ply")
+    recorded(pruned)
+    written, means = load_scene(tmp_path / "mug.ply"), SCENES["blobs.ply"].gaussians.means
+    np.testing.assert_array_equal(written.gaussians.means, means[blob("mug")])
+    assert (len(written.language), len(written.cameras)) == (120, 3)
+    assert pruned.state.is_unsaved  # the scene is not
+    saving.run_export(pruned, form_of(pruned, "scene"), tmp_path / "all.ply")
+    recorded(pruned)
+    assert not pruned.state.is_unsaved
 
 
-def test_exported_points_have_their_colours(opened, tmp_path):
-    take(opened, blob("mug"))
-    act(saving.export, opened, tmp_path, "selection", as_points=True)
-    assert names_in(tmp_path) == ["blobs-selection-points-001.ply"]
-    table = PlyData.read(tmp_path / "blobs-selection-points-001.ply")["vertex"]
-    assert len(table) == 120
-    np.testing.assert_allclose([table["red"][0], table["blue"][0]], 255 * COLOURS[0, [0, 2]], atol=1)
-
-
-def test_export_never_overwrites(opened, tmp_path):
-    take(opened, blob("mug"))
-    taken = tmp_path / "blobs-selection-001.langsplat.safetensors"  # what would belong to the first name
+def test_edited_scene_never_overwrites(pruned, tmp_path):
+    taken = tmp_path / "blobs-edited-001.langsplat.safetensors"  # what would belong to the first name
     taken.write_text("precious")
-    saving.finish_writing(opened)  # nothing is
+    saving.finish_writing(pruned)  # nothing is
     for _ in range(2):  # both are asked for before either is written
-        saving.export(opened, tmp_path, "selection")
-    saving.finish_writing(opened)  # waits for both
+        saving.save_edited(pruned, tmp_path)
+    saving.finish_writing(pruned)  # waits for both
     assert taken.read_text() == "precious"
     written = [name for name in names_in(tmp_path) if name.endswith(".ply")]
-    assert written == ["blobs-selection-002.ply", "blobs-selection-003.ply"]
-
-
-def test_failed_export_says_why(opened, tmp_path):
-    saving.export(opened, tmp_path, "selection")
-    assert "nothing is selected" in opened.state.messages[-1].text
-    editing.select_all(opened)
-    saving.export(opened, tmp_path, "rest")
-    assert "the rest holds no Gaussians" in errors(opened)[-1]
-    (tmp_path / "file").write_text("")
-    act(saving.export, opened, tmp_path / "file", "selection")
-    assert errors(opened)[-1].startswith("not saved: ")
-    assert names_in(tmp_path) == ["file"]
+    assert written == ["blobs-edited-002.ply", "blobs-edited-003.ply"]
 
 
 def test_deletion_is_unsaved_until_exported(pruned, tmp_path):
     for action, unsaved in (
         (editing.undo, False),
         (editing.redo, True),
-        (partial(saving.export, folder=tmp_path, part="edited"), False),
+        (partial(saving.save_edited, folder=tmp_path), False),
         (partial(take, found=blob("mug")), False),
         (editing.delete_selected, True),
     ):
@@ -479,7 +457,7 @@ def test_taught_name_is_found_and_saved(opened, tmp_path):
     act(editing.name_selection, opened, "grandma's mug")
     assert phrases(opened) == ["grandma's mug"]
     np.testing.assert_array_equal(result(opened).members, blob("plant"))
-    act(saving.export, opened, tmp_path, "edited")
+    act(saving.save_edited, opened, tmp_path)
     (saved,) = tmp_path.glob("*.ply")
     assert [word.name for word in load_scene(saved).language.taught] == ["grandma's mug"]
     assert errors(opened) == []
@@ -599,7 +577,7 @@ def test_held_gizmo_previews_the_transform(opened):
 def test_transformed_scene_is_saved_as_seen(opened, tmp_path):
     selected_mug(opened)
     editing.transform(opened, moving(STEP))
-    act(saving.export, opened, tmp_path, "edited")
+    act(saving.save_edited, opened, tmp_path)
     made = load_scene(next(tmp_path.glob("*.ply")))
     np.testing.assert_array_equal(made.gaussians.means, means(opened))
     assert made.language is not None

@@ -160,10 +160,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_typed_path_is_completed_by_folders_and_scenes(folder):
     kinds = (".ply", ".spz")
-    assert completions("", folder, kinds) == ["all/", "A.SPZ", "a.ply"]
-    assert completions("all/../a.", folder, kinds) == ["all/../A.SPZ", "all/../a.ply"]
+    assert completions("", folder, kinds) == [f"{folder}/{name}" for name in ("A.SPZ", "a.ply", "all/")]
+    assert completions("all/../a.", folder, kinds) == [f"{folder}/all/../a.ply"]
     assert completions(f"{folder}/al", Path("/gone"), kinds) == [f"{folder}/all/"]
-    for typed in ("b", "gone/", "a.ply/", "x" * 5000, "\0/"):
+    for typed in ("b", "gone/", "a.ply/", "[a]", "x" * 5000):
         assert completions(typed, folder, kinds) == []
 
 

@@ -83,7 +83,7 @@ LOOKED_FOR = {
     "export: web page ...": "html browser share website",
     "export: mesh ...": "triangles glb",
     "save a film of the path": "video mp4 gif movie",
-    "save the scene without what was deleted": "export clean",
+    "export the selection ...": "extract cut",
     "reset the layout": "reset default restore",
     "delete the selection": "crop erase remove",
     "compare two displays": "split side wipe",

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from langsplat_core.datasets.photos import count_photographs
 from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io.files import is_utf8, shown
-from langsplat_core.io.scenes import format_of, formats, scene_files
+from langsplat_core.io.scenes import format_of, scene_files
 from langsplat_core.pipeline.report import stated_warnings, work_folder
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
@@ -522,20 +522,6 @@ def _mirrored(state: ViewerState, other: ViewerState) -> Session:
 
 # What dialogs ask for.
 
-
-def ask_for_file(viewer: Viewer) -> None:
-    """Have a dialog ask for a scene, a project or a camera path, and open it."""
-    scenes = chain.from_iterable((row.suffix, row.folder_file) for row in formats())
-    suffixes = (*filter(None, scenes), PROJECTS, PATHS)
-    ask_for(viewer, FileChoice("Open a scene", open_file, suffixes=suffixes))
-
-
-def ask_for_beside(viewer: Viewer) -> None:
-    """Have a dialog ask for a scene to compare with."""
-    suffixes = tuple(row.suffix for row in formats())
-    ask_for(viewer, FileChoice("Scene to compare with", open_beside, suffixes=suffixes))
-
-
-def ask_for_dataset(viewer: Viewer) -> None:
-    """Have a dialog ask for a folder of photographs."""
-    ask_for(viewer, FileChoice("Photographs to train on", choose_photographs, "folder"))
+ask_for_file = partial(ask_for, choice=FileChoice("Open a scene", open_file))
+ask_for_beside = partial(ask_for, choice=FileChoice("Scene to compare with", open_beside))
+ask_for_dataset = partial(ask_for, choice=FileChoice("Photographs to train on", choose_photographs, "folder"))

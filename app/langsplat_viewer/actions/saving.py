@@ -1,6 +1,6 @@
-"""What is written: pictures, views and films, parts of the scene, projects; and the question before leaving.
+"""What is written: pictures, views and films, exports, projects; and the question before leaving.
 
-Everything goes to new files, never over old ones, but a project to the file that it came from.
+Everything goes to new files, or over what a dialog has asked about; a project to the file that it came from.
 """
 
 import os
@@ -12,7 +12,6 @@ from concurrent.futures import wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal
 
 import numpy as np
 
@@ -22,13 +21,12 @@ from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import check_keeps, save_scene, scene_files
-from langsplat_core.io.shapes import write_points
 from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
-from langsplat_viewer.actions.editing import adopt, has_selection
+from langsplat_viewer.actions.editing import adopt
 from langsplat_viewer.actions.settings import ask_for, folder_of
 from langsplat_viewer.actions.viewpoint import bookmarked_view, path_motion
 from langsplat_viewer.camera.flight import pose_of
@@ -78,11 +76,17 @@ def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
     return viewer.save(path, write)
 
 
-def _record(viewer: Viewer, label: str, work: Callable[[Progress], tuple[Path, str]]) -> None:
+def _record(
+    viewer: Viewer,
+    label: str,
+    work: Callable[[Progress], tuple[Path, str]],
+    then: Callable[[], None] = lambda: None,
+) -> None:
     """Have the recorder's thread write a file; `work` returns it with what is said of it."""
 
     def done(written: tuple[Path, str]) -> None:
         viewer.state.say(written[1], file=written[0])
+        then()
 
     viewer.recorder.submit(label, work, done, viewer.say_error)
 
@@ -109,7 +113,7 @@ def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the camera, in perspective, to a new file that `--camera` reads; its path, None if that failed."""
     state = viewer.state
     if state.view is None:
-        viewer.say_error("open a scene first, then save a view of it")
+        viewer.has_scene("save a view of it")
         return None
     path = _new_file(viewer, folder, ".json", "-view")
     camera = replace(state.view, orthographic=False).camera(*state.size).moved(state.origin)
@@ -160,54 +164,42 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
     _record(viewer, f"film {out.name}", work)
 
 
-# The selection, the rest, or the scene without what was deleted.
+# The scene as it was edited.
 
-Part = Literal["selection", "rest", "edited"]
 COMPANIONS = (sidecar.SUFFIX, cameras.SUFFIX)
 LONGEST_WAIT = 60.0  # seconds that a window which is closed waits for what is being written
 
 
-def export(
-    viewer: Viewer,
-    folder: Path,
-    part: Part,
-    as_points: bool = False,
-    then: Callable[[Viewer], None] = lambda viewer: None,
-) -> None:
-    """Have the worker write a part of the scene to a new file in `folder`; `then` runs once it is there."""
-    if not (viewer.has_scene("save it") if part == "edited" else has_selection(viewer)):
+def save_edited(viewer: Viewer, folder: Path, then: Callable[[Viewer], None] = lambda viewer: None) -> None:
+    """Have the worker write the scene without what was deleted to a new file; `then` runs after that."""
+    state = viewer.state
+    if not viewer.has_scene("save it") or state.scene is None:
         return
-    state, marks, session = viewer.state, viewer.state.marks, viewer.state.session
-    assert state.scene is not None
-    shown, scene = state.scene, replace(state.scene, language=viewer.language)
-    parts = {"selection": marks.selected, "rest": marks.kept & ~marks.selected, "edited": marks.kept}
-    rows = np.flatnonzero(parts[part])
-    if len(rows) == 0:
-        viewer.say_error(f"the {part} holds no Gaussians: nothing to write")
-        return
-    stem = f"{state.path.stem if state.path else 'scene'}-{part}{'-points' if as_points else ''}"
+    shown, marked = state.scene, state.session
+    rows, stem = np.flatnonzero(state.marks.kept), state.path.stem if state.path else "scene"
+    scene = replace(shown, language=viewer.language).take(rows)
 
-    def done(written: tuple[Path, int]) -> None:
-        path, count = written
-        state.say(f"saved {path}: {count:,} {'points' if as_points else 'Gaussians'}", file=path)
-        if part == "edited" and not as_points and state.scene is shown:
-            state.saved = replace(state.saved, marks=session.marks, moves=session.moves)
+    def work(progress: Progress) -> Path:
+        path = output.free_name(folder, f"{stem}-edited", ".ply", COMPANIONS)
+        save_scene(path, replace(scene, path=path))
+        return path
+
+    def done(path: Path) -> None:
+        state.say(f"saved {path}: {len(rows):,} Gaussians", file=path)
+        _count_as_saved(viewer, shown, marked)
         then(viewer)
 
-    state.writing = viewer.run(
-        f"saving the {part}",
-        lambda progress: _write(scene, rows, folder, stem, as_points),
-        done,
-        lambda reason: viewer.say_error(f"not saved: {reason}"),
-    ).future
+    def failed(reason: str) -> None:
+        viewer.say_error(f"not saved: {reason}")
+
+    state.writing = viewer.run("saving the scene", work, done, failed).future
 
 
-def _write(scene: Scene, rows: Array, folder: Path, stem: str, as_points: bool) -> tuple[Path, int]:
-    path = output.free_name(folder, stem, ".ply", () if as_points else COMPANIONS)
-    if as_points:
-        return path, write_points(path, scene.take(rows))
-    save_scene(path, replace(scene.take(rows), path=path))
-    return path, len(rows)
+def _count_as_saved(viewer: Viewer, shown: Scene, session: Session) -> None:
+    """Note that a file has the edits of a session, if its scene is still shown."""
+    state = viewer.state
+    if state.scene is shown:
+        state.saved = replace(state.saved, marks=session.marks, moves=session.moves)
 
 
 def finish_writing(viewer: Viewer) -> None:
@@ -233,78 +225,58 @@ class Option:
 class ExportRow:
     """Something that a command of the command line makes of a scene."""
 
-    about: str
     words: str  # the command, with places for the scene and what is written
-    # suffix, "" of a folder -> bytes at all, for each Gaussian, and for each coefficient of its colours
-    # (measured on the bundled scene)
+    about: str
+    # Suffix, "" of a folder -> bytes in all, for each Gaussian, and for each coefficient of its colours, as
+    # measured on the bundled scene. `at_most`: it may be much less. `beside`: companions are added.
     sizes: Mapping[str, tuple[float, float, float]]
     options: tuple[Option, ...] = ()
-    has_companions: bool = False
-    at_most: bool = False  # what is written may be much less
+    at_most: bool = False
+    beside: bool = False
     asks: bool = False  # it takes a text encoder in place of the scene's
     needs_field: bool = False
+    keeps_all: bool = False  # a .ply is the scene
 
 
+PAGE = "web page"
 SCENES = {
     ".ply": (0, 56, 12), ".spz": (0, 14, 2), ".sog": (0, 20, 0.5), ".glb": (0, 48, 12), ".gltf": (0, 64, 16),
     ".splat": (0, 32, 0),
 }  # fmt: skip
 LOSS = Option("--max-psnr-loss", "Loss allowed, dB", 0.1, (0.01, 3.0))
+CELL = Option("--resolution", "Metres of a cell", 0.05, (0.01, 0.5))
+UNIT = Option("--metres-per-unit", "Metres of a unit", 1.0, (0.001, 1000.0))  # where the scene has none
 EXPORTS = {
-    "web page": ExportRow(
-        "One file that any browser shows and searches, without a network.",
-        "export {scene} {out}",
+    PAGE: ExportRow(
+        "export {scene} {out}", "One file that any browser shows and searches, without a network.",
         {".html": (1.2e6, 52, 3)},
-        asks=True,
     ),
     "scene": ExportRow(
-        ".ply keeps everything; .spz and .sog are a fifth, and rounded; .splat is without view dependence.",
-        "convert {scene} {out}",
-        SCENES,
-        has_companions=True,
+        "convert {scene} {out}", ".ply keeps everything; .spz and .sog are a fifth, and rounded; .splat is "
+        "without view dependence.", SCENES, beside=True, keeps_all=True,
     ),
     "cleaned copy": ExportRow(
-        "Without floaters: small regions that touch nothing, and veils in free space.",
-        "clean {scene} {out}",
-        SCENES,
-        (LOSS,),
-        has_companions=True,
-        at_most=True,
+        "clean {scene} {out}", "Without floaters: small regions that touch nothing, and veils in free space.",
+        SCENES, (LOSS,), at_most=True, beside=True,
     ),
     "compacted copy": ExportRow(
-        "Without Gaussians and colours that the views do not need.",
-        "compact {scene} --out {out}",
-        SCENES,
-        (LOSS,),
-        has_companions=True,
-        at_most=True,
+        "compact {scene} --out {out}", "Without Gaussians and colours that the views do not need.",
+        SCENES, (LOSS,), at_most=True, beside=True,
     ),
     "mesh": ExportRow(
-        "The surface as triangles with colours: .glb in metres with y up, .ply in the scene's units.",
-        "mesh {scene} {out}",
-        {".glb": (15e6, 0, 0), ".ply": (15e6, 0, 0)},
-        (Option("--watertight", "Close all holes", False),),
+        "mesh {scene} {out}", "Triangles with colours: .glb in metres with y up, .ply in the scene's units.",
+        {".glb": (15e6, 0, 0), ".ply": (15e6, 0, 0)}, (Option("--watertight", "Close all holes", False),),
         at_most=True,
     ),
     "map for a robot": ExportRow(
-        "Occupancy grid, labelled voxels and a collider, into a folder.",
-        "map {scene} {out}",
-        {"": (5e6, 0, 0)},
-        (
-            Option("--resolution", "Metres of a cell", 0.05, (0.01, 0.5)),
-            Option("--metres-per-unit", "Metres of a unit", 1.0, (0.001, 1000.0)),
-        ),
-        asks=True,
+        "map {scene} {out}", "Occupancy grid, labelled voxels and a collider, into a folder.",
+        {"": (5e6, 0, 0)}, (CELL, UNIT), asks=True,
     ),
     "labels": ExportRow(
-        "The scene with instance, part and class of each Gaussian, and the words for them.",
-        "describe {scene} --labels {out}",
-        {".ply": (6e4, 68, 12)},
-        has_companions=True,
-        needs_field=True,
-        asks=True,
+        "describe {scene} --labels {out}", "The scene with instance, part and class of each Gaussian, and "
+        "the words for them.", {".ply": (6e4, 68, 12)}, beside=True, asks=True, needs_field=True,
     ),
-}
+}  # fmt: skip
 
 
 def exports() -> tuple[str, ...]:
@@ -313,15 +285,13 @@ def exports() -> tuple[str, ...]:
     return tuple(title for title, row in EXPORTS.items() if row.words.split()[0] in known)
 
 
-def ask_export(viewer: Viewer, title: str) -> None:
+def ask_export(viewer: Viewer, title: str, only_selected: bool = False) -> None:
     """Open the dialog that exports, with something to write."""
-    state = viewer.state
-    if not viewer.has_scene("export it") or state.scene is None:
-        return
-    row, given = EXPORTS[title], state.scene.metres_per_unit
-    shown = (one for one in row.options if one.flag != "--metres-per-unit" or given is None)
-    values = {option.flag: option.default for option in shown}
-    state.export_form = ExportForm(title, next(iter(row.sizes)), values)
+    scene, row = viewer.state.scene, EXPORTS[title]
+    if viewer.has_scene("export it") and scene is not None:
+        shown = (one for one in row.options if one is not UNIT or scene.metres_per_unit is None)
+        values = {option.flag: option.default for option in shown}
+        viewer.state.export_form = ExportForm(title, next(iter(row.sizes)), values, only_selected)
 
 
 def _exported(viewer: Viewer, form: ExportForm) -> Array:
@@ -340,15 +310,14 @@ def export_problem(viewer: Viewer, form: ExportForm) -> str:
 
 def export_size(viewer: Viewer, form: ExportForm) -> str:
     """Return about how large the files will be, in words."""
-    state, row = viewer.state, EXPORTS[form.title]
-    assert state.scene is not None
-    assert state.path is not None
-    count, (at_all, each, by_colour) = int(_exported(viewer, form).sum()), row.sizes[form.suffix]
-    size = at_all + count * (each + by_colour * state.scene.gaussians.sh.shape[1])
-    size *= (0.05 / form.values.get("--resolution", 0.05)) ** 2
-    if row.has_companions:
-        beside = sum(file.stat().st_size for file in scene_files(state.path)[1:] if file.exists())
-        size += beside * count / max(len(state.scene.gaussians), 1)
+    scene, path, row = viewer.state.scene, viewer.state.path, EXPORTS[form.title]
+    assert scene is not None
+    assert path is not None
+    rows, (in_all, each, by_colour) = _exported(viewer, form), row.sizes[form.suffix]
+    size = in_all + rows.sum() * (each + by_colour * scene.gaussians.sh.shape[1])
+    size *= (CELL.default / form.values.get(CELL.flag, CELL.default)) ** 2
+    if row.beside:
+        size += rows.mean() * sum(file.stat().st_size for file in scene_files(path)[1:] if file.exists())
     return f"{'At most' if row.at_most else 'About'} {size / 1e6:.{0 if size >= 1e7 else 1}f} MB"
 
 
@@ -361,42 +330,32 @@ def choose_export(viewer: Viewer) -> None:
     def then(viewer: Viewer, out: Path) -> None:
         run_export(viewer, form, out)
 
-    title, folder = f"Export: {form.title}", folder_of(viewer)
-    if form.suffix:
-        new = _new_file(viewer, folder, form.suffix, f"-{form.title.split()[0]}")
-        ask_for(viewer, FileChoice(title, then, "save", (form.suffix,), new))
-    else:
-        ask_for(viewer, FileChoice(title, then, "folder"))
+    new = _new_file(viewer, folder_of(viewer), form.suffix, f"-{form.title.split()[0]}")
+    choice = FileChoice(f"Export: {form.title}", then, "save", (form.suffix,), new)
+    ask_for(viewer, choice if form.suffix else replace(choice, kind="folder", start=new.parent))
 
 
 def run_export(viewer: Viewer, form: ExportForm, out: Path) -> None:
     """Have the recorder's thread run the command, on the scene's file or, if it was edited, a copy."""
-    state, row, path = viewer.state, EXPORTS[form.title], viewer.state.path
+    state, row, path, session = viewer.state, EXPORTS[form.title], viewer.state.path, viewer.state.session
     assert state.scene is not None
     assert path is not None
-    rows, scene = _exported(viewer, form), replace(state.scene, language=viewer.language)
-    taught = state.scene.language is not None and viewer.engine is not None and bool(viewer.engine.taught)
-    is_own = rows.all() and not (state.session.moves or taught or viewer.watch.changed) and path.exists()
-    switches = [flag for flag, value in form.values.items() if value is True]
-    words = [
-        *switches,
-        *(f"{flag}={value:g}" for flag, value in form.values.items() if not isinstance(value, bool)),
-    ]
-    if row.asks and viewer.services.encoder_id:
-        words.append(f"--encoder={viewer.services.encoder_id}")
-
-    write_page_of = _page(viewer)
+    shown, mask, scene = state.scene, _exported(viewer, form), replace(state.scene, language=viewer.language)
+    taught = viewer.engine is not None and bool(viewer.engine.taught)
+    is_own = mask.all() and not (state.session.moves or taught or viewer.watch.changed) and path.exists()
+    rows, write_page_of = np.flatnonzero(mask), _page(viewer)
+    words = [flag if value is True else f"{flag}={value:g}" for flag, value in form.values.items() if value]
+    words += [f"--encoder={viewer.services.encoder_id}"] * bool(row.asks and viewer.services.encoder_id)
 
     def work(progress: Progress) -> tuple[Path, str]:
         check_keeps(out, path)
-        if form.title == "web page":
-            return out, write_page_of(out, scene.take(np.flatnonzero(rows)), progress)
+        if form.title == PAGE:
+            return out, write_page_of(out, scene.take(rows), progress)
         with TemporaryDirectory(prefix="langsplat-") as folder:
-            source = path
+            source = path.absolute() if is_own else Path(folder) / f"{path.stem}.ply"
             if not is_own:
                 progress("copying the scene", 0.0)
-                source = Path(folder) / f"{path.stem}.ply"
-                save_scene(source, replace(scene.take(np.flatnonzero(rows)), path=source))
+                save_scene(source, replace(scene.take(rows), path=source))
             named = [word.format(scene=source, out=out) for word in row.words.split()]
             process = CommandProcess([*program(), *named, *words], viewer.recorder.wake)
             try:
@@ -408,13 +367,26 @@ def run_export(viewer: Viewer, form: ExportForm, out: Path) -> None:
                 process.end()
         return out, _said(process, out)
 
-    _record(viewer, form.title, work)
+    def then() -> None:
+        if row.keeps_all and out.suffix == ".ply" and not form.only_selected:
+            _count_as_saved(viewer, shown, session)
+
+    _record(viewer, form.title, work, then)
+
+
+def _said(process: CommandProcess, out: Path) -> str:
+    """Return what a command says of the file that it wrote; InputError with the reason where it failed."""
+    said = process.progress.said
+    if process.exit_code != 0:
+        raise InputError((said or ["no reason given"])[-1].removeprefix("langsplat: "))
+    own = [line.removeprefix(f"{out}: ") for line in said if line.startswith(f"{out}: ")]
+    return "; ".join([f"saved {out}", *(own or [line for line in said[-3:] if str(out) not in line])])
 
 
 def _page(viewer: Viewer) -> Callable[[Path, Scene, Progress], str]:
     """Return what writes a web page that opens with the current view, and has the bookmarks and notes.
 
-    Those are what the command line does not know. It returns what is said of the page.
+    Those the command line does not know. It returns what is said of the page.
     """
     state, services = viewer.state, viewer.services
     assert state.view is not None
@@ -430,15 +402,6 @@ def _page(viewer: Viewer) -> Callable[[Path, Scene, Progress], str]:
         return f"saved {out}: {report.bytes / 1e6:.1f} MB, opens in any browser"
 
     return write
-
-
-def _said(process: CommandProcess, out: Path) -> str:
-    """Return what a command says of the file that it wrote; InputError with the reason where it failed."""
-    said = process.progress.said
-    if process.exit_code != 0:
-        raise InputError((said or ["no reason given"])[-1].removeprefix("langsplat: "))
-    own = [line.removeprefix(f"{out}: ") for line in said if line.startswith(f"{out}: ")]
-    return "; ".join([f"saved {out}", *(own or [line for line in said[-3:] if str(out) not in line])])
 
 
 # Projects.
@@ -571,7 +534,7 @@ def end(viewer: Viewer, folder: Path = Path()) -> None:
     if viewer.state.has_unsaved_notes:
         save_project(viewer, folder)
     if viewer.state.is_unsaved:
-        export(viewer, folder, "edited", then=end_at_once)
+        save_edited(viewer, folder, end_at_once)
     else:
         end_at_once(viewer)
 
@@ -587,7 +550,7 @@ def save_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
     """Write the scene without what was deleted to a new file in `folder`, and go on once it is there."""
     leaving, viewer.state.leaving = viewer.state.leaving, None
     if leaving is not None:
-        export(viewer, folder, "edited", then=leaving.then)
+        save_edited(viewer, folder, leaving.then)
 
 
 def save_project_and_leave(viewer: Viewer, folder: Path = Path()) -> None:

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from os.path import exists
 from pathlib import Path
 from typing import Any
@@ -69,18 +70,18 @@ def set_split(viewer: Viewer, mode: SplitMode) -> None:
         viewer.change(split=replace(viewer.state.session.split, mode=mode))
 
 
-def toggle_wipe(viewer: Viewer) -> None:
-    """Show the second display beside the first, or the first alone."""
+def toggle_split(viewer: Viewer, mode: SplitMode) -> None:
+    """Divide the scene's area, or show one image."""
     split = viewer.state.session.split
-    if split.mode == "wipe":
+    if split.mode == mode:
         set_split(viewer, "off")
-    else:
+    elif mode == "wipe":
         compare_with(viewer, split.second)
+    else:
+        set_split(viewer, mode)
 
 
-def toggle_levels(viewer: Viewer) -> None:
-    """Show the three levels side by side, or one image."""
-    set_split(viewer, "off" if viewer.state.session.split.mode == "levels" else "levels")
+toggle_wipe, toggle_levels = partial(toggle_split, mode="wipe"), partial(toggle_split, mode="levels")
 
 
 def move_line(viewer: Viewer, at: float) -> None:

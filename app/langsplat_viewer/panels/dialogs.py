@@ -19,12 +19,13 @@ from imgui_bundle import portable_file_dialogs as pfd
 
 from langsplat_core.errors import LangSplatError
 from langsplat_core.io.hostile import opened
+from langsplat_core.io.scenes import formats
 from langsplat_core.progress import Progress
 from langsplat_viewer.actions import editing, opening, saving, settings
 from langsplat_viewer.disk import completions
 from langsplat_viewer.jobs import Worker
 from langsplat_viewer.panels import ui
-from langsplat_viewer.projects import BUNDLED, thumbnail_of
+from langsplat_viewer.projects import BUNDLED, PATHS, PROJECTS, thumbnail_of
 from langsplat_viewer.state import ExportForm, FileChoice, Message
 from langsplat_viewer.viewer import Viewer
 
@@ -164,6 +165,26 @@ class Toasts:
             self._shown = []
 
 
+# Dialogs.
+
+
+def _begin_modal(title: str, is_wanted: bool, width: float) -> bool:
+    """Begin a dialog so many widths of an m wide while it `is_wanted`; return whether it is drawn."""
+    ui.ask_for_popup(title, is_wanted)
+    imgui.set_next_window_size(ImVec2(ui.fitting(width, 1).x, 0))
+    flags = imgui.WindowFlags_.no_saved_settings | imgui.WindowFlags_.no_resize
+    return bool(imgui.begin_popup_modal(title, None, flags)[0])
+
+
+def _end_modal(viewer: Viewer, name: str, cancel: str = "Cancel") -> None:
+    """End it with a button that empties its field of the state, as Esc does; without that it closes."""
+    if imgui.button(cancel) or imgui.is_key_pressed(imgui.Key.escape):
+        settings.put(viewer.state, **{name: None})
+    if getattr(viewer.state, name) is None:
+        imgui.close_current_popup()
+    imgui.end_popup()
+
+
 # Files and folders: by the dialogs of the system, else by a path.
 
 BOX_EM = 34.0
@@ -177,10 +198,18 @@ def system_dialog(choice: FileChoice) -> Any:
     within = f"{choice.start}{os.sep}"
     if choice.kind == "folder":
         return pfd.select_folder(choice.title, within)
-    filters = [choice.title, " ".join(f"*{suffix}" for suffix in choice.suffixes), "All files", "*"]
+    filters = [choice.title, " ".join(f"*{suffix}" for suffix in _offered(choice)), "All files", "*"]
     if choice.kind == "save":
         return pfd.save_file(choice.title, str(choice.start), filters)
     return pfd.open_file(choice.title, within, filters)
+
+
+def _offered(choice: FileChoice) -> tuple[str, ...]:
+    """Return the endings of files that are offered; none where a folder is wanted."""
+    if choice.kind != "open":
+        return choice.suffixes or ("/",)  # which no name of a file has
+    names = (name for row in formats() for name in (row.suffix, row.folder_file) if name)
+    return (*names, PROJECTS, PATHS)
 
 
 class FileDialogs:
@@ -206,20 +235,13 @@ class FileDialogs:
         if choice is not self._choice:
             self._begin(viewer, choice)
         title = "Choose" if choice is None else choice.title
-        ui.ask_for_popup(f"{title}###choice", choice is not None)
-        imgui.set_next_window_size(ImVec2(ui.fitting(BOX_EM, 1).x, 0))
-        flags = imgui.WindowFlags_.no_saved_settings | imgui.WindowFlags_.no_resize
-        if not imgui.begin_popup_modal(f"{title}###choice", None, flags)[0]:
+        if not _begin_modal(f"{title}###choice", choice is not None, BOX_EM):
             return
         if choice is not None and self._dialog is None:
             _path_box(viewer, choice)
         else:
             imgui.text_wrapped("Choose in the window that the system has opened.")
-        if imgui.button("Cancel") or imgui.is_key_pressed(imgui.Key.escape):
-            settings.put(viewer.state, choice=None)
-        if viewer.state.choice is None:
-            imgui.close_current_popup()
-        imgui.end_popup()
+        _end_modal(viewer, "choice")
 
     def _begin(self, viewer: Viewer, choice: FileChoice | None) -> None:
         self.close()
@@ -255,8 +277,7 @@ def _path_box(viewer: Viewer, choice: FileChoice) -> None:
     if typed is not None:
         settings.choose(viewer, typed)
         drafts["##path"] = typed
-    suffixes = choice.suffixes or ("/",)  # which no name has
-    for offer in completions(drafts.get("##path", ""), folder, suffixes):
+    for offer in completions(drafts.get("##path", ""), folder, _offered(choice)):
         if imgui.selectable(offer, False, imgui.SelectableFlags_.no_auto_close_popups)[0]:
             drafts["##path"] = offer
 
@@ -269,18 +290,10 @@ EXPORT_EM = 27.0
 def draw_export(viewer: Viewer) -> None:
     """Draw the dialog that exports: what, its options, and about how large it will be."""
     form = viewer.state.export_form
-    ui.ask_for_popup("Export", form is not None)
-    imgui.set_next_window_size(ImVec2(ui.fitting(EXPORT_EM, 1).x, 0))
-    flags = imgui.WindowFlags_.no_saved_settings | imgui.WindowFlags_.no_resize
-    if not imgui.begin_popup_modal("Export", None, flags)[0]:
-        return
-    if form is not None:
-        _export(viewer, form)
-    if imgui.button("Cancel") or imgui.is_key_pressed(imgui.Key.escape):
-        settings.put(viewer.state, export_form=None)
-    if viewer.state.export_form is None:
-        imgui.close_current_popup()
-    imgui.end_popup()
+    if _begin_modal("Export", form is not None, EXPORT_EM):
+        if form is not None:
+            _export(viewer, form)
+        _end_modal(viewer, "export_form")
 
 
 def _export(viewer: Viewer, form: ExportForm) -> None:
@@ -343,21 +356,18 @@ def draw_changed(viewer: Viewer, area: ui.Area) -> None:
 
 # What is not saved.
 
+LEAVING_EM = 32.0
+
 
 def draw_unsaved(viewer: Viewer) -> None:
     """Ask whether to save, discard or stay; over everything else, while something waits for the answer."""
     leaving = viewer.state.leaving
-    ui.ask_for_popup("Not saved", leaving is not None)
-    flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings
-    if not imgui.begin_popup_modal("Not saved", None, flags)[0]:
-        return
-    if leaving is not None and leaving.film:
-        _wait_for_film(viewer)
-    elif leaving is not None:
-        _ask(viewer, leaving.to)
-    if viewer.state.leaving is None:
-        imgui.close_current_popup()
-    imgui.end_popup()
+    if _begin_modal("Not saved", leaving is not None, LEAVING_EM):
+        if leaving is not None and leaving.film:
+            _wait_for_film(viewer)
+        elif leaving is not None:
+            _ask(viewer, leaving.to)
+        _end_modal(viewer, "leaving", "Stay" if leaving is not None and leaving.film else "Cancel")
 
 
 def _ask(viewer: Viewer, to: str) -> None:
@@ -365,7 +375,7 @@ def _ask(viewer: Viewer, to: str) -> None:
     if state.is_unsaved:
         moved = " and some transformed" if state.session.moves else ""
         count = f"{int(state.marks.deleted.sum()):,} Gaussians"
-        imgui.text_unformatted(f"{count} were deleted{moved}, and the scene is not saved so.")
+        imgui.text_wrapped(f"{count} were deleted{moved}, and the scene is not saved so.")
     if state.has_unsaved_notes:
         imgui.text_unformatted("Notes or names are in no project.")
     imgui.text_unformatted(f"Save before {to}?")
@@ -379,8 +389,6 @@ def _ask(viewer: Viewer, to: str) -> None:
     if imgui.button("Discard"):
         saving.go_on(viewer)
     imgui.same_line()
-    if imgui.button("Cancel"):
-        settings.put(viewer.state, leaving=None)
 
 
 def _wait_for_film(viewer: Viewer) -> None:
@@ -393,5 +401,3 @@ def _wait_for_film(viewer: Viewer) -> None:
     if imgui.button("Stop it, and close"):
         saving.end_at_once(viewer)
     imgui.same_line()
-    if imgui.button("Stay"):
-        settings.put(viewer.state, leaving=None)

@@ -23,7 +23,7 @@ from langsplat_viewer.viewer import Viewer
 
 OF_SELECTED = (
     *("None", "Grow", "Shrink", "More like it", "Hide", "Isolate", "Delete"),
-    *("Selection", "Rest", "Points"),
+    "Export selection ...",
 )
 
 
@@ -44,10 +44,7 @@ def draw(viewer: Viewer) -> None:
     imgui.separator()
     ui.verbs(viewer, "Hide", "Isolate", "Show all", "Delete", disabled=disabled)
     imgui.separator()
-    imgui.align_text_to_frame_padding()
-    imgui.text("Save")
-    imgui.same_line()
-    ui.verbs(viewer, "Selection", "Rest", "Points", "Scene", disabled=disabled)
+    ui.verbs(viewer, "Export selection ...", "Export scene ...", disabled=disabled)
     imgui.end_disabled()
 
 
