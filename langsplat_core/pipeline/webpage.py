@@ -43,7 +43,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query import grammar, taught
 from langsplat_core.query.answers import place_of
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
-from langsplat_core.query.instances import BOXED, oriented_box
+from langsplat_core.query.instances import BOXED, OrientedBox, axis_aligned_box, oriented_box
 from langsplat_core.query.inventory import suggest
 from langsplat_core.query.relations import ASIDE, NEAR, WHOLE, Body, body, stands, upright
 from langsplat_core.query.rule import RULE
@@ -61,7 +61,7 @@ BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, witho
 WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS", "ALSO_NOUNS")
 STILL = 1280  # pixels of the longer side of the picture in the page
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
-TOUCHING: tuple[grammar.Side, ...] = ("on", "in", "near")  # relations that follow from points
+TOUCHING: tuple[grammar.Side, ...] = ("near", "on", "in")  # relations that follow from points
 CHUNK = 256  # Gaussians that share the range of a quantised column
 FLATTEST, OPAQUE = -46.0, 20.0  # bounds of the logarithm of a scale, whatever a file holds; of a logit
 
@@ -136,7 +136,7 @@ def write_page(
     meta |= {"language": language or None, "why_not": why_not}
     progress("compressing", 0.8)
     plain = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
-    packed = zlib.compress(save(plain, {"page": json.dumps(meta, allow_nan=False)}), 9)
+    packed = zlib.compress(save(plain, {"page": json.dumps(meta, allow_nan=False)}))
     text = page_text(title, packed, _still(scene, seen_from[0]))
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -276,15 +276,19 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
     """
     regions, scene, (centre, _) = engine.regions, engine.scene, engine.scene.bounds()
     means, count = scene.gaussians.means, sum(map(len, regions.nodes))
-    places, boxes, corners = [], [], []
-    for level, sizes in enumerate(regions.sizes):
+    places, boxes, corners = np.empty((count, 3)), np.empty((count, 2, 3)), np.empty((count, 8, 3))
+    axes, parents = np.empty((count, 3, 3)), regions.table.parents
+    for level, sizes in reversed([*enumerate(regions.sizes)]):
         order = regions.counts[np.argsort(regions.everywhere[level, regions.counts], kind="stable")]
         each = np.split(order, np.cumsum(sizes)[:-1]) if len(sizes) else []
-        found = [place_of(means[own]) for own in each]
-        places += [place for place, _ in found]
-        boxes += [box.ravel() for _, box in found]
-        around = [oriented_box(means[own[:: -(-len(own) // BOXED)]]).corners for own in each]
-        corners += [(eight - centre).ravel() for eight in around]
+        for region, own in enumerate(each, sum(map(len, regions.nodes[:level]))):
+            points, parent = means[own] - centre, parents[region]
+            places[region], boxes[region] = place_of(means[own])
+            # A part's box lies along that of its whole, which was settled before.
+            turned = axes[parent] if parent >= 0 else oriented_box(points[:: -(-len(own) // BOXED)]).axes
+            low, high = axis_aligned_box(points @ turned)
+            axes[region] = turned
+            corners[region] = OrientedBox(turned @ ((low + high) / 2), turned, (high - low) / 2).corners
         if level == WHOLE:
             bodies = [body(means[own] - centre, upright(scene.up())) for own in each]
     share = regions.mixtures(codes, engine.field.codec.size + 1)[:, :-1].tocoo()
@@ -293,10 +297,10 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
         "share_code": share.col.astype(np.uint16),
         "share": share.data.astype(np.float32),
         "sizes": np.concatenate(regions.sizes).astype(np.uint32),
-        "parents": regions.table.parents.astype(np.int32),
-        "places": scene.in_world(np.reshape(places, (count, 3))),
-        "boxes": scene.in_world(np.reshape(boxes, (count, 2, 3))).reshape(count, 6),
-        "corners": np.array(corners, np.float32).reshape(count, 24),
+        "parents": parents.astype(np.int32),
+        "places": scene.in_world(places),
+        "boxes": scene.in_world(boxes).reshape(count, 6),
+        "corners": corners.astype(np.float32).reshape(count, 24),
         "bodies": np.array([(one.low, one.high) for one in bodies], np.float32).reshape(-1, 6),
         "pairs": np.array(_touching(bodies), np.uint32).reshape(-1, 3),
     }
@@ -308,10 +312,15 @@ def _touching(bodies: Sequence[Body]) -> list[tuple[int, int, int]]:
     found = []
     for number, one in enumerate(bodies):
         apart = np.linalg.norm(np.maximum(0, np.maximum(low - one.high, one.low - high)), axis=1)
-        for other in np.flatnonzero(apart <= NEAR * one.size).tolist():
-            if other != number:
-                kinds = (k for k, kind in enumerate(TOUCHING) if stands(kind, one, bodies[other], None))
-                found += [(kind, number, other) for kind in kinds]
+        for other in np.flatnonzero(apart[:number] <= NEAR * one.size).tolist():
+            ways, near = ((number, other), (other, number)), stands("near", one, bodies[other], None)
+            found += [(0, *way) for way in ways if near]
+            found += [
+                (kind, a, b)
+                for kind, name in enumerate(TOUCHING)
+                for a, b in ways
+                if kind > 0 and stands(name, bodies[a], bodies[b], None)
+            ]
     return found
 
 

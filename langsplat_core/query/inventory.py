@@ -72,8 +72,13 @@ class _Claim:
     probability: float
 
 
-def scene_inventory(describer: Describer, progress: Progress = silent) -> list[InventoryEntry]:
-    """Return every word true in the scene, once, at its coarsest level; wholes first, then by surface."""
+def scene_inventory(
+    describer: Describer, progress: Progress = silent, placed: bool = True
+) -> list[InventoryEntry]:
+    """Return every word true in the scene, once, at its coarsest level; wholes first, then by surface.
+
+    placed: with the spots of each, which need the scene's surface.
+    """
     field, known = describer.engine.field, describer.known
     of = np.full(known.shape, -1, np.int64)
     latents, of[known] = field.codec.unique(field.latents[known])
@@ -83,7 +88,7 @@ def scene_inventory(describer: Describer, progress: Progress = silent) -> list[I
         claims = list(_claims(describer, latents, of[level], level))
         for done, claim in enumerate(claims):
             progress("checking words", done / len(claims), LEVELS[level])
-            entry = _verified(describer, claim) if named.isdisjoint(claim.phrases) else None
+            entry = _verified(describer, claim, placed) if named.isdisjoint(claim.phrases) else None
             if entry is not None:
                 entries.append(entry)
                 named.update(claim.phrases)
@@ -140,7 +145,7 @@ def same_things(names: Array, surface: Array) -> list[list[int]]:
     return groups
 
 
-def _verified(describer: Describer, claim: _Claim) -> InventoryEntry | None:
+def _verified(describer: Describer, claim: _Claim, placed: bool) -> InventoryEntry | None:
     """Return the claim as an entry under the first of its words that a query finds there, if any."""
     engine, areas, level = describer.engine, describer.areas, claim.level
     for phrase in claim.phrases:
@@ -148,8 +153,8 @@ def _verified(describer: Describer, claim: _Claim) -> InventoryEntry | None:
         agreed = claim.rows[result.relevancy[level, claim.rows] > FLOOR]
         if not result.found or 2 * areas[agreed].sum() < areas[claim.rows].sum():
             continue
-        spots = _spots(describer, agreed)
-        if spots:
+        spots = _spots(describer, agreed) if placed else ()
+        if spots or (not placed and len(agreed) >= LEAST_COUNT):
             others = tuple(other for other in claim.phrases if other != phrase)
             share = float(sum(spot.share for spot in spots))
             return InventoryEntry(phrase, others, level, claim.probability, result.peak, share, spots)
@@ -316,7 +321,8 @@ def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = s
     try:
         describer = Describer(engine, progress=progress)
         taught = describer.words[0].phrases
-        entries = sorted(scene_inventory(describer, progress), key=lambda entry: -entry.probability)
+        inventory = scene_inventory(describer, progress, placed=False)
+        entries = sorted(inventory, key=lambda entry: -entry.probability)
         here = tuple(entry.phrase for entry in entries)
     except LangSplatError:  # no encoder here, or one that knows none of the words: the phrasebook is left
         pass
