@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, Literal, TypeVar
 
 import moderngl
@@ -335,7 +336,7 @@ class Latest(Generic[M]):
         if key != self._key:
             self.drop()
             self._key = key
-            self.worker.submit("", make, self._keep, self._fail)
+            self.worker.submit("", make, partial(setattr, self, "_made"), partial(setattr, self, "_problem"))
 
     def made(self, key: object) -> M | None:
         """Return what has that key, if it is ready. Raises BackendError, once, where it failed."""
@@ -350,9 +351,3 @@ class Latest(Generic[M]):
         self.worker.cancel()
         self.worker.poll()  # so that nothing of a job that was left is held
         self._key, self._made, self._problem = None, None, ""
-
-    def _keep(self, made: M) -> None:
-        self._made = made
-
-    def _fail(self, problem: str) -> None:
-        self._problem = problem

@@ -242,6 +242,7 @@ class SceneState:
     suggestions: Suggestions = field(default_factory=Suggestions)
     offered: tuple[str, tuple[str, tuple[str, ...]]] = ("", ("", ()))  # what was typed, and its offers
     suggestions_of: Scene | None = None  # the scene for which they were looked for
+    frusta: tuple[Scene, Array] | None = None  # (C, 8, 2, 3) edges of the cameras of which scene
     pivot: tuple[Scene, Array, Array] | None = None  # of what is selected in which scene, a point (3,)
     out_of_sight: tuple[OutlineView, Marks, Array] | None = None  # nodes with nothing shown, of which
     _edited: EditedScene | None = None  # of the last request

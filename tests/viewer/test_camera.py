@@ -213,6 +213,14 @@ def test_training_cameras_wrap_round(opened):
     assert opened.state.camera_index == 0
 
 
+def test_frusta_are_computed_once_for_a_scene(opened):
+    made = viewpoint.camera_frusta(opened)
+    assert made.shape == (3, 8, 2, 3)
+    assert viewpoint.camera_frusta(opened) is made
+    open_scene(opened, "bare.ply")
+    assert len(viewpoint.camera_frusta(opened)) == 0
+
+
 def test_double_click_turns_around_the_surface(opened):
     go(viewpoint.focus_pixel, opened, 0.75, 0.5)
     assert_allclose(opened.state.view.target, (0.25, 0.0, 0.0))

@@ -60,8 +60,7 @@ def _new_file(viewer: Viewer, folder: Path, suffix: str, more: str = "") -> Path
 def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the scene as shown to a new PNG in `folder`; return its path, None if that failed."""
     state = viewer.state
-    if viewer.surface is None or state.scene is None or state.view is None:
-        viewer.say_error("open a scene first, then save a picture of it")
+    if not viewer.has_scene("save a picture of it") or viewer.surface is None or state.view is None:
         return None
     path = _new_file(viewer, folder, ".png")
     beside, transparent = viewer.beside, state.session.picture.transparent
@@ -94,8 +93,7 @@ def _record(
 def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
     """Have the scene as shown drawn by the CPU in the size of a film, and saved to a new file."""
     state, (width, height) = viewer.state, viewer.state.record.size
-    if state.view is None:
-        viewer.say_error("open a scene first, then save a picture of it")
+    if not viewer.has_scene("save a picture of it") or state.view is None:
         return
     request = state.request((width, height), state.session.picture.transparent)
 
@@ -433,8 +431,7 @@ def save_project(viewer: Viewer, folder: Path = Path(), to: Path | None = None) 
     Return where it is, None where that failed.
     """
     state = viewer.state
-    if state.scene is None or state.path is None or state.view is None:
-        viewer.say_error("open a scene first, then save the project")
+    if not viewer.has_scene("save the project") or not (state.scene and state.path and state.view):
         return None
     path = to or state.project or _new_file(viewer, folder, PROJECTS)
     read = state.project_read if path == state.project else None

@@ -11,13 +11,14 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError, LangSplatError, printable_line
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
-from langsplat_core.query.engine import QueryEngine, no_field
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera import controls, flight
 from langsplat_viewer.camera.controls import Extent, OrbitCamera, Side
 from langsplat_viewer.camera.flight import Keyframe, Motion
+from langsplat_viewer.camera.overlays import FRUSTUM_DEPTH, frusta
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight
 from langsplat_viewer.rendering.request import image_formation
@@ -135,6 +136,16 @@ def go_to_camera(viewer: Viewer, index: int) -> None:
     glide_to(viewer, controls.from_camera(scene.cameras[viewer.state.camera_index], extent))
 
 
+def camera_frusta(viewer: Viewer) -> Array:
+    """(C, 8, 2, 3) edges of the pyramids of the training cameras; none without a scene."""
+    scene, extent, kept = viewer.state.scene, viewer.state.extent, viewer.state.frusta
+    if scene is None or extent is None:
+        return np.zeros((0, 8, 2, 3))
+    if kept is None or kept[0] is not scene:  # asked in every frame
+        kept = viewer.state.frusta = scene, frusta(scene.cameras, FRUSTUM_DEPTH * extent.radius)
+    return kept[1]
+
+
 def step_camera(viewer: Viewer, by: int) -> None:
     """Go to the next (1) or previous (-1) training camera."""
     go_to_camera(viewer, (viewer.state.camera_index or 0) + by)
@@ -206,8 +217,8 @@ def toggle_playing(viewer: Viewer) -> None:
     record = viewer.state.record
     if record.began is not None:
         record.began = None
-    elif viewer.state.view is None:
-        viewer.say_error("open a scene first, then play a path in it")
+    elif not viewer.has_scene("play a path in it"):
+        return
     elif path_seconds(viewer) <= 0:
         viewer.say_error("a path needs two keyframes: add one at the current view")
     else:
@@ -267,8 +278,7 @@ def _show(viewer: Viewer, seconds: float) -> None:
 def add_keyframe(viewer: Viewer) -> None:
     """Add the current view as a keyframe, some seconds after the last one."""
     state, record = viewer.state, viewer.state.record
-    if state.view is None:
-        viewer.say_error("open a scene first, then record a path in it")
+    if not viewer.has_scene("record a path in it") or state.view is None:
         return
     keyframes = state.session.keyframes
     last = keyframes[-1].seconds + SPACING if keyframes else 0.0
@@ -364,10 +374,8 @@ REST_SECONDS = 0.2  # of the mouse, after which it is asked what lies there
 def toggle_pointing(viewer: Viewer) -> None:
     """Say what is under the cursor from now on, or no longer."""
     state = viewer.state
-    if not state.pointing and (state.scene is None or state.scene.language is None):
-        viewer.say_error("open a scene first" if state.scene is None else no_field(state.scene))
-        return
-    state.pointing, state.hover = not state.pointing, None
+    if state.pointing or viewer.searchable() is not None:
+        state.pointing, state.hover = not state.pointing, None
 
 
 def hover(viewer: Viewer, pixel: tuple[int, int] | None) -> None:
@@ -409,8 +417,7 @@ def _ask(viewer: Viewer, place: Hover) -> None:
 def add_bookmark(viewer: Viewer, name: str = "") -> None:
     """Keep the current view; in place of one of the same name. Without a name it gets a number."""
     state, kept = viewer.state, viewer.state.session.bookmarks
-    if state.view is None:
-        viewer.say_error("open a scene first, then bookmark a view of it")
+    if not viewer.has_scene("bookmark a view of it") or state.view is None:
         return
     if not name.strip():
         taken, number = {bookmark.name for bookmark in kept}, len(kept) + 1

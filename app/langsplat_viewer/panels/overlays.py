@@ -184,8 +184,7 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
         if grid is not None:
             _grid(grid, pen)
         if "cameras" in shown:
-            edges = overlays.frusta(state.scene.cameras, overlays.FRUSTUM_DEPTH * state.extent.radius)
-            _cameras(viewer, edges, pen)
+            _cameras(viewer, viewpoint.camera_frusta(viewer), pen)
         if "things" in shown:  # after the lines, so that its words are readable
             _things(viewer, pen)
         _ruler(state.session.ruler, pen, metres)

@@ -307,23 +307,19 @@ class GlRenderer(Renderer[moderngl.Texture]):
     def draw(self, request: RenderRequest, targets: Sequence[moderngl.Texture]) -> None:
         layers, (*channels, selected) = self._rasterized(request)
         for pane, channel, texture in zip(request.panes, channels, targets, strict=True):
-            target = self._ctx.framebuffer([texture])
-            self._compose(request, pane, layers, (channel, selected), target)
-            target.release()
+            self._compose(request, pane, layers, (channel, selected), texture)
 
     def read(self, request: RenderRequest) -> Array:
         camera, components = request.camera, 4 if request.picture.transparent else 3
-        (layers, (*channels, selected)), images = self._rasterized(request), []
-        target = self._ctx.framebuffer([self._ctx.renderbuffer((camera.width, camera.height), 4)])
+        targets = [self._ctx.texture((camera.width, camera.height), 4) for _ in request.panes]
         try:
-            for pane, channel in zip(request.panes, channels, strict=True):
-                self._compose(request, pane, layers, (channel, selected), target)
-                pixels = np.frombuffer(target.read(components=components, alignment=1), np.uint8)
-                images.append(pixels.reshape(camera.height, camera.width, components)[::-1].copy())
+            self.draw(request, targets)
+            pixels = [np.frombuffer(target.read(), np.uint8) for target in targets]
         finally:
-            target.color_attachments[0].release()
-            target.release()
-        return request.split.joined(images, request.width)
+            for target in targets:
+                target.release()
+        images = [part.reshape(camera.height, camera.width, 4)[::-1, :, :components] for part in pixels]
+        return request.split.joined([image.copy() for image in images], request.width)
 
     def _splat(self, view: View, scene: Scene, channels: tuple[Channel, ...]) -> tuple[moderngl.Texture, ...]:
         valued = [channel for channel in channels if isinstance(channel, np.ndarray)]
@@ -348,7 +344,7 @@ class GlRenderer(Renderer[moderngl.Texture]):
         pane: Pane,
         layers: Layers[moderngl.Texture],
         channels: tuple[Channel, Channel],  # the pane's, and that of the selection
-        target: moderngl.Framebuffer,
+        texture: moderngl.Texture,
     ) -> None:
         picture, (channel, selected) = pane.picture, channels
         uniforms: dict[str, object] = {
@@ -370,12 +366,13 @@ class GlRenderer(Renderer[moderngl.Texture]):
             "background": picture.background,
         }
         set_uniforms(self._program, uniforms)
-        for unit, texture in enumerate(
-            (layers.images[0], layers.of(channel), self._maps, layers.of(selected))
-        ):
-            texture.use(unit)
+        sources = layers.images[0], layers.of(channel), self._maps, layers.of(selected)
+        for unit, source in enumerate(sources):
+            source.use(unit)
+        target = self._ctx.framebuffer([texture])
         with drawing(self._ctx, target, moderngl.NOTHING):
             self._vao.render(moderngl.TRIANGLES, vertices=3)
+        target.release()
 
     def _alpha(self, layer: moderngl.Texture) -> Array:
         return np.frombuffer(layer.read(), layer.dtype).reshape(-1, layer.components)[:, -1]

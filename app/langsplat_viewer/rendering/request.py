@@ -268,17 +268,6 @@ def plain_request(scene: Scene, camera: Camera, picture: PictureConfig, **more: 
 VISIBLE_ALPHA = 1 / 255
 
 
-def _in_image(gaussians: Gaussians, camera: Camera) -> tuple[slice, Array, Array]:
-    """Return rows of at most 40 000 Gaussians, their (M,) depths, and (M,) whether they are in the image.
-
-    They go by their centres; quantiles need no more of them.
-    """
-    rows = slice(None, None, max(len(gaussians) // 20_000, 1))
-    with np.errstate(invalid="ignore", over="ignore"):
-        pixels, depths = camera.project(gaussians.means[rows].astype(np.float64))
-        return rows, depths, camera.in_image(pixels, depths)
-
-
 def image_formation(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> RasterSettings:
     """Return the scene's own image formation, within `clip`.
 
@@ -295,9 +284,10 @@ def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) ->
 
     (0, 1) where nothing is.
     """
-    _, depths, inside = _in_image(gaussians, camera)
-    with np.errstate(invalid="ignore"):
-        inside &= clip.keeps(depths)
+    some = gaussians.means[:: max(len(gaussians) // 20_000, 1)]  # quantiles need no more
+    with np.errstate(invalid="ignore", over="ignore"):
+        pixels, depths = camera.project(some.astype(np.float64))
+        inside = camera.in_image(pixels, depths) & clip.keeps(depths)
     if not inside.any():
         return 0.0, 1.0
     near, far = np.quantile(depths[inside], [0.02, 0.98])
