@@ -27,7 +27,7 @@ from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer, ReferenceView
 from langsplat_core.raster.reference import colours as true_colours
 from langsplat_core.raster.render import splat_colours
-from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene import Camera, Gaussians
 from tests.support.backends import Backend, Measure, assert_adjoint
 from tests.support.hard_cases import CASES, HUGE_IMAGE, ROW, Case, Drawing, Seen, altered, balls, crowd, draw
 from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
@@ -37,8 +37,8 @@ Drawn = tuple[Gaussians, Camera, RasterSettings]
 
 @st.composite
 def cases(draw: st.DrawFn) -> Drawn:
-    """1 to 30 Gaussians, sizes 1e-6 to 10 world units, opacities from 0 to 1, any camera of both kinds."""
-    count, seed = draw(st.integers(1, 30)), draw(st.integers(0, 2**31))
+    """1 to 80 Gaussians, sizes 1e-6 to 10 world units, opacities from 0 to 1, any camera of both kinds."""
+    count, seed = draw(st.integers(1, 80)), draw(st.integers(0, 2**31))
     rng = np.random.default_rng(seed)
     base = random_gaussians(count, seed)
     size, anisotropy = draw(st.floats(-6, 1)), draw(st.floats(0, 6))
@@ -51,7 +51,7 @@ def cases(draw: st.DrawFn) -> Drawn:
         quats_wxyz=base.quats_wxyz * 10 ** draw(st.floats(-3, 3)),
         opacity_logits=opacity + rng.normal(size=count),
     )
-    width, height = draw(st.integers(1, 36)), draw(st.integers(1, 36))
+    width, height = draw(st.integers(1, 50)), draw(st.integers(1, 50))
     camera = random_camera(seed, width, height, distance=draw(st.floats(0.05, 6)))
     if draw(st.booleans()):
         camera = without_perspective(camera, draw(st.floats(0.05, 6)))
@@ -60,10 +60,10 @@ def cases(draw: st.DrawFn) -> Drawn:
     return gaussians, camera, replace(profile, antialiased=draw(st.booleans()), focal=focal)
 
 
-def over_random_cases(law: Callable[[Drawn], None], slow: bool, largest: int = 1000) -> None:
+def over_random_cases(law: Callable[[Drawn], None], slow: bool, few: int = 25) -> None:
     """Run `law` on as many cases as the tier has."""
     examples = settings(
-        max_examples=largest if slow else 25, derandomize=True, suppress_health_check=list(HealthCheck)
+        max_examples=1000 if slow else few, derandomize=True, suppress_health_check=list(HealthCheck)
     )
     examples(given(cases())(law))()
 
@@ -119,31 +119,98 @@ def test_gather_is_the_adjoint_of_splat(backend: Backend, slow: bool) -> None:
     over_random_cases(law, slow)
 
 
-def off(seen: Seen) -> tuple[Array, Array]:
-    """(H, W) distance of image or alpha from the reference's, whichever is more, and where cut-offs are."""
+# How far every fast rasterizer is from the reference.
+
+FLIPS = 1e-3  # of the pixels; each costs one alpha of 1/255
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What the reference makes of a drawing."""
+
+    image: Array  # (H, W, C) of its features
+    alpha: Array
+    depth: Array
+    band: Array  # (H, W) True at a cut-off
+    view: ReferenceView
+
+
+@lru_cache(maxsize=4)  # shared by the backends
+def truth_of(drawing: Drawing, settings: RasterSettings, width: float) -> Truth:
+    """One pass for image, alpha and depth: the reference is slow."""
+    view = ReferenceRasterizer().view(drawing.gaussians, drawing.camera, settings)
+    sums, alpha = view.splat(np.column_stack([drawing.features(), view.footprints.depths]))
+    depth = sums[..., -1] / np.where(alpha > 0, alpha, 1)
+    return Truth(sums[..., :-1], alpha, depth, view.cut_off_band(width), view)
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """Error of one picture."""
+
+    worst: float  # away from cut-offs: image, alpha
+    mean: float
+    depth: float  # relative, where alpha > 0.01
+    flips: int  # pixels at a cut-off that are off by more than the tolerance
+    pixels: int
+    largest: float  # at a cut-off
+
+
+LABELS = ("error away from cut-offs", "mean error", "relative error of depth", "pixels flipped", "pixels")
+
+
+def score(seen: Seen, group: str, measured: Measure) -> Scored:
+    """Image, alpha and depth against the reference."""
     drawing, backend = seen.drawing, seen.backend
-    settings = backend.expected_settings(drawing.settings)
-    reference = ReferenceRasterizer().view(drawing.gaussians, drawing.camera, settings)
-    want, want_alpha = reference.splat(drawing.features())
-    error = np.abs(np.dstack([seen.image - want, seen.alpha - want_alpha])).max(-1)
-    return error, reference.cut_off_band(backend.band)
+    truth = truth_of(drawing, backend.expected_settings(drawing.settings), backend.band)
+    error = np.abs(np.dstack([seen.image - truth.image, seen.alpha - truth.alpha])).max(-1)
+    covered = ~truth.band & (truth.alpha > 0.01)
+    scored = Scored(
+        worst=float(error[~truth.band].max(initial=0)),
+        mean=float(error.mean()),
+        depth=float(np.abs(seen.view.depth()[covered] / truth.depth[covered] - 1).max(initial=0)),
+        flips=int((error[truth.band] > backend.tolerance).sum()),
+        pixels=error.size,
+        largest=float(error[truth.band].max(initial=0)),
+    )
+    for label, value in zip(LABELS, vars(scored).values(), strict=False):
+        measured(f"{backend.name}, {group}", label, value)
+    return scored
 
 
-def test_images_and_depths_equal_the_reference(fast_backend: Backend, slow: bool) -> None:
-    """Away from cut-offs, within the backend's promise."""
-    flipped = pixels = 0
+def check_gather(seen: Seen) -> None:
+    """W^T y is the reference's, to a part of the largest entry."""
+    if not hasattr(seen.view, "gather"):
+        return
+    drawing, backend = seen.drawing, seen.backend
+    truth = truth_of(drawing, backend.expected_settings(drawing.settings), backend.band)
+    y = np.random.default_rng(4).normal(size=truth.image.shape).astype(np.float32)
+    y[truth.band] = 0  # flipped weights of the band would enter every sum
+    want, rtol = truth.view.gather(y), backend.adjoint_tolerance
+    assert_adjoint(lambda v: seen.view.splat(v)[0], seen.view.gather, drawing.features(), y, rtol)
+    assert np.abs(seen.view.gather(y) - want).max(initial=0) <= rtol * max(np.abs(want).max(initial=0), 1e-3)
+
+
+def test_random_scenes_equal_the_reference(fast_backend: Backend, slow: bool, measured: Measure) -> None:
+    """Image and depth away from cut-offs, within the backend's promise; sums of what is gathered."""
+    flips = pixels = 0
 
     def law(case: Drawn) -> None:
-        nonlocal flipped, pixels
-        if not fast_backend.promises(case[0], case[2]):
+        nonlocal flips, pixels
+        gaussians, camera, settings = case
+        if fast_backend.gsplat:  # whose antialiasing has no floor
+            settings = replace(settings, antialiased=False)
+        if not fast_backend.promises(gaussians, settings):
             return
-        error, band = off(draw(fast_backend, Drawing(*case)))
-        flipped += int((error[band] > fast_backend.tolerance).sum())
-        pixels += error.size
-        assert error[~band].max(initial=0) <= fast_backend.tolerance
+        seen = draw(fast_backend, Drawing(gaussians, camera, settings))
+        scored = score(seen, "random scenes", measured)
+        assert scored.worst <= fast_backend.tolerance
+        assert scored.depth <= 2e-5
+        check_gather(seen)
+        flips, pixels = flips + scored.flips, pixels + scored.pixels
 
-    over_random_cases(law, slow)
-    assert flipped <= 1e-3 * pixels
+    over_random_cases(law, slow, few=100)
+    assert flips <= FLIPS * pixels
 
 
 def check_gradients(view: Any, values: Array, without: Array) -> None:
@@ -235,12 +302,9 @@ def check_depth(seen: Seen) -> None:
 
 def compare(seen: Seen, measured: Measure) -> None:
     """The picture is the reference's but at cut-offs, where an alpha of 1/255 may flip."""
-    (error, band), tolerance = off(seen), seen.backend.tolerance
-    worst = float(error[~band].max(initial=0))
-    measured(f"hard cases, {seen.backend.name}", "error away from cut-offs", worst)
-    measured(f"hard cases, {seen.backend.name}", "pixels flipped", float((error[band] > tolerance).sum()))
-    assert worst <= tolerance
-    assert error[band].max(initial=0) <= MOST_AT_A_CUT_OFF
+    scored = score(seen, "hard cases", measured)
+    assert scored.worst <= seen.backend.tolerance
+    assert scored.largest <= MOST_AT_A_CUT_OFF
 
 
 def check_adjoint(seen: Seen) -> None:
@@ -342,84 +406,10 @@ def test_too_many_tile_intersections_are_refused() -> None:
         load_rasterizer("cpu").view(gaussians, HUGE_IMAGE.build().camera)
 
 
-# How far every fast rasterizer is from the reference: the bundled scene, real scenes, random ones.
+# The bundled scene, real scenes, and the corner of a large image.
 
-REFERENCE = ReferenceRasterizer()
 DEMO = Path(__file__).parent.parent.parent / "assets" / "demo" / "scene.ply"
 REAL = ("guitar.compressed.ply", "playbot_8k_sog", "playbot_31k_sog")
-FLIPS = 1e-3  # of the pixels; each costs one alpha of 1/255
-
-
-@dataclass(frozen=True, eq=False)
-class Scored:
-    """Error of one picture."""
-
-    worst: float  # away from cut-offs: image, alpha
-    mean: float
-    depth: float  # relative, where alpha > 0.01
-    flips: int  # pixels at a cut-off that are off by more than the tolerance
-    pixels: int
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """Return what the reference makes of a view."""
-
-    image: Array  # (H, W, 3) of `VALUES`
-    alpha: Array
-    depth: Array
-    band: Array  # (H, W) True at a cut-off
-    view: ReferenceView
-
-
-def truth_of(gaussians: Gaussians, camera: Camera, settings: RasterSettings, width: float) -> Truth:
-    """One pass for image, alpha and depth: the reference is slow."""
-    view = REFERENCE.view(gaussians, camera, settings)
-    both = np.column_stack([random_values(len(gaussians), 3), view.footprints.depths])
-    sums, alpha = view.splat(both)
-    depth = sums[..., 3] / np.where(alpha > 0, alpha, 1)
-    return Truth(sums[..., :3], alpha, depth, view.cut_off_band(width), view)
-
-
-truth_of_scene = lru_cache(maxsize=4)(truth_of)  # shared by the backends
-
-
-def score(
-    backend: Backend, gaussians: Gaussians, camera: Camera, settings: RasterSettings, truth: Truth
-) -> Scored:
-    """Image, alpha and depth against the reference; also that `gather` is the adjoint."""
-    values = random_values(len(gaussians), 3)
-    view = backend.raster.view(gaussians, camera, settings)
-    image, alpha = view.splat(values)
-    error = np.abs(np.dstack([image - truth.image, alpha - truth.alpha])).max(-1)
-    seen = ~truth.band & (truth.alpha > 0.01)
-    check_gather(view, truth, values, backend.adjoint_tolerance)
-    return Scored(
-        worst=float(error[~truth.band].max(initial=0)),
-        mean=float(error.mean()),
-        depth=float(np.abs(view.depth()[seen] / truth.depth[seen] - 1).max(initial=0)),
-        flips=int((error[truth.band] > backend.tolerance).sum()),
-        pixels=error.size,
-    )
-
-
-def check_gather(view: object, truth: Truth, x: Array, rtol: float) -> None:
-    """<W x, y> = <x, W^T y>, and W^T y is the reference's, both to `rtol` of the largest entry."""
-    if not hasattr(view, "gather"):
-        return
-    y = np.random.default_rng(4).normal(size=truth.image.shape).astype(np.float32)
-    y[truth.band] = 0  # flipped weights of the band would enter every sum
-    assert_adjoint(lambda v: view.splat(v)[0], view.gather, x, y, rtol)
-    want = truth.view.gather(y)
-    assert np.abs(view.gather(y) - want).max(initial=0) <= rtol * max(np.abs(want).max(initial=0), 1e-3)
-
-
-LABELS = ("error away from cut-offs", "mean error", "relative error of depth", "pixels flipped", "pixels")
-
-
-def record(scored: Scored, backend: Backend, group: str, measured: Measure) -> None:
-    for label, value in zip(LABELS, vars(scored).values(), strict=True):
-        measured(f"{backend.name}, {group}", label, value)
 
 
 def part_of(camera: Camera, width: int = 48, height: int = 36) -> Camera:
@@ -429,18 +419,17 @@ def part_of(camera: Camera, width: int = 48, height: int = 36) -> Camera:
 
 
 @lru_cache
-def scene_and_camera(path: Path, size: tuple[int, int]) -> tuple[Scene, Camera]:
-    """A scene, and its first photograph or, without any, the camera that frames it."""
-    scene = load_scene(path)
-    return scene, scene.cameras[0].resized(*size) if scene.cameras else scene.framing_camera(size)
+def drawing_of(path: Path, antialiased: bool = False) -> Drawing:
+    """A scene in its first photograph or, without any, as the camera that frames it sees it."""
+    scene, size = load_scene(path), (320, 240)
+    camera = scene.cameras[0].resized(*size) if scene.cameras else scene.framing_camera(size)
+    return Drawing(scene.gaussians, part_of(camera), replace(INRIA, antialiased=antialiased))
 
 
-def check_scene(
-    backend: Backend, scene: Scene, camera: Camera, settings: RasterSettings, group: str, measured: Measure
-) -> None:
-    truth = truth_of_scene(scene.gaussians, camera, backend.expected_settings(settings), backend.band)
-    scored = score(backend, scene.gaussians, camera, settings, truth)
-    record(scored, backend, group, measured)
+def check_scene(backend: Backend, drawing: Drawing, group: str, measured: Measure) -> None:
+    seen = draw(backend, drawing)
+    scored = score(seen, group, measured)
+    check_gather(seen)
     # Half floats: dozens of layers at every pixel, each rounded once; towards zero in software.
     assert scored.worst <= (2e-2 if backend.name == "opengl-half" else backend.tolerance)
     assert scored.depth <= 2e-5
@@ -451,55 +440,14 @@ def check_scene(
 @pytest.mark.long
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_bundled_scene(fast_backend: Backend, measured: Measure, antialiased: bool) -> None:
-    scene, camera = scene_and_camera(DEMO, (320, 240))
-    settings = replace(INRIA, antialiased=antialiased)
-    check_scene(fast_backend, scene, part_of(camera), settings, "bundled scene", measured)
+    check_scene(fast_backend, drawing_of(DEMO, antialiased), "bundled scene", measured)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", REAL)
 def test_real_scene(real_data: Path, fast_backend: Backend, measured: Measure, name: str) -> None:
     """Trained Gaussians: anisotropy up to 2.5e7, opacities of exactly 1, equal depths."""
-    scene, camera = scene_and_camera(real_data / "gaussians" / name, (320, 240))
-    check_scene(fast_backend, scene, part_of(camera), INRIA, name, measured)
-
-
-def random_case(seed: int) -> tuple[Gaussians, Camera, RasterSettings]:
-    """Every seed another kind: few or many, small or large, opaque or faint, near or far, both profiles."""
-    rng = np.random.default_rng(seed)
-    smallest = 10 ** rng.uniform(-4, -1)
-    gaussians = random_gaussians(
-        int(rng.integers(1, 80)), seed, scale_range=(smallest, smallest * 10 ** rng.uniform(0.1, 1.5))
-    )
-    logits = gaussians.opacity_logits + np.float32(rng.uniform(-3, 6))
-    settings = replace((INRIA, GSPLAT)[seed % 2], antialiased=bool(rng.integers(2)))
-    width, height = (int(size) for size in rng.integers(1, 50, 2))
-    camera = random_camera(
-        seed, width, height, distance=rng.uniform(0.3, 5), off_centre=bool(rng.integers(2))
-    )
-    return replace(gaussians, opacity_logits=logits), camera, settings
-
-
-def check_random_scenes(seeds: range, backend: Backend, measured: Measure) -> None:
-    flips = pixels = 0
-    for seed in seeds:
-        gaussians, camera, settings = random_case(seed)
-        if backend.gsplat:  # whose antialiasing has no floor
-            settings = replace(settings, antialiased=False)
-        truth = truth_of(gaussians, camera, backend.expected_settings(settings), backend.band)
-        scored = score(backend, gaussians, camera, settings, truth)
-        record(scored, backend, "random scenes", measured)
-        assert scored.worst <= backend.tolerance, f"seed {seed}"
-        assert scored.depth <= 2e-5, f"seed {seed}"
-        flips, pixels = flips + scored.flips, pixels + scored.pixels
-    assert flips <= FLIPS * pixels
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("start", [0, pytest.param(200, marks=pytest.mark.slow)])
-def test_random_scenes(fast_backend: Backend, measured: Measure, start: int) -> None:
-    count = (1_000 if start else 200) if fast_backend.name == "cpu" else (160 if start else 40)
-    check_random_scenes(range(start, start + count), fast_backend, measured)
+    check_scene(fast_backend, drawing_of(real_data / "gaussians" / name), name, measured)
 
 
 def corner_case(width: int, height: int) -> tuple[Gaussians, Camera, Camera]:
@@ -522,7 +470,7 @@ def test_far_corner_of_a_large_image(fast_backend: Backend, measured: Measure, s
     OpenGL and gsplat an opaque Gaussian of sub-pixel size is off by 5e-8 per pixel of the image's width."""
     gaussians, camera, corner = corner_case(*size)
     x = random_values(len(gaussians), 3)
-    reference = REFERENCE.view(gaussians, corner, fast_backend.expected_settings(INRIA))
+    reference = ReferenceRasterizer().view(gaussians, corner, fast_backend.expected_settings(INRIA))
     band = reference.cut_off_band(3 * fast_backend.band)
     image = fast_backend.raster.view(gaussians, camera).splat(x)[0][-30:, -40:]
     error = np.abs(image - reference.splat(x)[0]).max(-1)
