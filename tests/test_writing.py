@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.checkpoints.langsplat_files import write_checkpoint
 from langsplat_core.io import files
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.files import atomic_path, check_output_file, check_output_folder
@@ -198,6 +199,9 @@ WRITERS: dict[str, Write] = {
     "cameras": lambda folder: write_cameras(folder / "cameras.json", SCENE.cameras),
     "feature store": features,
     "checkpoint": checkpoint,
+    "checkpoint of another method": lambda folder: write_checkpoint(
+        folder / "c.pth", GAUSSIANS, np.ones((40, 3), np.float32)
+    ),
     "stage": stage,
     "stage's array": lambda folder: write_npy(folder / "a.npy", np.ones(999)),
     "report of scores": lambda folder: files.write_json(folder / "r.json", list(range(999))),

@@ -320,20 +320,6 @@ def test_synthetic_scenes_of_nerf_hold_their_test_views_out(tmp_path: Path) -> N
     assert split_views(capture, replace(WHOLE, test_every=0)) == ([0, 1, 2], [])
 
 
-def test_transparent_photographs_lie_over_black(tmp_path: Path) -> None:
-    intrinsics = PhotoIntrinsics(160, 120, 140.0, 140.0, 80.0, 60.0)
-    write_transforms(tmp_path, {"fl_x": 140.0}, intrinsics)
-    pixels = np.full((120, 160, 4), 200, np.uint8)
-    pixels[..., 3] = 255
-    pixels[:60, :, 3] = 0
-    pixels[60, :, 3] = 51
-    Image.fromarray(pixels).save(tmp_path / "images/view_0.png")
-    image = load(tmp_path).images[0]
-    assert (image[:60] == 0).all()
-    assert (image[60] == 40).all()
-    assert (image[61:] == 200).all()
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -263,6 +263,8 @@ def test_transparency_is_a_mask_or_an_empty_background(tmp_path, inside, alpha, 
     assert bool(counted[15, 20]) != inside
     assert bool(counted[8, 20]) == capture.cut_out  # the thing's edge
     assert (capture.images[0][15 if inside else 0, 20] == 0).all()
+    whole = np.asarray(Image.open(tmp_path / "images/a.png"))[8, 20]
+    assert np.abs(capture.images[0][8, 20] - whole[:3] * (100 / 255)).max() <= 1  # in part, over black
     assert sum(record.levelno > logging.INFO for record in caplog.records) == (alpha == "auto")  # a guess
     again = capture.read_at([0], 30)
     assert again.cut_out == capture.cut_out

@@ -104,21 +104,6 @@ def test_splat_is_linear(backend: Backend, slow: bool) -> None:
     over_random_cases(law, slow)
 
 
-def test_gather_is_the_adjoint_of_splat(backend: Backend, slow: bool) -> None:
-    """<W x, y> = <x, W^T y>."""
-    if backend.name.startswith("opengl"):
-        pytest.skip("it has no adjoint")
-
-    def law(case: Drawn) -> None:
-        view, camera = backend.raster.view(*case), case[1]
-        x = random_values(len(case[0]), 3)
-        y = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
-        rtol = 1e-12 if backend.name == "reference" else 1e-5
-        assert_adjoint(lambda v: view.splat(v)[0], view.gather, x, y, rtol)
-
-    over_random_cases(law, slow)
-
-
 # How far every fast rasterizer is from the reference.
 
 FLIPS = 1e-3  # of the pixels; each costs one alpha of 1/255

@@ -31,7 +31,13 @@ from langsplat_core.scene.transform import (
 )
 from tests.support.file_samples import assert_same, random_field
 from tests.support.hard_cases import balls
-from tests.support.scenes import covariances, random_camera, random_gaussians, without_perspective
+from tests.support.scenes import (
+    covariances,
+    random_camera,
+    random_gaussians,
+    repeated,
+    without_perspective,
+)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e4, 1e15, 3e38])
@@ -157,10 +163,7 @@ def test_merge_keeps_distant_gaussians():
 
 @pytest.fixture(scope="module")
 def dense() -> Gaussians:
-    small = random_gaussians(200, 1, sh_degree=1, scale_range=(0.05, 0.2))
-    many = small.take(np.resize(np.arange(len(small)), 1600))  # each moved by a random step of its own size
-    steps = np.random.default_rng(0).normal(size=(1600, 3)) * np.exp(many.log_scales)
-    return replace(many, means=many.means + steps)
+    return repeated(Scene(random_gaussians(200, 1, sh_degree=1, scale_range=(0.05, 0.2))), 1600).gaussians
 
 
 def test_merge_shrinks_a_dense_scene_that_looks_alike(dense):

@@ -348,14 +348,17 @@ def test_words_are_read_as_tokenizers_reads_them() -> None:
 
 
 def test_neither_torch_nor_transformers_is_imported() -> None:
+    """By the bundled encoder, and by a command that asks it."""
     code = (
-        "import sys; from langsplat_core import load_text_encoder;"
+        "import sys; from importlib.resources import files; from langsplat_core import load_text_encoder;"
         "assert load_text_encoder('demo').encode_texts(['red mug']).shape == (1, 512);"
-        "heavy = ('torch', 'transformers', 'tokenizers', 'huggingface_hub', 'scipy');"
-        "print([m for m in heavy if m in sys.modules])"
+        "heavy = {'torch', 'transformers', 'tokenizers', 'huggingface_hub'};"
+        "assert not (heavy | {'scipy'}) & sys.modules.keys();"
+        "from langsplat_core.cli.app import parse; scene = files('langsplat_assets') / 'demo' / 'scene.ply';"
+        "parse(['query', str(scene), 'blue gift']).run(); print(heavy & sys.modules.keys())"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.splitlines()[-1] == "set()"
 
 
 # Folders of weights that hold something else: one line each, and nothing in them is run.

@@ -18,7 +18,6 @@ from langsplat_core.config import CodebookConfig, LinearConfig
 from langsplat_core.errors import STRICTNESS, EncoderError, FormatError, InputError
 from langsplat_core.extensions.checkpoints.convert import export_langsplat, export_occam
 from langsplat_core.extensions.checkpoints.importing import ForeignScene, import_scene, read_foreign
-from langsplat_core.extensions.checkpoints.langsplat_files import write_checkpoint
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import ExportRequest, load_scene, save_scene
 from langsplat_core.scene import CANONICAL_PHRASES, Gaussians, LanguageField, Scene
@@ -33,7 +32,7 @@ from tests.support.file_samples import (
     tensor,
     training_state,
 )
-from tests.support.processes import Captured, check_full_disk, refusal, run
+from tests.support.processes import refusal, run
 from tests.support.scenes import random_gaussians
 from tests.support.tiny_models import tiny_clip
 
@@ -491,23 +490,6 @@ def test_langsplat_there_and_back(tmp_path, clip):
 
 
 @pytest.mark.long
-def test_occam_there_and_back(tmp_path, clip):
-    scene, _ = import_scene(read_foreign(occam_levels(tmp_path)), clip)
-    assert scene.language is not None
-    written = [Path(name) for name in export_occam(asked(scene, tmp_path / "out"))]
-    (elements, _) = torch.load(written[2], weights_only=True)
-    assert elements[7].shape == (COUNT, D)
-    np.testing.assert_array_equal(elements[7][0].numpy(), 0)  # never seen
-    again, _ = import_scene(read_foreign(written), clip)
-    assert again.language is not None
-    assert_same(again.gaussians, GAUSSIANS)
-    np.testing.assert_array_equal(again.language.confidence, scene.language.confidence)
-    for level in range(3):
-        got, want = decoded(again.language, level), decoded(scene.language, level)
-        np.testing.assert_allclose(got[SEEN], want[SEEN], atol=1e-3)
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
 def test_every_codec_is_written_as_vectors(tmp_path, kind):
     field = random_field(COUNT, kind)
@@ -586,11 +568,3 @@ def test_checkpoints_become_a_scene_and_back(tmp_path, checkpoints, capsys):
     assert len(list((tmp_path / "out").glob("chkpnt30000_langfeat_[123].pth"))) == 3
     words = ("convert", tmp_path / "a.ply", tmp_path / "out", "--to", "langsplat")
     assert "--to occam" in refusal(capsys, *words)
-
-
-@pytest.mark.long
-def test_a_full_disk_is_one_line(tmp_path: Path, capsys: Captured) -> None:
-    def write(folder: Path) -> None:
-        write_checkpoint(folder / "c.pth", GAUSSIANS, np.ones((COUNT, 3), np.float32))
-
-    check_full_disk(write, tmp_path, capsys, b"what was there before")

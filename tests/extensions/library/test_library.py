@@ -81,20 +81,12 @@ def test_scenes_with_a_field_are_found_in_all_folders(folder):
         scenes_in(folder / "elsewhere")
 
 
-@pytest.mark.parametrize("phrase", WORDS)
-def test_the_index_has_the_fits_of_the_engine(folder, phrase):
+def test_scenes_without_a_codebook_are_not_indexed(folder):
+    """What an index says of the others is the engine's answer: on the bundled scene, below."""
     group = update_library(folder, load_encoder=load).groups[0]
-    vector = FakeEncoder().encode_texts([phrase])[0]
-    for scene, fits, common in zip(group.scenes, *fits_in(group, vector), strict=True):
-        answer = QueryEngine(load_scene(folder / scene.path), load).run(phrase)
-        if scene.path == "linear.spz":
-            assert not scene.is_indexed
-            assert np.isneginf(fits).all()
-        else:
-            np.testing.assert_allclose(fits, answer.fits, atol=0.05)  # spreads; 8 bits of a codeword
-            verdict = judge(triple(fits), "thing", "auto", scene.bars, scene.calibration, float(common))
-            assert (verdict.outcome, verdict.probability) == (answer.verdict, answer.probability)
-            assert verdict.margin == pytest.approx(answer.judgement.margin, abs=0.2)
+    fits, _ = fits_in(group, FakeEncoder().encode_texts(["mug"])[0])
+    for scene, found in zip(group.scenes, fits, strict=True):
+        assert scene.is_indexed == np.isfinite(found).any() == (scene.path != "linear.spz")
 
 
 def test_own_calibration_counts_before_a_scene_is_opened(folder, tmp_path, monkeypatch):
