@@ -5,15 +5,17 @@ import { add, inner } from "./camera.js";
 import { unpackGaussians } from "./data.js";
 
 // [page]
-// In a worker: Gaussians ahead of the near plane, back to front by camera z, of equal ones the later first.
+// In a worker: Gaussians ahead of the near plane, back to front by camera z, of equal ones the later first; of a
+// coarse image the large ones alone.
 function sortWorker() {
   let means;
+  let large;
   onmessage = ({ data }) => {
     if (data.means) {
-      means = data.means;
+      ({ means, large } = data);
       return;
     }
-    const { plane, near, far, ticket } = data;
+    const { plane, near, far, ticket, coarse } = data;
     const [a, b, c, d] = plane;
     const count = means.length / 3;
     const depth = new Float32Array(1);
@@ -23,7 +25,7 @@ function sortWorker() {
     let ahead = 0;
     for (let i = count - 1; i >= 0; --i) {
       depth[0] = a * means[3 * i] + b * means[3 * i + 1] + c * means[3 * i + 2] + d;
-      if (!(depth[0] > near && depth[0] <= far)) {
+      if (!(depth[0] > near && depth[0] <= far) || (coarse && !large[i])) {
         continue;
       }
       keys[ahead] = ~bits[0]; // bits of positive floats rise with them
@@ -49,6 +51,17 @@ function sortWorker() {
     const order = rows.slice(0, ahead);
     postMessage({ order, ticket }, [order.buffer]);
   };
+}
+
+// Which Gaussians are of the quarter that covers most: by opacity, and their faces' area.
+function large(geometry, count, texels) {
+  const covered = Float32Array.from({ length: count }, (_, i) => {
+    const at = 4 * (texels + i); // its scales
+    const [x, y, z] = [geometry[at], geometry[at + 1], geometry[at + 2]];
+    return geometry[4 * i + 3] * (x * y + y * z + z * x);
+  });
+  const least = covered.toSorted()[Math.trunc(0.75 * count)];
+  return Uint8Array.from(covered, (area) => (area >= least ? 1 : 0));
 }
 
 class Painter {
@@ -101,7 +114,9 @@ class Painter {
     this.drawn = 0; // Gaussians in `order`
     const code = URL.createObjectURL(new Blob([`(${sortWorker})()`], { type: "text/javascript" }));
     this.worker = new Worker(code);
-    this.worker.postMessage({ means: scene.means }, [scene.means.buffer]);
+    this.worker.postMessage({ means: scene.means, large: large(scene.geometry, count, texels) }, [
+      scene.means.buffer,
+    ]);
     this.worker.onmessage = ({ data }) => this.sorted(data);
     this.ticket = 0;
     this.waiting = [];
@@ -218,17 +233,17 @@ class Painter {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.columns, this.rows, gl.RGBA, gl.FLOAT, this.values);
   }
 
-  // Ask for the draw order of a camera; one sort runs at a time, and only the newest request waits. Resolves
+  // Ask for the draw order of a camera, and of a coarse image; one sort runs at a time, and only the newest request waits. Resolves
   // when the order of this camera is here (true), or that of a later one (false).
-  sort(camera) {
+  sort(camera, coarse = false) {
     const { near, far } = this.meta.raster;
     const ahead = camera.rotation.slice(6, 9);
     const plane = [...ahead, -inner(ahead, camera.position)];
-    if (this.plane && plane.every((value, i) => value === this.plane[i])) {
+    if (this.coarse === coarse && plane.every((value, i) => value === this.plane[i])) {
       return this.last;
     }
-    this.plane = plane;
-    this.next = { plane, near, far: far ?? Infinity, ticket: ++this.ticket };
+    Object.assign(this, { plane, coarse });
+    this.next = { plane, near, far: far ?? Infinity, ticket: ++this.ticket, coarse };
     if (!this.busy) {
       this.post();
     }

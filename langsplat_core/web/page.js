@@ -32,8 +32,9 @@ class Page {
       level: "auto",
       display: "rgb",
       answers: [],
-      share: 1,
-      moving: false,
+      share: COARSEST, // of the pixels in a row
+      coarse: true, // large Gaussians alone
+      moving: true,
       shown: [],
     });
     this.painter = new Painter(byId("scene"), meta, tensors);
@@ -517,9 +518,8 @@ class Page {
       this.asked = 0;
       const began = performance.now();
       this.paint();
-      if (this.painter.drawn) {
-        byId("still").hidden = true;
-      }
+      const early = this.moving && this.controls.moving === 1 && !location.hash; // the picture shows more
+      byId("still").hidden ||= Boolean(this.painter.drawn) && !early;
       if (this.moving) {
         this.keepUp(began);
       }
@@ -528,7 +528,7 @@ class Page {
 
   paint() {
     const camera = this.controls.camera(devicePixelRatio * this.share);
-    this.painter.sort(camera);
+    this.painter.sort(camera, this.coarse);
     this.painter.paint(camera, this.appearance());
     this.draw();
   }
@@ -549,17 +549,18 @@ class Page {
     });
   }
 
-  // Fewer pixels next time where an image took long, until none was asked for twice as long as that.
+  // Fewer pixels next time where an image took long, and fewer Gaussians where it took very long, until none was asked for twice as long as that.
   keepUp(began) {
     this.painter.wait();
     const taken = performance.now() - began;
     if (taken > SLOW) {
       this.share = Math.max(this.share * Math.sqrt(SLOW / taken), COARSEST);
+      this.coarse ||= taken > 4 * SLOW;
     }
     clearTimeout(this.rest);
     this.rest = setTimeout(
       () => {
-        Object.assign(this, { share: 1, moving: false });
+        Object.assign(this, { share: 1, coarse: false, moving: false });
         this.remember(false);
         this.redraw();
       },

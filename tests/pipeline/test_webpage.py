@@ -447,18 +447,20 @@ SLOW_PAINTER = """async () => {
   const { page } = await langsplat;
   const paint = page.painter.paint.bind(page.painter);
   const full = page.controls.camera(devicePixelRatio).width;
-  globalThis.widths = [];
+  globalThis.widths = [], globalThis.drawn = [];
   page.painter.paint = (camera, appearance) => {
     const began = performance.now();
     paint(camera, appearance);
     while (performance.now() - began < 500 * (camera.width / full) ** 2);
     widths.push(camera.width / full);
+    drawn.push(page.painter.drawn);
   };
 }"""
 
 
 def test_page_draws_coarsely_however_slow_it_is(browser: Any, thin: Path) -> None:
     with open_tab(browser, thin, viewport={"width": 390, "height": 800}) as tab:
+        tab.page.locator("#still").wait_for(state="hidden")
         tab.run(SLOW_PAINTER)
         tab.page.mouse.move(150, 150)
         tab.page.mouse.down()
@@ -468,6 +470,7 @@ def test_page_draws_coarsely_however_slow_it_is(browser: Any, thin: Path) -> Non
         tab.page.wait_for_function("() => widths.length > 2 && widths.at(-1) === 1")  # once it rests
         widths = tab.run("() => widths")
         assert min(widths) < 0.5
+        tab.page.wait_for_function("() => drawn.at(-1) > 3 * Math.min(...drawn)")  # the large ones first
         assert sum(width == 1 for width in widths) <= 3  # at first, and at rest
 
 
