@@ -449,11 +449,9 @@ def _uncalled(words: Iterable[str], called: AbstractSet[str]) -> list[str]:
 
 def fit_calibration(rows: Sequence[Verdict]) -> Calibration:
     """Platt scaling of all kinds of phrases. Raises as `fit_scaling` does."""
+    fits = {kind: np.array([row.fits for row in own]) for kind, own in grouped(rows, "kind").items()}
     return Calibration(
-        **{
-            name: fit_scaling(fits_of(rows, there), fits_of(rows, not_))
-            for name, (there, not_) in PAIRS.items()
-        }
+        **{name: fit_scaling(fits[there], fits[not_]) for name, (there, not_) in PAIRS.items()}
     )
 
 
@@ -462,11 +460,6 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     stated = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     stated["calibration"] = asdict(calibration)
     write_json(path, stated)
-
-
-def fits_of(rows: Sequence[Verdict], kind: str) -> Array:
-    """(n, 3) fits of one kind of phrase."""
-    return np.array([row.fits for row in rows if row.kind == kind])
 
 
 def verdict_table(rows: Sequence[Verdict]) -> str:
