@@ -23,7 +23,6 @@ from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import check_keeps, save_scene, scene_files
 from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.progress import Progress
-from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
 from langsplat_viewer.actions.editing import adopt
@@ -210,16 +209,6 @@ def finish_writing(viewer: Viewer) -> None:
 
 
 @dataclass(frozen=True)
-class Option:
-    """An option of a command that the window shows."""
-
-    flag: str
-    label: str
-    default: float  # False: a switch
-    limits: tuple[float, float] = (0.0, 1.0)
-
-
-@dataclass(frozen=True)
 class ExportRow:
     """Something that a command of the command line makes of a scene."""
 
@@ -228,51 +217,51 @@ class ExportRow:
     # Suffix, "" of a folder -> bytes in all, for each Gaussian, and for each coefficient of its colours, as
     # measured on the bundled scene. `at_most`: it may be much less. `beside`: companions are added.
     sizes: Mapping[str, tuple[float, float, float]]
-    options: tuple[Option, ...] = ()
+    options: tuple[str, ...] = ()  # of `OPTIONS`
     at_most: bool = False
     beside: bool = False
-    asks: bool = False  # it takes a text encoder in place of the scene's
-    needs_field: bool = False
-    keeps_all: bool = False  # a .ply is the scene
 
 
-PAGE = "web page"
+CELL, UNIT = "--resolution", "--metres-per-unit"
+OPTIONS: dict[str, tuple[str, float, tuple[float, float]]] = {  # label, default (False: a switch), limits
+    "--max-psnr-loss": ("Loss allowed, dB", 0.1, (0.01, 3.0)),
+    "--watertight": ("Close all holes", False, (0, 1)),
+    CELL: ("Metres of a cell", 0.05, (0.01, 0.5)),
+    UNIT: ("Metres of a unit", 1.0, (0.001, 1000.0)),  # where the scene has none
+}
 SCENES = {
     ".ply": (0, 56, 12), ".spz": (0, 14, 2), ".sog": (0, 20, 0.5), ".glb": (0, 48, 12), ".gltf": (0, 64, 16),
     ".splat": (0, 32, 0),
 }  # fmt: skip
-LOSS = Option("--max-psnr-loss", "Loss allowed, dB", 0.1, (0.01, 3.0))
-CELL = Option("--resolution", "Metres of a cell", 0.05, (0.01, 0.5))
-UNIT = Option("--metres-per-unit", "Metres of a unit", 1.0, (0.001, 1000.0))  # where the scene has none
+PAGE, SCENE = "web page", "scene"
 EXPORTS = {
     PAGE: ExportRow(
         "export {scene} {out}", "One file that any browser shows and searches, without a network.",
         {".html": (1.2e6, 52, 3)},
     ),
-    "scene": ExportRow(
+    SCENE: ExportRow(
         "convert {scene} {out}", ".ply keeps everything; .spz and .sog are a fifth, and rounded; .splat is "
-        "without view dependence.", SCENES, beside=True, keeps_all=True,
+        "without view dependence.", SCENES, beside=True,
     ),
     "cleaned copy": ExportRow(
         "clean {scene} {out}", "Without floaters: small regions that touch nothing, and veils in free space.",
-        SCENES, (LOSS,), at_most=True, beside=True,
+        SCENES, ("--max-psnr-loss",), at_most=True, beside=True,
     ),
     "compacted copy": ExportRow(
         "compact {scene} --out {out}", "Without Gaussians and colours that the views do not need.",
-        SCENES, (LOSS,), at_most=True, beside=True,
+        SCENES, ("--max-psnr-loss",), at_most=True, beside=True,
     ),
     "mesh": ExportRow(
         "mesh {scene} {out}", "Triangles with colours: .glb in metres with y up, .ply in the scene's units.",
-        {".glb": (15e6, 0, 0), ".ply": (15e6, 0, 0)}, (Option("--watertight", "Close all holes", False),),
-        at_most=True,
+        {".glb": (15e6, 0, 0), ".ply": (15e6, 0, 0)}, ("--watertight",), at_most=True,
     ),
     "map for a robot": ExportRow(
         "map {scene} {out}", "Occupancy grid, labelled voxels and a collider, into a folder.",
-        {"": (5e6, 0, 0)}, (CELL, UNIT), asks=True,
+        {"": (5e6, 0, 0)}, (CELL, UNIT),
     ),
     "labels": ExportRow(
         "describe {scene} --labels {out}", "The scene with instance, part and class of each Gaussian, and "
-        "the words for them.", {".ply": (6e4, 68, 12)}, beside=True, asks=True, needs_field=True,
+        "the words for them.", {".ply": (6e4, 68, 12)}, beside=True,
     ),
 }  # fmt: skip
 
@@ -287,23 +276,15 @@ def ask_export(viewer: Viewer, title: str, only_selected: bool = False) -> None:
     """Open the dialog that exports, with something to write."""
     scene, row = viewer.state.scene, EXPORTS[title]
     if viewer.has_scene("export it") and scene is not None:
-        shown = (one for one in row.options if one is not UNIT or scene.metres_per_unit is None)
-        values = {option.flag: option.default for option in shown}
+        shown = (flag for flag in row.options if flag != UNIT or scene.metres_per_unit is None)
+        values = {flag: OPTIONS[flag][1] for flag in shown}
         viewer.state.export_form = ExportForm(title, next(iter(row.sizes)), values, only_selected)
 
 
-def _exported(viewer: Viewer, form: ExportForm) -> Array:
+def exported(viewer: Viewer, form: ExportForm) -> Array:
     """(N,) bool of what is written."""
     marks = viewer.state.marks
     return marks.selected if form.only_selected else marks.kept
-
-
-def export_problem(viewer: Viewer, form: ExportForm) -> str:
-    """Return why something cannot be written, "" where it can."""
-    scene = viewer.state.scene
-    if EXPORTS[form.title].needs_field and scene is not None and scene.language is None:
-        return no_field(scene)
-    return "" if _exported(viewer, form).any() else "it would hold no Gaussians"
 
 
 def export_size(viewer: Viewer, form: ExportForm) -> str:
@@ -311,9 +292,9 @@ def export_size(viewer: Viewer, form: ExportForm) -> str:
     scene, path, row = viewer.state.scene, viewer.state.path, EXPORTS[form.title]
     assert scene is not None
     assert path is not None
-    rows, (in_all, each, by_colour) = _exported(viewer, form), row.sizes[form.suffix]
+    rows, (in_all, each, by_colour) = exported(viewer, form), row.sizes[form.suffix]
     size = in_all + rows.sum() * (each + by_colour * scene.gaussians.sh.shape[1])
-    size *= (CELL.default / form.values.get(CELL.flag, CELL.default)) ** 2
+    size *= (OPTIONS[CELL][1] / form.values.get(CELL, OPTIONS[CELL][1])) ** 2
     if row.beside:
         size += rows.mean() * sum(file.stat().st_size for file in scene_files(path)[1:] if file.exists())
     return f"{'At most' if row.at_most else 'About'} {size / 1e6:.{0 if size >= 1e7 else 1}f} MB"
@@ -322,7 +303,7 @@ def export_size(viewer: Viewer, form: ExportForm) -> str:
 def choose_export(viewer: Viewer) -> None:
     """Have a dialog ask for the file or folder, and write it."""
     form, viewer.state.export_form = viewer.state.export_form, None
-    if form is None or export_problem(viewer, form):
+    if form is None:
         return
 
     def then(viewer: Viewer, out: Path) -> None:
@@ -338,12 +319,11 @@ def run_export(viewer: Viewer, form: ExportForm, out: Path) -> None:
     state, row, path, session = viewer.state, EXPORTS[form.title], viewer.state.path, viewer.state.session
     assert state.scene is not None
     assert path is not None
-    shown, mask, scene = state.scene, _exported(viewer, form), replace(state.scene, language=viewer.language)
+    shown, mask, scene = state.scene, exported(viewer, form), replace(state.scene, language=viewer.language)
     taught = viewer.engine is not None and bool(viewer.engine.taught)
     is_own = mask.all() and not (state.session.moves or taught or viewer.watch.changed) and path.exists()
     rows, write_page_of = np.flatnonzero(mask), _page(viewer)
     words = [flag if value is True else f"{flag}={value:g}" for flag, value in form.values.items() if value]
-    words += [f"--encoder={viewer.services.encoder_id}"] * bool(row.asks and viewer.services.encoder_id)
 
     def work(progress: Progress) -> tuple[Path, str]:
         check_keeps(out, path)
@@ -366,7 +346,7 @@ def run_export(viewer: Viewer, form: ExportForm, out: Path) -> None:
         return out, _said(process, out)
 
     def then() -> None:
-        if row.keeps_all and out.suffix == ".ply" and not form.only_selected:
+        if form.title == SCENE and out.suffix == ".ply" and not form.only_selected:
             _count_as_saved(viewer, shown, session)
 
     _record(viewer, form.title, work, then)

@@ -310,23 +310,19 @@ def _export(viewer: Viewer, form: ExportForm) -> None:
     suffix, only = form.suffix, form.only_selected
     if len(row.sizes) > 1:
         suffix = ui.radio({name: name for name in row.sizes}, suffix)
-    for option in row.options:
-        if option.flag in values and option.default is False:
-            values[option.flag] = imgui.checkbox(option.label, bool(values[option.flag]))[1]
-        elif option.flag in values:
-            value = ui.slider(option.label, values[option.flag], option.limits, "%.3g", logarithmic=True)
-            values[option.flag] = value
+    for flag, value in values.items():
+        label, default, limits = saving.OPTIONS[flag]
+        if default is False:
+            values[flag] = imgui.checkbox(label, bool(value))[1]
+        else:
+            values[flag] = ui.slider(label, value, limits, "%.3g", logarithmic=True)
     selected = int(viewer.state.marks.selected.sum())
     if selected or only:
         only = imgui.checkbox(f"Only the selection ({selected:,} Gaussians)", only)[1]
     form = replace(form, suffix=suffix, values=values, only_selected=only)
     settings.put(viewer.state, export_form=form)
-    problem = saving.export_problem(viewer, form)
-    if problem:
-        ui.small_wrapped(problem, ui.bad())
-    else:
-        imgui.text_unformatted(f"{saving.export_size(viewer, form)} on disk")
-    if ui.button("Export ...", enabled=not problem):
+    imgui.text_unformatted(f"{saving.export_size(viewer, form)} on disk")
+    if ui.button("Export ...", enabled=bool(saving.exported(viewer, form).any())):
         saving.choose_export(viewer)
     imgui.same_line()
 
