@@ -23,7 +23,7 @@ from langsplat_viewer.camera.controls import spanning
 from langsplat_viewer.canvas import MOVING_BUDGET, Canvas
 from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
 from langsplat_viewer.options import ViewerOptions, chosen_camera, latent_level
-from langsplat_viewer.panels import dialogs, layout, menus, navigation, outline, overlays, ui
+from langsplat_viewer.panels import dialogs, layout, menus, navigation, outline, overlays, theme, ui
 from langsplat_viewer.panels.navigation import Keyboard
 from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
 from langsplat_viewer.session import Preferences
@@ -110,7 +110,7 @@ class Workspace:
     def style(self) -> None:
         """Make the window look as the preferences say."""
         self._styled = self._state.preferences
-        ui.apply(self._styled)
+        theme.apply(self._styled)
 
     def update(self) -> None:
         """Apply and keep the preferences that have changed; once per frame."""

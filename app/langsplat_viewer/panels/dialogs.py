@@ -24,7 +24,7 @@ from langsplat_core.progress import Progress
 from langsplat_viewer.actions import editing, opening, saving, settings
 from langsplat_viewer.disk import completions
 from langsplat_viewer.jobs import Worker
-from langsplat_viewer.panels import ui
+from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.projects import BUNDLED, PATHS, PROJECTS, thumbnail_of
 from langsplat_viewer.state import ExportForm, FileChoice, Message
 from langsplat_viewer.viewer import Viewer
@@ -69,7 +69,7 @@ class StartPage:
         imgui.begin("start", None, (ui.OVER | ui.FIXED) & ~imgui.WindowFlags_.no_scrollbar)
         imgui.pop_style_var()
         imgui.dummy(ImVec2(0, 0.04 * area.height))
-        imgui.push_font(imgui.get_font(), TITLE * ui.FONT_SIZE)
+        imgui.push_font(imgui.get_font(), TITLE * theme.FONT_SIZE)
         imgui.text_unformatted("LangSplat viewer")
         imgui.pop_font()
         ui.small_wrapped("Look around in 3D Gaussian scenes, and search them with words.", ui.muted())

@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from langsplat_core.arrays import Array
 from langsplat_viewer.commands import BY_BUTTON, with_key
-from langsplat_viewer.session import Preferences
+from langsplat_viewer.panels import theme
 from langsplat_viewer.viewer import Viewer
 
 T = TypeVar("T")
@@ -70,54 +70,21 @@ def scene_area() -> Area:
 
 TIP_LETTERS = 72  # of a line
 MOST_OVER = 0.94  # of the window that something which lies over it may take
-# Window units at a scale of 1.
-SPACES = {
-    "window_padding": (10.0, 8.0),
-    "frame_padding": (4.0, 3.0),
-    "item_spacing": (8.0, 6.0),
-    "item_inner_spacing": (4.0, 4.0),
-    "cell_padding": (4.0, 2.0),
-}
-SIZES = {"frame_rounding": 4.0, "indent_spacing": 21.0, "scrollbar_size": 14.0, "grab_min_size": 12.0}
-
-
-def apply(preferences: Preferences) -> None:
-    """Apply the theme, with one accent and little contrast between the widgets; once for every change."""
-    dark = preferences.theme == "dark"
-    themes = hello_imgui.ImGuiTheme_
-    hello_imgui.apply_theme(themes.darcula_darker if dark else themes.imgui_colors_light)
-    style = imgui.get_style()
-    scale = preferences.ui_scale
-    for name, (x, y) in SPACES.items():
-        setattr(style, name, ImVec2(x * scale, y * scale))
-    for name, size in SIZES.items():
-        setattr(style, name, size * scale)
-    style.window_border_size = 0
-    style.font_scale_main = scale
-    for colour in (imgui.Col_.slider_grab, imgui.Col_.slider_grab_active):  # numbers are read over it
-        style.set_color_(colour, ImVec4(0.18, 0.36, 0.66, 1) if dark else ImVec4(0.62, 0.76, 0.96, 1))
-    popup = style.color_(imgui.Col_.popup_bg)
-    style.set_color_(imgui.Col_.popup_bg, ImVec4(popup.x, popup.y, popup.z, 1))
-
-
-def _readable(on_dark: tuple[float, float, float], on_light: tuple[float, float, float]) -> ImVec4:
-    background = imgui.get_style().color_(imgui.Col_.window_bg)
-    return ImVec4(*(on_dark if background.x + background.y + background.z < 1.5 else on_light), 1.0)
 
 
 def good() -> ImVec4:
     """Return the colour of what is found."""
-    return _readable((0.47, 0.80, 0.52), (0.05, 0.45, 0.15))
+    return theme.colour("good")
 
 
 def bad() -> ImVec4:
     """Return the colour of errors."""
-    return _readable((0.95, 0.58, 0.45), (0.70, 0.15, 0.05))
+    return theme.colour("bad")
 
 
 def muted() -> ImVec4:
     """Return the colour of what matters less."""
-    return _readable((0.62, 0.64, 0.67), (0.35, 0.36, 0.40))
+    return theme.colour("soft")
 
 
 def small_wrapped(text: str, colour: ImVec4) -> None:
@@ -395,7 +362,6 @@ def elided(text: str, room: float, width_of: Callable[[str], float] = width_of) 
 
 # Letters: the window's own font, and behind it others for what that does not have.
 
-FONT_SIZE = 15.0  # window units
 FOLDERS = {
     "linux": ("/usr/share/fonts", "/usr/local/share/fonts", "~/.local/share/fonts", "~/.fonts"),
     "darwin": ("/System/Library/Fonts", "/Library/Fonts", "~/Library/Fonts"),
@@ -414,15 +380,17 @@ BUNDLED = {  # package -> its file; pictographs, and letters: Latin, Greek, Cyri
 
 
 def load_fonts() -> None:
-    """Load hello_imgui's default font, with what else there is merged into it; a callback.
+    """Load the theme's font, with icons and what else there is merged into it; a callback.
 
     Letters are drawn into the texture when they first appear, so that a large font costs nothing until then.
     """
-    hello_imgui.imgui_default_settings.load_default_font_with_font_awesome_icons()
+    hello_imgui.load_font(theme.FONT, theme.FONT_SIZE)
     merged = hello_imgui.FontLoadingParams()
-    merged.merge_to_last_font, merged.inside_assets = True, False
+    merged.merge_to_last_font = True
+    hello_imgui.load_font("fonts/Font_Awesome_6_Free-Solid-900.otf", theme.FONT_SIZE, merged)
+    merged.inside_assets = False
     for path in fallbacks():
-        hello_imgui.load_font(str(path), FONT_SIZE, merged)
+        hello_imgui.load_font(str(path), theme.FONT_SIZE, merged)
 
 
 def fallbacks() -> list[Path]:
