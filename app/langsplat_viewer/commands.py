@@ -40,7 +40,9 @@ def buttons_of(row: DisplayRow) -> tuple[Button, ...]:
     """One for the display, but for each level one where it shows latents."""
     if not row.by_level:
         return (Button(row.label, row.name),)
-    return tuple(Button(f"{name}##{row.name}", row.name, index) for index, name in enumerate(LEVELS))
+    return tuple(
+        Button(f"{name.capitalize()}##{row.name}", row.name, index) for index, name in enumerate(LEVELS)
+    )
 
 
 BUTTONS = tuple(button for row in DISPLAYS.values() for button in buttons_of(row))
@@ -141,8 +143,8 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
     ("bottom", "Ctrl+Keypad7"),
 )
 PANEL_TITLES = (
-    *("Search", "Display", "Camera", "Scene", "Outline", "Select", "Transform"),
-    *("Train", "Record", "Bookmarks", "Messages", "Notes"),
+    *("Search", "Display", "Camera", "Outline", "Select", "Transform", "Record", "Bookmarks"),
+    *("Notes", "Scene", "Train", "Timeline", "Messages"),
     *registry.references("panels"),
 )
 TOOL_ICONS: dict[Tool, str] = {

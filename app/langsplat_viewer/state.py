@@ -44,6 +44,7 @@ class Recording:
     size: tuple[int, int] = (1280, 720)  # of films, and of images that are no screenshots, pixels
     fps: float = 30.0
     film_file: str = ""  # where the film goes; empty: a new name
+    thumbnails: tuple[tuple[Keyframe, ...], Array] = ((), np.zeros((0, 144, 3), np.uint8))  # see viewpoint
 
 
 @lru_cache(maxsize=2)
@@ -311,7 +312,6 @@ class ViewerState(SceneState):
     show_start: bool = False  # the start page, in place of panels and scene
     show_palette: bool = False
     resets_panels: bool = False  # at the next frame
-    shows_panels: tuple[str, ...] = ()  # titles of those that alone are open from now on; (): as they are
     choice: FileChoice | None = None  # what a dialog asks for, while one is open
     extension_panels: dict[str, Any] = field(default_factory=dict)  # title -> what an extension's panel keeps
     preferences: Preferences = field(default_factory=Preferences)

@@ -352,7 +352,6 @@ def _restore(viewer: Viewer, project: Project, path: Path) -> None:
     state.preferences = state.preferences.with_recent(path)
     if project.panels:
         state.preferences = replace(state.preferences, panels=project.panels)
-        state.shows_panels = project.panels
 
 
 # Training a scene from photographs, in a process of its own.

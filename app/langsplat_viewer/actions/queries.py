@@ -300,15 +300,13 @@ def prepare_suggestions(viewer: Viewer) -> None:
 def offers(viewer: Viewer, typed: str) -> tuple[str, tuple[str, ...]]:
     """Return a title and the phrases to offer now.
 
-    They go on from what is typed; else they correct the last query, or, before the first, are examples.
+    They go on from what is typed; else they correct the last query, or are examples.
     """
     state, queries = viewer.state, viewer.state.session.queries
     if typed.strip():
         return "", tuple(completions(typed, state.suggestions.phrases))
-    if not queries:
-        return "try", state.suggestions.examples
-    meant = state.answer(queries[-1]).meant
-    return "did you mean", (meant,) if meant else ()
+    meant = state.answer(queries[-1]).meant if queries else ""
+    return ("did you mean", (meant,)) if meant else ("", state.suggestions.examples)
 
 
 def offered(viewer: Viewer, typed: str, is_pointed_at: bool) -> tuple[str, tuple[str, ...]]:

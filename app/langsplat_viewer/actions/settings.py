@@ -199,6 +199,12 @@ def open_panel(viewer: Viewer, title: str) -> None:
     viewer.state.show_panel, viewer.state.wanted_panel, viewer.state.show_start = True, title, False
 
 
+def turn_panel(viewer: Viewer, title: str, *, is_open: bool) -> None:
+    """Have a panel open or closed."""
+    others = tuple(other for other in viewer.state.preferences.panels or () if other != title)
+    prefer(viewer, panels=(*others, title) if is_open else others)
+
+
 def _switch(name: str) -> Callable[[Viewer], None]:
     """Return the action that turns a switch of the state over."""
     return lambda viewer: setattr(viewer.state, name, not getattr(viewer.state, name))

@@ -21,7 +21,7 @@ from langsplat_viewer.camera.flight import Keyframe, Motion
 from langsplat_viewer.camera.overlays import FRUSTUM_DEPTH, frusta
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight
-from langsplat_viewer.rendering.request import image_formation
+from langsplat_viewer.rendering.request import Split, image_formation
 from langsplat_viewer.session import LONGEST_NAME, MOST_BOOKMARKS, Bookmark, Query
 from langsplat_viewer.state import GLIDE_SECONDS, SPACING, Glide, Hover, flight_of
 from langsplat_viewer.viewer import Viewer
@@ -274,6 +274,9 @@ def _show(viewer: Viewer, seconds: float) -> None:
 
 # Keyframes of the path.
 
+THUMBNAIL, MOST_THUMBNAILS = (144, 90), 64  # pixels
+SLOW = 250.0  # milliseconds of an image of the window: where one takes longer there are no thumbnails
+
 
 def add_keyframe(viewer: Viewer) -> None:
     """Add the current view as a keyframe, some seconds after the last one."""
@@ -297,6 +300,27 @@ def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
     if state.extent is not None:
         glide_to(viewer, flight.view_of(key.pose, state.extent))
         record.chosen, record.at = key, key.seconds
+
+
+def thumbnails(viewer: Viewer) -> Array:
+    """Return the first keyframes as they look in colours, (K * height, width, 3) uint8, one below the other.
+
+    One more is drawn in each frame; none where that would take long.
+    """
+    state, record = viewer.state, viewer.state.record
+    keys, (known, images) = state.session.keyframes[:MOST_THUMBNAILS], record.thumbnails
+    missing = next((key for key in keys if key not in known), None)
+    made = dict(zip(known, np.split(images, max(len(known), 1)), strict=False))
+    if missing and viewer.surface and state.extent and state.stats.milliseconds < SLOW:
+        camera = flight.view_of(missing.pose, state.extent).camera(*THUMBNAIL)
+        request = replace(state.request(THUMBNAIL), camera=camera, split=Split(), answers=())
+        picture = replace(request.picture, display="rgb")
+        made[missing] = viewer.surface.capture(replace(request, picture=picture))
+        viewer.worker.wake()  # for the next one
+    there = tuple(key for key in keys if key in made)
+    if there != known:
+        record.thumbnails = there, np.concatenate([images[:0], *map(made.__getitem__, there)])
+    return record.thumbnails[1]
 
 
 def delete_keyframe(viewer: Viewer, key: Keyframe) -> None:

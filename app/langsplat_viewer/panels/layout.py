@@ -1,12 +1,13 @@
-"""The layout of the window: the table of panels, docked around the scene, and what lies over it."""
+"""The layout of the window: the inspector and its sections, what is docked, what floats over the scene."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from imgui_bundle import ImVec2, hello_imgui, imgui
+from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import registry
-from langsplat_viewer.actions import settings
+from langsplat_viewer.actions import queries, settings
+from langsplat_viewer.commands import with_key
 from langsplat_viewer.panels import (
     dialogs,
     menus,
@@ -18,36 +19,38 @@ from langsplat_viewer.panels import (
     ui,
     viewpoint,
 )
+from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 
-LEFT, MIDDLE, FOOT = "Left", "Middle", "Foot"  # docks of the column beside the scene; Search has its own
-COLUMN = 345.0  # its width at first, window units
-MOST_SHARE, MIDDLE_SHARE, FOOT_SHARE = 0.4, 0.44, 0.15
+INSPECTOR, FOOT = "Inspector", "Foot"  # the docks: right of the scene, and below it
+COLUMN = 320.0  # the inspector's width at first, window units
+MOST_SHARE, FOOT_SHARE = 0.36, 0.3
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A window that can be docked, resized and closed."""
+    """A section of the inspector that folds, or a window that can be docked."""
 
     title: str
-    dock: str  # where it lies until it is moved
     draw: Callable[[Viewer], None]
-    is_open: bool = True  # until it is opened or closed
+    is_open: bool = False  # until it is opened or closed
+    dock: str = INSPECTOR  # for a section; FOOT for a window; "" for what floats over the scene
 
 
 CORE_PANELS: tuple[Panel, ...] = (
-    Panel("Search", LEFT, search.draw),
-    Panel("Display", MIDDLE, scene.draw_display),
-    Panel("Camera", MIDDLE, viewpoint.draw_camera),
-    Panel("Scene", MIDDLE, scene.draw_scene),
-    Panel("Outline", MIDDLE, outline.draw, is_open=False),
-    Panel("Select", MIDDLE, select.draw, is_open=False),
-    Panel("Transform", MIDDLE, select.draw_transform, is_open=False),
-    Panel("Train", MIDDLE, scene.draw_training, is_open=False),
-    Panel("Record", MIDDLE, viewpoint.draw_record, is_open=False),
-    Panel("Bookmarks", MIDDLE, viewpoint.draw_bookmarks, is_open=False),
-    Panel("Messages", FOOT, scene.draw_messages),
-    Panel("Notes", MIDDLE, overlays.draw_notes, is_open=False),
+    Panel(search.TITLE, search.draw, is_open=True, dock=""),
+    Panel("Display", scene.draw_display, is_open=True),
+    Panel("Camera", viewpoint.draw_camera),
+    Panel("Outline", outline.draw),
+    Panel("Select", select.draw),
+    Panel("Transform", select.draw_transform),
+    Panel("Record", viewpoint.draw_record),
+    Panel("Bookmarks", viewpoint.draw_bookmarks),
+    Panel("Notes", overlays.draw_notes),
+    Panel("Scene", scene.draw_scene),
+    Panel("Train", scene.draw_training),
+    Panel("Timeline", viewpoint.draw_timeline, dock=FOOT),
+    Panel("Messages", scene.draw_messages, dock=FOOT),
 )
 
 
@@ -56,16 +59,25 @@ def all_panels() -> tuple[Panel, ...]:
     return (*CORE_PANELS, *registry.parts("panels").values())
 
 
+def opened(state: ViewerState) -> list[str]:
+    """Return the titles of the panels that are open."""
+    kept = state.preferences.panels
+    return [panel.title for panel in all_panels() if (panel.is_open if kept is None else panel.title in kept)]
+
+
 def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
-    """Return the docks of a window `width` units wide, and the panels in them, for hello_imgui to draw."""
+    """Return the docks of a window `width` units wide, and the windows in them, for hello_imgui to draw."""
     docking = hello_imgui.DockingParams()
+    docking.layout_name = INSPECTOR  # what was kept of other layouts is not taken for it
     share = min(COLUMN * viewer.state.preferences.ui_scale / width, MOST_SHARE)
     docking.docking_splits = [
-        hello_imgui.DockingSplit(ui.MAIN_DOCK, LEFT, imgui.Dir.left, share),
-        hello_imgui.DockingSplit(LEFT, FOOT, imgui.Dir.down, FOOT_SHARE),
-        hello_imgui.DockingSplit(LEFT, MIDDLE, imgui.Dir.down, MIDDLE_SHARE),
+        hello_imgui.DockingSplit(ui.MAIN_DOCK, INSPECTOR, imgui.Dir.right, share),
+        hello_imgui.DockingSplit(ui.MAIN_DOCK, FOOT, imgui.Dir.down, FOOT_SHARE),
     ]
-    docking.dockable_windows = [_window(viewer, panel) for panel in all_panels()]
+    inspector = Panel(INSPECTOR, draw_inspector, dock=INSPECTOR)
+    windows = (inspector, *(panel for panel in all_panels() if panel.dock == FOOT))
+    docking.dockable_windows = [_window(viewer, panel) for panel in windows]
+    docking.dockable_windows[0].can_be_closed = False
     # The scene itself is no panel: nothing is docked over it.
     docking.main_dock_space_node_flags = (
         imgui.DockNodeFlags_.passthru_central_node | imgui.DockNodeFlags_.no_docking_over_central_node
@@ -74,56 +86,77 @@ def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
 
 
 def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
-    remembered = viewer.state.preferences.panels
-    is_open = panel.is_open if remembered is None else panel.title in remembered
-    window = hello_imgui.DockableWindow(panel.title, panel.dock, lambda: panel.draw(viewer), is_open)
+    window = hello_imgui.DockableWindow(panel.title, panel.dock, lambda: panel.draw(viewer), False)
     window.remember_is_visible = False  # the preferences do
     window.window_size = ImVec2(360, 330)
     return window
 
 
+def draw_inspector(viewer: Viewer) -> None:
+    """Draw the sections, each below its header; the one that is wanted is scrolled to."""
+    for panel in all_panels():
+        if panel.dock != INSPECTOR:
+            continue
+        was_open = panel.title in opened(viewer.state)
+        imgui.set_next_item_open(was_open)
+        if viewer.state.wanted_panel == panel.title:
+            settings.take(viewer.state, "wanted_panel")
+            imgui.set_scroll_here_y(0.0)
+        imgui.push_style_var(imgui.StyleVar_.frame_border_size, 0.0)
+        is_open = imgui.collapsing_header(panel.title)
+        imgui.pop_style_var()
+        if is_open != was_open:
+            settings.turn_panel(viewer, panel.title, is_open=not was_open)
+        if was_open:
+            imgui.push_id(panel.title)
+            panel.draw(viewer)
+            imgui.dummy(ImVec2(0, imgui.get_style().item_spacing.y))
+            imgui.pop_id()
+
+
 class Docks:
-    """Keeps the panels as the state wants them."""
+    """Keeps the docked windows as the state wants them."""
 
     def __init__(self) -> None:
         self._scale = 0.0  # of the letters, in the last frame
-        self._hidden: list[str] = []  # panels that were taken away at one key
+        self._shown: list[str] = []  # the windows of the last frame
 
     def apply(self, viewer: Viewer) -> None:
-        """Open, hide and bring back panels, and make their column as wide as letters want; once per frame."""
-        docking, state = hello_imgui.get_runner_params().docking_params, viewer.state
-        windows, scale = docking.dockable_windows, state.preferences.ui_scale
+        """Open, hide and raise windows, and make their column as wide as letters want; once per frame."""
+        params, state = hello_imgui.get_runner_params(), viewer.state
+        docking, scale = params.docking_params, state.preferences.ui_scale
         if self._scale not in (0.0, scale):
             _widen(COLUMN * scale)
         self._scale = scale
-        shown = state.show_panel and not state.show_start
-        if not shown and not self._hidden:
-            self._hidden = [window.label for window in windows if window.is_visible]
-            for window in windows:
-                window.is_visible = False
-        elif shown and self._hidden:
-            for title in self._hidden:
-                docking.dockable_window_of_name(title).is_visible = True
-            self._hidden = []
-        if shown:
-            visible = (window.label for window in windows if window.is_visible)
-            settings.prefer(viewer, panels=tuple(visible))
-        alone = settings.take(state, "shows_panels")
-        if any(window.label in alone for window in windows):
-            for window in windows:
-                window.is_visible = window.label in alone
-        docking.layout_reset |= settings.take(state, "resets_panels")
-        title = settings.take(state, "wanted_panel") if shown else ""
-        if title:  # in front of those that it shares its place with
-            docking.dockable_window_of_name(title).is_visible = True
-            docking.focus_dockable_window(title)
+        if settings.take(state, "resets_panels"):
+            settings.prefer(viewer, panels=None)
+            docking.layout_reset = True
+        settings.prefer(viewer, panels=tuple(opened(state)))
+        for window in docking.dockable_windows:
+            if window.label in self._shown and not window.is_visible:  # its cross was clicked
+                settings.turn_panel(viewer, window.label, is_open=False)
+        wanted, shown = state.wanted_panel, state.show_panel and not state.show_start
+        if wanted and shown:
+            settings.turn_panel(viewer, wanted, is_open=True)
+        are_open = (INSPECTOR, *opened(state)) if shown else ()
+        for window in docking.dockable_windows:
+            window.is_visible = window.label in are_open
+        self._shown = [window.label for window in docking.dockable_windows if window.is_visible]
+        params.imgui_window_params.show_status_bar = shown
+        if wanted and shown:  # in front of those that it shares its place with
+            is_window = wanted in self._shown
+            is_section = any(panel.title == wanted and panel.dock == INSPECTOR for panel in all_panels())
+            if is_window or is_section:
+                docking.focus_dockable_window(wanted if is_window else INSPECTOR)
+            if not is_section:  # which is scrolled to when it is drawn
+                settings.take(state, "wanted_panel")
 
 
 def _widen(width: float) -> None:
     """Make the column beside the scene `width` units wide, as long as it lies there."""
     docking = hello_imgui.get_runner_params().docking_params
     root = docking.dock_space_id_from_name(ui.MAIN_DOCK)
-    node = imgui.internal.dock_builder_get_node(docking.dock_space_id_from_name(LEFT) or 0)
+    node = imgui.internal.dock_builder_get_node(docking.dock_space_id_from_name(INSPECTOR) or 0)
     while node is not None and node.parent_node is not None and node.parent_node.id_ != root:
         node = node.parent_node
     above = None if node is None else node.parent_node
@@ -132,26 +165,46 @@ def _widen(width: float) -> None:
         imgui.internal.dock_builder_set_node_size(node.id_, ImVec2(width, node.size.y))
 
 
+def draw_titles(viewer: Viewer) -> None:
+    """Draw the panels in the menu Window: a click opens one, raises it from behind a tab, or closes it."""
+    imgui.separator()
+    are_open = opened(viewer.state)
+    for panel in all_panels():
+        if imgui.menu_item(panel.title, "", panel.title in are_open)[0]:
+            window = imgui.internal.find_window_by_name(panel.title if panel.dock == FOOT else INSPECTOR)
+            is_seen = not panel.dock or (window is not None and not window.hidden)  # not behind a tab
+            if panel.title in are_open and viewer.state.show_panel and is_seen:
+                settings.turn_panel(viewer, panel.title, is_open=False)
+            else:
+                settings.open_panel(viewer, panel.title)
+    imgui.separator()
+
+
+# What lies over the scene.
+
+CARD_EM, CARD_SHARE, MARGIN_EM = 22.0, 0.55, 0.8  # width of the search, at most of the scene's; around it
+
+
 def draw_over(
     viewer: Viewer, start: dialogs.StartPage, toasts: dialogs.Toasts, files: dialogs.FileDialogs
 ) -> None:
-    """Draw what lies over the scene: legends, tools, questions, dialogs, help and palette."""
+    """Draw what lies over the scene: search, legends, tools, questions, dialogs, help and palette."""
     area = ui.scene_area()
     start.draw(viewer, area)
+    free = _float_search(viewer, area, menus.draw_toolbar(viewer, area))
     said = _said(viewer)
     if said:
-        overlays.say(said, area)
+        overlays.say(said, free)
     else:
         overlays.draw_legends(viewer, area)
         outline.draw_legend(viewer, area)
         overlays.draw_pointing(viewer)
         select.draw_stroke(viewer, area)
-        select.draw_hint(viewer, area)
+        select.draw_hint(viewer, free)
         select.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
-    menus.draw_toolbar(viewer, area)
-    toasts.draw(viewer, area)
-    dialogs.draw_changed(viewer, area)
+    toasts.draw(viewer, free)
+    dialogs.draw_changed(viewer, free)
     dialogs.draw_unsaved(viewer)
     dialogs.draw_export(viewer)
     files.draw(viewer)
@@ -159,15 +212,30 @@ def draw_over(
     menus.draw_palette(viewer)
 
 
+def _float_search(viewer: Viewer, area: ui.Area, left: float) -> ui.Area:
+    """Draw the search `left` window units from the scene's edge; return what is free beside it."""
+    if not viewer.state.show_panel or viewer.state.show_start:
+        return area
+    margin = hello_imgui.em_size(MARGIN_EM)
+    width = min(hello_imgui.em_size(CARD_EM), CARD_SHARE * area.width)
+    imgui.set_next_window_pos(ImVec2(area.left + left + margin, area.top + margin))
+    if search.TITLE not in opened(viewer.state):
+        with ui.floating("search button"):
+            if imgui.button(f"{icons_fontawesome_6.ICON_FA_MAGNIFYING_GLASS}##search"):
+                queries.focus_search(viewer)
+            ui.tip(with_key("Search", queries.focus_search))
+        return area
+    imgui.set_next_window_size_constraints(ImVec2(width, 0), ImVec2(width, area.height - 2 * margin))
+    with ui.floating(search.TITLE):
+        search.draw(viewer)
+    taken = left + margin + width
+    return replace(area, left=area.left + taken, width=max(area.width - taken, 1.0))
+
+
 def _said(viewer: Viewer) -> str:
     """Return the words in place of an image; empty while there is one."""
     state = viewer.state
-    if state.scene is None:
-        return (
-            ""
-            if state.show_start
-            else f"opening {state.opening.name} ..."
-            if state.opening
-            else "Drop a scene here, or press Ctrl+O"
-        )
-    return state.nothing
+    if state.scene is not None:
+        return state.nothing
+    opening = f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or press Ctrl+O"
+    return "" if state.show_start else opening

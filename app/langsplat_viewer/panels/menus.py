@@ -1,19 +1,20 @@
 """What is made from the table of commands: menus, toolbar, palette of commands and help."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
+import numpy as np
+from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import __version__
-from langsplat_viewer.actions import opening, settings
-from langsplat_viewer.commands import BY_MENU, COMMANDS, HELD, MENUS, Command, matching
-from langsplat_viewer.panels import ui
+from langsplat_viewer.actions import editing, opening, settings
+from langsplat_viewer.commands import BY_MENU, COMMANDS, HELD, MENUS, Command, matching, with_key
+from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.viewer import Viewer
 
 
-def draw_menus(viewer: Viewer) -> None:
-    """Draw the menus, for hello_imgui."""
+def draw_menus(viewer: Viewer, draw_titles: Callable[[Viewer], None]) -> None:
+    """Draw the menus, for hello_imgui; `draw_titles` draws those of the panels."""
     for menu in MENUS:
         if imgui.begin_menu(menu):
             first, *others = BY_MENU[menu]
@@ -26,7 +27,7 @@ def draw_menus(viewer: Viewer) -> None:
                 imgui.end_menu()
             _items(viewer, others[-1:])
             if menu == "Window":
-                _panels()
+                draw_titles(viewer)
             imgui.end_menu()
 
 
@@ -52,57 +53,44 @@ def _recent(viewer: Viewer) -> None:
         imgui.end_menu()
 
 
-def _panels() -> None:
-    imgui.separator()
-    docking = hello_imgui.get_runner_params().docking_params
-    for window in docking.dockable_windows:
-        _, window.is_visible = imgui.menu_item(window.label, "", window.is_visible)
-    imgui.separator()
-
-
 # The toolbar: commands that have an icon, in a strip at the left edge of the scene.
 
 GROUPS = [group for menu in MENUS if (group := [command for command in BY_MENU[menu] if command.icon])]
-TOOLS = [command for group in GROUPS for command in group]
-SIDE_EM, GAP_EM, MARGIN_EM = 1.75, 0.3, 0.3  # of a button, between menus, around them
-OPACITY = 0.95  # of a button
+SIDE_EM, GAP_EM, EDGE_EM = 1.8, 0.4, 0.3  # of a button, between menus, within the strip
+LEAST = 0.8  # of a button's side; a lower strip is scrolled by the wheel
 
 
-def draw_toolbar(viewer: Viewer, area: ui.Area) -> None:
-    """Draw a column of buttons over the scene's left edge, smaller ones where the scene is low.
-
-    It lies between the titles of images and what is written at their foot.
-    """
+def draw_toolbar(viewer: Viewer, area: ui.Area) -> float:
+    """Draw a column of buttons over the scene's left edge; return how far it reaches into the scene."""
     if viewer.state.scene is None or not viewer.state.show_panel or viewer.state.show_start:
-        return
-    top, gap, margin = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GAP_EM, MARGIN_EM))
-    gaps = len(GROUPS) * gap
-    side = min(top, (area.height - 2 * top - 2 * margin - gaps) / len(TOOLS))
-    if side < top / 3:
-        return
-    imgui.set_next_window_pos(ImVec2(area.left, area.top + top))
-    imgui.set_next_window_size(ImVec2(side + 2 * margin, len(TOOLS) * side + gaps + 2 * margin))
-    imgui.set_next_window_bg_alpha(0.0)
-    imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(margin, margin))
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, ImVec2(0, 0))
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, 0))
-    imgui.begin("toolbar", None, ui.OVER | ui.FIXED)
-    for group in GROUPS:
-        if group is not GROUPS[0]:
-            imgui.dummy(ImVec2(side, gap))
-        for command in group:
-            _tool_button(viewer, command, side)
-    imgui.end()
-    imgui.pop_style_var(3)
+        return 0.0
+    side, gap, edge = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GAP_EM, EDGE_EM))
+    margin, gaps, count = 2 * gap, (len(GROUPS) - 1) * gap, sum(map(len, GROUPS))
+    room = area.height - 2 * margin
+    side = max(min(side, (room - gaps - 2 * edge) / count), LEAST * side)
+    imgui.set_next_window_pos(ImVec2(area.left + margin, area.top + margin))
+    wide, high = side + 2 * edge, count * side + gaps + 2 * edge
+    imgui.set_next_window_size(ImVec2(wide, min(high, room)))
+    with ui.floating("toolbar", ui.OVER | ui.FIXED, ImVec2(edge, edge)):
+        imgui.push_style_var(imgui.StyleVar_.item_spacing, ImVec2(0, 0))
+        imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, 0))
+        imgui.push_style_var(imgui.StyleVar_.frame_border_size, 0.0)
+        for group in GROUPS:
+            if group is not GROUPS[0]:
+                imgui.dummy(ImVec2(side, gap))
+            for command in group:
+                _tool_button(viewer, command, side)
+        imgui.pop_style_var(3)
+    return margin + wide
 
 
 def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
     lit = command.is_on is not None and command.is_on(viewer)
-    colour = imgui.get_style_color_vec4(imgui.Col_.button_active if lit else imgui.Col_.window_bg)
-    imgui.push_style_color(imgui.Col_.button, ImVec4(colour.x, colour.y, colour.z, OPACITY))
+    imgui.push_style_color(imgui.Col_.button, theme.colour("pressed") if lit else theme.CLEAR)
+    imgui.push_style_color(imgui.Col_.text, theme.colour("accent" if lit else "ink"))
     if imgui.button(button_label(command), ImVec2(side, side)):
         command.act(viewer)
-    imgui.pop_style_color()
+    imgui.pop_style_color(2)
     keys = f" ({command.keys[0]})" if command.keys else ""
     ui.tip(command.does[0].upper() + command.does[1:] + keys)
 
@@ -110,6 +98,56 @@ def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
 def button_label(command: Command) -> str:
     """Return the label of a command's button: its icon, and an id that no other command has."""
     return f"{getattr(icons_fontawesome_6, f'ICON_FA_{command.icon}')}##{command.does}"
+
+
+# The status line.
+
+BAR_EM, FOOT = 18.0, ("Timeline", "Messages")
+DRAWN_BY = {"cpu": "the processor", "opengl": "OpenGL", "cuda": "CUDA", "": "nothing yet"}
+
+
+def draw_status(viewer: Viewer) -> None:
+    """Draw what is under way with its Cancel, the figures, and what is opened at the foot."""
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, hello_imgui.em_to_vec2(0.6, 0.1))
+    imgui.set_cursor_pos_y((imgui.get_window_height() - imgui.get_frame_height()) / 2)
+    right = imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x
+    right -= sum(ui.button_width(title) + imgui.get_style().item_spacing.x for title in FOOT)
+    imgui.align_text_to_frame_padding()
+    work = viewer.worker.current
+    if work is not None:
+        if ui.stoppable(*work, width=hello_imgui.em_size(BAR_EM)):
+            opening.cancel(viewer)
+        imgui.same_line()
+    for text, about in _figures(viewer):
+        if imgui.get_cursor_pos_x() + ui.width_of(text) > right:
+            break
+        imgui.text_colored(ui.muted(), text)
+        ui.tip(about)
+        imgui.same_line(0, hello_imgui.em_size(1.4))
+    imgui.same_line(right)
+    for title in FOOT:
+        is_open = title in (viewer.state.preferences.panels or ())
+        imgui.push_style_color(imgui.Col_.text, theme.colour("accent" if is_open else "ink"))
+        clicked = imgui.button(f"{title}##status")
+        imgui.pop_style_color()
+        if clicked:
+            settings.turn_panel(viewer, title, is_open=not is_open)
+        imgui.same_line()
+    imgui.pop_style_var()
+
+
+def _figures(viewer: Viewer) -> Iterator[tuple[str, str]]:
+    """Yield what is open and selected, and how the image was drawn: words and their tip."""
+    state, stats = viewer.state, viewer.state.stats
+    if state.scene is not None and state.path is not None:
+        yield f"{state.path.name}: {len(state.scene.gaussians):,} Gaussians", str(state.path)
+    selected = np.count_nonzero(state.marks.selected)
+    if selected:
+        yield f"{selected:,} selected", with_key("Selected Gaussians; none", editing.select_none)
+    if stats.width:
+        size = f"{stats.width} x {stats.height} pixels in {stats.milliseconds:.0f} ms"
+        yield size, "Size of the last image of the scene, and the time that it took to draw"
+        yield f"drawn by {DRAWN_BY[state.backend]}", "Another is chosen on the command line: --backend"
 
 
 # The command palette: the project's own, since that of imgui-bundle shows no keys, sorts by name and does not

@@ -28,7 +28,7 @@ def draw(viewer: Viewer) -> None:
     drafts = viewer.state.drafts
     _, typed = imgui.input_text_with_hint("##filter", "filter", drafts.get("##filter", ""))
     drafts["##filter"] = typed
-    if imgui.begin_child("rows", child_flags=imgui.ChildFlags_.nav_flattened):
+    if ui.begin_list("rows"):
         for row in outline.filtered(viewer, view.roots, typed):
             _row(viewer, row)
     imgui.end_child()

@@ -77,7 +77,9 @@ def draw_display(viewer: Viewer) -> None:
     if needs_query and not viewer.state.shown():
         ui.small_wrapped("search for something to see where it is", ui.muted())
     if any(pane.row.drawing is Drawing.HEAT for pane in viewer.state.panes()):
-        picture = replace(picture, heat=ui.radio({of: of for of in HEAT_TIPS}, picture.heat, HEAT_TIPS))
+        ui.row("Heat")
+        heats = {of: of.capitalize() for of in HEAT_TIPS}
+        picture = replace(picture, heat=ui.choice(heats, picture.heat, HEAT_TIPS))
         picture = replace(picture, heat_opacity=ui.slider("Heat opacity", picture.heat_opacity, (0.0, 1.0)))
         picture = replace(picture, heat_scale=_heat_scale(viewer))
     if needs_query:
@@ -88,14 +90,15 @@ def draw_display(viewer: Viewer) -> None:
         changed, chosen = imgui.combo("Colour map", names.index(picture.colour_map), list(names))
         if changed:
             picture = replace(picture, colour_map=names[chosen])
-    picture = replace(picture, background=ui.radio(BACKDROPS, picture.background))
-    ui.beside_boxed("Backdrop")
-    flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.uint8
+    ui.row("Backdrop")
+    flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.uint8 | imgui.ColorEditFlags_.no_label
     changed, colour = imgui.color_edit3("Backdrop", list(picture.background), flags)
     if changed:
         red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
         picture = replace(picture, background=(red, green, blue))
     ui.tip("What shows where the scene is not")
+    imgui.same_line()
+    picture = replace(picture, background=ui.choice(BACKDROPS, picture.background))
     picture = replace(picture, transparent=imgui.checkbox("Save without backdrop", picture.transparent)[1])
     ui.tip("Pictures are saved transparent where the scene is not")
     settings.set_picture(viewer, picture)
@@ -124,18 +127,15 @@ def _heat_scale(viewer: Viewer) -> tuple[float, float] | None:
 def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
     """Draw displays that need the same beside each other, named first where one has several buttons."""
     state = viewer.state
-    buttons = [button for row in rows for button in buttons_of(row)]
+    buttons: dict[Button | None, str] = {one: one.label for row in rows for one in buttons_of(row)}
     if len(buttons) > len(rows):
-        imgui.align_text_to_frame_padding()
-        imgui.text(rows[0].label)
-        imgui.same_line()
-    for place, button in enumerate(buttons):
-        if place:
-            ui.beside_boxed(button.label)
-        imgui.begin_disabled(not state.has_field and DISPLAYS[button.display].needs_field)
-        if imgui.radio_button(button.label, is_shown(state, button)):
-            settings.set_display(viewer, button.display, button.latent_level)
-        imgui.end_disabled()
+        ui.row(rows[0].label)
+    shown = next((one for one in buttons if one is not None and is_shown(state, one)), None)
+    imgui.begin_disabled(not state.has_field and rows[0].needs_field)
+    chosen = ui.choice(buttons, shown)
+    imgui.end_disabled()
+    if chosen is not None and chosen != shown:
+        settings.set_display(viewer, chosen.display, chosen.latent_level)
 
 
 def _compared(viewer: Viewer) -> None:
@@ -190,7 +190,7 @@ def draw_training(viewer: Viewer) -> None:
     form = replace(form, gaussians=_text_box("Gaussians", hint, form.gaussians))
     form = replace(form, out=_text_box("Scene", "scene.ply", form.out))
     form = replace(form, encoder=_text_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
-    preset = ui.radio({name: name for name in PRESETS}, form.preset, PRESETS)
+    preset = ui.choice({name: name.capitalize() for name in PRESETS}, form.preset, PRESETS)
     settings.put(state, training_form=replace(form, preset=preset))
     if imgui.button("Train"):
         opening.start_training(viewer)
@@ -235,19 +235,9 @@ def _running(viewer: Viewer, process: Training) -> None:
 
 
 def draw_messages(viewer: Viewer) -> None:
-    """Draw progress, messages (the latest first), and backend, time and size of the last image."""
-    if viewer.worker.current is not None and ui.stoppable(*viewer.worker.current):
-        opening.cancel(viewer)
+    """Draw the panel "Messages", the latest first."""
     ui.recorder_bar(viewer)
-    line, stats = imgui.get_text_line_height_with_spacing(), viewer.state.stats
-    height = max(imgui.get_content_region_avail().y - line, 2 * line)  # however low the panel is
-    if imgui.begin_child("messages", ImVec2(0, height)):
+    if imgui.begin_child("messages"):
         for message in reversed(viewer.state.messages):
             ui.small_wrapped(message.text, ui.bad() if message.is_error else ui.muted())
     imgui.end_child()
-    figures = [viewer.state.backend]
-    if stats.width:
-        figures += [f"{stats.milliseconds:.0f} ms", f"{stats.width} x {stats.height}"]
-    selected = np.count_nonzero(viewer.state.marks.selected)
-    figures += [f"{selected:,} selected"] if selected else []
-    imgui.text_colored(ui.muted(), "   ".join(part for part in figures if part))

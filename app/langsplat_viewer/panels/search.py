@@ -1,11 +1,10 @@
-"""The panel "Search": the box with its offers, the list of queries, and the details of the chosen one."""
+"""What floats over the scene: the search box with its offers, the answers, and details of the chosen one."""
 
-import math
 from functools import lru_cache
 from typing import get_args
 
 import numpy as np
-from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core.arrays import Array, length_text
 from langsplat_core.config import LevelChoice
@@ -14,19 +13,21 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import opening, queries, settings, viewpoint
-from langsplat_viewer.panels import ui
+from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
 from langsplat_viewer.session import Query
 from langsplat_viewer.viewer import Viewer
 
+TITLE = "Search"
 HINT = "what to look for"
 HINT_EXAMPLES = 2
 OFFER_LINES = 2  # more are scrolled to
+FOLD = f"{icons_fontawesome_6.ICON_FA_CHEVRON_UP}##fold"
 
 
 def _box(viewer: Viewer) -> None:
     queries.prepare_suggestions(viewer)
-    imgui.set_next_item_width(ui.beside_button("Search"))
+    imgui.set_next_item_width(ui.beside_button(FOLD))
     if settings.take(viewer.state, "focus_input"):
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.enter_returns_true | imgui.InputTextFlags_.callback_history
@@ -46,17 +47,23 @@ def _box(viewer: Viewer) -> None:
 
     entered, drafts[label] = imgui.input_text_with_hint(label, hint(viewer), typed, flags, recalled)
     imgui.same_line()
-    if imgui.button("Search") or entered:
+    if ui.button(FOLD, "Fold the search; Ctrl + F opens it again"):
+        settings.turn_panel(viewer, TITLE, is_open=False)
+    if entered:
         settings.put(viewer.state, focus_input=True, awaits_keyboard=True)  # for the next phrase
         if drafts[label].strip():
             queries.ask(viewer, drafts.pop(label))
-    height = OFFER_LINES * imgui.get_text_line_height_with_spacing()  # with or without offers
+    imgui.push_style_var(imgui.StyleVar_.frame_rounding, theme.PILL)
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, hello_imgui.em_to_vec2(0.65, 0.15))
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, hello_imgui.em_to_vec2(0.4, 0.4))
+    height = OFFER_LINES * imgui.get_frame_height_with_spacing()  # with or without offers
     if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.nav_flattened):
         is_pointed_at = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item)
         title, phrases = queries.offered(viewer, drafts.get(label, ""), is_pointed_at)
         if phrases:
             _offer_buttons(viewer, title, phrases)
     imgui.end_child()
+    imgui.pop_style_var(3)
 
 
 def hint(viewer: Viewer) -> str:
@@ -66,11 +73,13 @@ def hint(viewer: Viewer) -> str:
 
 
 def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None:
-    imgui.text_colored(ui.muted(), title)
+    if title:
+        imgui.text_colored(ui.muted(), title)
     for number, phrase in enumerate(phrases):
-        ui.beside(phrase)
+        if title or number:
+            ui.beside(phrase)
         shown = ui.elided(phrase, imgui.get_content_region_avail().x - ui.button_width(""))
-        if imgui.small_button(f"{shown}###offer {number}"):
+        if imgui.button(f"{shown}###offer {number}"):
             viewer.state.drafts.pop("##phrase", None)
             queries.ask_offered(viewer, phrase)
         if shown != phrase:
@@ -118,28 +127,19 @@ def histogram(result: QueryResult) -> tuple[float, float, Array]:
 
 # The list of queries.
 
-ROWS = 3.5  # that the list shows at least: the half one says that there are more
-BELOW = 10  # rows that the details of a query take, and what follows them in the panel
+MOST_ROWS = 5.5  # that are seen at a time: the half one says that there are more
 HIDDEN = (0.25, 0.25, 0.25)
 
 
 def _answers(viewer: Viewer) -> None:
-    """Draw the list, newest first, and below it the chosen query.
-
-    It grows when something is asked and not when an answer arrives.
-    """
-    row = imgui.get_frame_height_with_spacing()
-    listed = viewer.state.session.queries
-    room = imgui.get_content_region_avail().y / row - BELOW
-    rows = min(len(listed) or 1, max(ROWS, math.floor(room) + 0.5))
-    if imgui.begin_child("queries", ImVec2(0, rows * row), imgui.ChildFlags_.nav_flattened):
-        if not listed:
-            imgui.text_colored(ui.muted(), "what you search is listed here")
-        for query in reversed(listed):
+    """Draw the list, newest first, and below it the chosen query."""
+    if viewer.state.session.queries and ui.begin_list("queries", MOST_ROWS):
+        for query in reversed(viewer.state.session.queries):
             imgui.push_id(query.phrase)
             _line(viewer, query)
             imgui.pop_id()
-    imgui.end_child()
+    if viewer.state.session.queries:
+        imgui.end_child()
     chosen = viewer.state.session.query(viewer.state.session.chosen)
     if chosen is not None:
         _details(viewer, chosen)
@@ -193,7 +193,7 @@ def _verdict(viewer: Viewer, query: Query, width: float) -> None:
 
 
 def _details(viewer: Viewer, query: Query) -> None:
-    """Draw how a query was read or why it was not answered; of what may be here place, scores, threshold."""
+    """Draw how a query was read or why it was not answered; of what may be here what can be done with it."""
     answer, result = viewer.state.answer(query), viewer.state.result(query)
     if answer.problem:
         ui.small_wrapped(answer.problem, ui.bad())
@@ -209,13 +209,15 @@ def _details(viewer: Viewer, query: Query) -> None:
         queries.explain(viewer, query)
     if answer.like is not None and ui.next_button("Like it", "Find what is like it, too"):
         queries.show_alike(viewer, query)
+    if not imgui.tree_node_ex("Threshold, scores, place", imgui.TreeNodeFlags_.no_tree_push_on_open):
+        return
+    _cut(viewer, query, result)
+    _scores(result)
     if result.place is not None:
         imgui.text_colored(ui.muted(), "at " + length_text(result.place, "  ", 2, viewer.state.origin))
         ui.tip("Where it is relevant most; world units")
     if not answer.has_evidence:
         ui.small_wrapped(NO_EVIDENCE, ui.muted())
-    _scores(result)
-    _cut(viewer, query, result)
 
 
 def _scores(result: QueryResult) -> None:
@@ -230,7 +232,11 @@ def _scores(result: QueryResult) -> None:
 # The panel.
 
 NO_EVIDENCE = "Why? needs the masks that Train keeps beside a scene"
-NEW = {False: "replace", True: "add"}  # what a new answer does to those that are shown
+NEW = {False: "Replace", True: "Add"}  # what a new answer does to those that are shown
+NEW_TIPS = {
+    False: "The picture of the answer before goes; its row stays in the list",
+    True: "Answers are painted beside those before, each in its colour",
+}
 LEVEL_TIPS: dict[LevelChoice, str] = {
     name: "The level that answers best" if name == "auto" else "How finely things are divided"
     for name in get_args(LevelChoice)
@@ -249,22 +255,17 @@ def draw(viewer: Viewer) -> None:
     _box(viewer)
     _level(viewer)
     imgui.end_disabled()
+    _answers(viewer)
     if viewer.engine is not None:
         basis = viewer.engine.basis
         ui.small_wrapped(basis.short, ui.bad() if basis.guesses else ui.muted())
         ui.tip(basis.long)
-    _answers(viewer)
 
 
 def _level(viewer: Viewer) -> None:
-    imgui.align_text_to_frame_padding()
-    imgui.text("Level")
-    ui.beside_boxed(next(iter(LEVEL_TIPS)))
-    queries.set_level(
-        viewer, ui.radio({name: name for name in LEVEL_TIPS}, viewer.state.session.level, LEVEL_TIPS)
-    )
-    imgui.align_text_to_frame_padding()
-    imgui.text("New answers")
-    ui.beside_boxed(NEW[False])
-    viewer.change("adds", adds=ui.radio(NEW, viewer.state.session.adds))
-    ui.tip("Whether the picture of the answer before goes; its row stays in the list")
+    levels = {name: name.capitalize() for name in LEVEL_TIPS}
+    chosen = ui.choice(levels, viewer.state.session.level, LEVEL_TIPS)
+    queries.set_level(viewer, chosen)
+    if viewer.state.session.queries:
+        ui.row("New answers")
+        viewer.change("adds", adds=ui.choice(NEW, viewer.state.session.adds, NEW_TIPS))

@@ -65,7 +65,7 @@ def _tools(viewer: Viewer) -> None:
         if imgui.button(f"{tool.capitalize()}##tool"):
             editing.use_tool(viewer, None if active else tool)
         imgui.pop_style_color()
-    mode = ui.radio({mode: mode.capitalize() for mode in MODES}, tools.mode)
+    mode = ui.choice({mode: mode.capitalize() for mode in MODES}, tools.mode)
     _, only = imgui.checkbox("Only what is visible", tools.only_visible)
     editing.set_tools(viewer, mode=mode, only_visible=only)
     ui.tip("Rectangle, lasso and brush leave out what lies behind something")
@@ -202,7 +202,7 @@ def draw_transform(viewer: Viewer) -> None:
     chosen = np.count_nonzero(state.marks.selected)
     what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
     ui.small_wrapped(what, ui.muted())
-    kind = ui.radio(GIZMOS, state.edit_form.gizmo)
+    kind = ui.choice(GIZMOS, state.edit_form.gizmo)
     if kind != state.edit_form.gizmo:
         editing.set_gizmo(viewer, kind)
     form = state.edit_form

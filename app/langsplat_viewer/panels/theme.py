@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from imgui_bundle import ImVec2, ImVec4, imgui
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_viewer.session import Preferences
 
@@ -105,6 +105,7 @@ def apply(preferences: Preferences) -> None:
         setattr(style, name, ImVec2(x * scale, y * scale))
     for name, size in SIZES.items():
         setattr(style, name, size * scale)
+    hello_imgui.get_runner_params().imgui_window_params.background_color = ImVec4(*rgba(chosen.ground))
     style.window_border_size = style.popup_border_size = style.tab_border_size = 0
     style.child_border_size = style.frame_border_size = 1
     style.window_menu_button_position = imgui.Dir.none

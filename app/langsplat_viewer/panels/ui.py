@@ -1,7 +1,8 @@
 """What panels share: the scene's area of the window, colours, letters, and small widgets."""
 
 import sys
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -28,6 +29,7 @@ OVER = (  # a window over the scene: it looks like a part of the image, and does
     | imgui.WindowFlags_.no_bring_to_front_on_focus
 )
 FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_docking
+FLOATS = (OVER | FIXED | imgui.WindowFlags_.always_auto_resize) & ~imgui.WindowFlags_.no_scrollbar
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,7 @@ def scene_area() -> Area:
 
 
 TIP_LETTERS = 72  # of a line
+LABEL_EM = 5.2  # width of what is written before a row of choices
 MOST_OVER = 0.94  # of the window that something which lies over it may take
 
 
@@ -100,12 +103,17 @@ def tip(text: str) -> None:
         imgui.set_tooltip(fill(text, TIP_LETTERS, break_on_hyphens=False))
 
 
-def stoppable(label: str, fraction: float, tag: str = "") -> bool:
-    """Draw a bar with a button beside it; return whether that was clicked. `tag`: for an id of its own."""
-    width = beside_button("Cancel")
-    if width_of(label) > imgui.get_content_region_avail().x + width:  # no room for it in the bar
+def stoppable(label: str, fraction: float, tag: str = "", width: float = 0.0) -> bool:
+    """Draw a bar with a button beside it; return whether that was clicked.
+
+    `tag`: for an id of its own; `width`: of the bar, 0 for all of the row.
+    """
+    if width:
+        label = elided(label, width)
+    elif width_of(label) > imgui.get_content_region_avail().x + beside_button("Cancel"):  # no room in the bar
         imgui.text_wrapped(label)
         label = ""
+    width = width or beside_button("Cancel")
     imgui.push_style_color(imgui.Col_.plot_histogram, imgui.get_style_color_vec4(imgui.Col_.button_active))
     imgui.progress_bar(fraction, ImVec2(width, 0), label)
     imgui.pop_style_color()
@@ -229,14 +237,70 @@ def draw_fields(holder: Any, panel: str) -> dict[str, Any]:
     return values
 
 
-def radio(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = None) -> T:
-    """Draw a radio button with its label for each of the `choices`; return the one that is chosen now."""
-    for place, (value, label) in enumerate(choices.items()):
-        if place:
-            beside_boxed(label)
-        if imgui.radio_button(label, value == chosen):
-            chosen = value
-        tip(tips[value] if tips else "")
+@contextmanager
+def floating(name: str, flags: int = FLOATS, padding: ImVec2 | None = None) -> Iterator[None]:
+    """Draw what follows on glass over the scene, by default as large as it is."""
+    scale = imgui.get_style().font_scale_main
+    imgui.push_style_var(imgui.StyleVar_.window_rounding, theme.FLOATING * scale)
+    imgui.push_style_var(imgui.StyleVar_.window_border_size, 1.0)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, padding or hello_imgui.em_to_vec2(0.9, 0.9))
+    imgui.push_style_color(imgui.Col_.window_bg, theme.colour("glass"))
+    imgui.begin(name, None, flags)
+    imgui.pop_style_color()
+    imgui.pop_style_var(3)
+    yield
+    imgui.end()
+
+
+def row(label: str) -> None:
+    """Begin a row with a label, in a column with those above and below."""
+    imgui.align_text_to_frame_padding()
+    imgui.text_colored(muted(), label)
+    imgui.same_line(
+        max(hello_imgui.em_size(LABEL_EM), width_of(label) + 2 * imgui.get_style().item_spacing.x)
+    )
+
+
+def choice(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = None) -> T:
+    """Draw a row of joined buttons, one for each of the `choices`; return the one that is chosen now.
+
+    The row is as wide as there is room, and broken where that is too little.
+    """
+    room, padding = imgui.get_content_region_avail().x, imgui.get_style().frame_padding
+    widths = {value: button_width(label) - padding.x for value, label in choices.items()}
+    rows: list[list[T]] = [[]]
+    for value, width in widths.items():
+        if rows[-1] and sum(widths[other] for other in rows[-1]) + width > room:
+            rows.append([])
+        rows[-1].append(value)
+    height, paint, start = (
+        imgui.get_frame_height(),
+        imgui.get_window_draw_list(),
+        imgui.get_cursor_screen_pos(),
+    )
+    end = ImVec2(start.x + room, start.y + len(rows) * height)
+    rounding = imgui.get_style().frame_rounding
+    paint.add_rect_filled(start, end, imgui.get_color_u32(imgui.Col_.frame_bg), rounding)
+    paint.add_rect(start, end, imgui.get_color_u32(imgui.Col_.border), rounding)
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, ImVec2(0, 0))
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, padding.y))
+    imgui.push_style_var(imgui.StyleVar_.frame_border_size, 0.0)
+    imgui.begin_group()
+    for row in rows:
+        more = (room - sum(widths[value] for value in row)) / len(row)
+        for place, value in enumerate(row):
+            if place:
+                imgui.same_line()
+            imgui.push_style_color(
+                imgui.Col_.button, theme.colour("pressed") if value == chosen else theme.CLEAR
+            )
+            imgui.push_style_color(imgui.Col_.text, theme.colour("ink" if value == chosen else "soft"))
+            clicked = imgui.button(choices[value], ImVec2(widths[value] + more, height))
+            imgui.pop_style_color(2)
+            tip(tips[value] if tips else "")
+            chosen = value if clicked else chosen
+    imgui.pop_style_var(3)
+    imgui.end_group()
     return chosen
 
 
@@ -258,6 +322,14 @@ def slider(
     return new if changed else value  # what comes back unchanged has been rounded
 
 
+def begin_list(name: str, rows: float = 14.5) -> bool:
+    """Begin a part that is as high as what it lists, but for more than so many rows, which are scrolled."""
+    most = ImVec2(imgui.FLT_MAX, rows * imgui.get_frame_height_with_spacing())
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), most)
+    flags = imgui.ChildFlags_.nav_flattened | imgui.ChildFlags_.auto_resize_y
+    return bool(imgui.begin_child(name, ImVec2(0, 0), flags))
+
+
 @dataclass(frozen=True)
 class Row:
     """A row of a list."""
@@ -268,16 +340,15 @@ class Row:
 
 
 def listed(
-    name: str, rows: Sequence[Row], empty: str = "", height: float = 0, *, keeps_chosen: bool = False
+    name: str, rows: Sequence[Row], empty: str = "", *, keeps_chosen: bool = False
 ) -> tuple[int | None, int | None]:
     """Draw a list, each row with a button that takes it off.
 
-    Return the numbers of the row that was clicked and of the one taken off. `empty` is said in place of rows;
-    `height` in rows, 0 for all of the panel. `keeps_chosen`: the chosen one cannot be taken off.
+    Return the numbers of the row that was clicked and of the one taken off. `empty` is said in place of rows.
+    `keeps_chosen`: the chosen one cannot be taken off.
     """
     clicked = gone = None
-    borders = imgui.ChildFlags_.borders if height else 0
-    if imgui.begin_child(name, ImVec2(0, height * imgui.get_frame_height_with_spacing()), borders):
+    if begin_list(name):
         if not rows:
             small_wrapped(empty, muted())
         side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x

@@ -1,17 +1,19 @@
-"""The panels "Camera", "Record" and "Bookmarks"."""
+"""The panels "Camera", "Timeline", "Record" and "Bookmarks"."""
 
 import math
 from collections.abc import Sequence
 
-from imgui_bundle import hello_imgui, imgui
+from imgui_bundle import ImVec2, hello_imgui, imgui
 
+from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
 from langsplat_viewer.actions import settings, viewpoint
+from langsplat_viewer.actions.viewpoint import THUMBNAIL
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, with_fov
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.options import MAX_SIDE
-from langsplat_viewer.panels import ui
+from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.viewer import Viewer
 
@@ -76,26 +78,20 @@ def _training_cameras(viewer: Viewer, cameras: Sequence[Camera]) -> None:
         viewpoint.go_to_camera(viewer, wanted)
 
 
-# The panel "Record": keyframes of the camera path, playing it, films of it.
+# The panel "Timeline": keyframes of the camera path, and playing it.
 
-ROWS = 3.5  # of the list: the half one says that there are more
-NUMBER_EM, FPS_EM = 7.5, 4.5
+NUMBER_EM, FPS_EM, LOOP_EM = 8.0, 5.0, 5.0
+MOST_EM = 8.0  # height of a thumbnail
 
 
-def draw_record(viewer: Viewer) -> None:
-    """Draw the panel "Record": what the path is, playing it, saving it, films."""
-    record = viewer.state.record
-    turns = ui.radio({False: "Keyframes", True: "Turntable"}, record.turns)
-    if turns != record.turns:
-        viewpoint.set_turning(viewer, turns)
-    ui.tip("Once around what the view turns around; F makes that the latest result")
+def draw_timeline(viewer: Viewer) -> None:
+    """Draw the panel "Timeline": playing the path, and its keyframes as they will look."""
     imgui.begin_disabled(viewer.state.view is None)
     _play(viewer)
-    if record.turns:
-        _duration(viewer)
+    if viewer.state.record.turns:
+        ui.small_wrapped("Once around what the view turns around; F makes that the latest result", ui.muted())
     else:
         _keyframes(viewer)
-    _films(viewer)
     imgui.end_disabled()
 
 
@@ -106,23 +102,17 @@ def _play(viewer: Viewer) -> None:
     if ui.button(label, with_key("Play", viewpoint.toggle_playing)):
         viewpoint.toggle_playing(viewer)
     imgui.same_line()
-    loop = ui.width_of("Loop") + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
-    imgui.set_next_item_width(-loop)
+    imgui.set_next_item_width(-hello_imgui.em_size(NUMBER_EM + 2 * LOOP_EM))
     changed, at = imgui.slider_float("##at", record.at, 0.0, max(seconds, 1e-3), "%.2f s")
     if changed:
         viewpoint.scrub(viewer, at)
-    imgui.end_disabled()
     imgui.same_line()
-    settings.put(record, loops=imgui.checkbox("Loop", record.loops)[1])
-
-
-def _duration(viewer: Viewer) -> None:
-    seconds = viewpoint.path_seconds(viewer)
-    imgui.begin_disabled(seconds <= 0)
     wanted = _number("Duration", seconds, 1.0)
     if wanted is not None:
         viewpoint.set_path_seconds(viewer, wanted)
     imgui.end_disabled()
+    imgui.same_line()
+    settings.put(record, loops=imgui.checkbox("Loop", record.loops)[1])
 
 
 def _number(label: str, value: float, step: float) -> float | None:
@@ -135,39 +125,83 @@ def _number(label: str, value: float, step: float) -> float | None:
 
 def _keyframes(viewer: Viewer) -> None:
     record, keyframes = viewer.state.record, viewer.state.session.keyframes
-    ui.verbs(viewer, "Add keyframe")
+    ui.verbs(viewer, "Add keyframe", "Save path")
     if ui.next_button("Clear", enabled=bool(keyframes)):
         viewpoint.clear_path(viewer)
-    ui.beside("Duration", hello_imgui.em_size(NUMBER_EM))
-    _duration(viewer)
-    rows = [
-        ui.Row(f"{number}   {key.seconds:.2f} s", key is record.chosen)
-        for number, key in enumerate(keyframes, 1)
-    ]
-    empty = "Add the current view; the path goes smoothly from one to the next"
-    clicked, gone = ui.listed("keyframes", rows, empty, ROWS)
-    if clicked is not None:
-        viewpoint.choose_keyframe(viewer, keyframes[clicked])
-    if gone is not None:
-        viewpoint.delete_keyframe(viewer, keyframes[gone])
     _chosen(viewer, record.chosen)
-    ui.verbs(viewer, "Save path")
+    flags = imgui.WindowFlags_.horizontal_scrollbar
+    if imgui.begin_child("keyframes", ImVec2(0, 0), 0, flags):
+        if not keyframes:
+            empty = "Add the current view; the path goes smoothly from one keyframe to the next"
+            ui.small_wrapped(empty, ui.muted())
+        images = viewpoint.thumbnails(viewer)
+        drawn = viewer.state.record.thumbnails[0]
+        for number, key in enumerate(keyframes):
+            imgui.push_id(number)
+            _card(viewer, number, key, drawn.index(key) if key in drawn else None, images)
+            imgui.pop_id()
+            imgui.same_line()
+    imgui.end_child()
+
+
+_strip = ui.Picture()  # the thumbnails, one below the other
+
+
+def _card(viewer: Viewer, number: int, key: Keyframe, place: int | None, images: Array) -> None:
+    """Draw a keyframe as it will look, over its time; a click goes there."""
+    room = imgui.get_content_region_avail().y - imgui.get_text_line_height_with_spacing()
+    height, count = min(hello_imgui.em_size(MOST_EM), max(room - 8, 16)), len(images) // THUMBNAIL[1]
+    size = ImVec2(height * THUMBNAIL[0] / THUMBNAIL[1], height)
+    imgui.begin_group()
+    border = theme.colour("accent" if key is viewer.state.record.chosen else "line")
+    imgui.push_style_color(imgui.Col_.border, border)
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, hello_imgui.em_to_vec2(0.15, 0.15))
+    if place is not None:
+        ends = ImVec2(0, place / count), ImVec2(1, (place + 1) / count)
+        texture = imgui.ImTextureRef(_strip.texture(images).glo)
+        clicked = imgui.image_button("##keyframe", texture, size, *ends)
+    else:
+        clicked = imgui.button(f"{number + 1}##keyframe", size)
+    imgui.pop_style_var()
+    imgui.pop_style_color()
+    imgui.text_colored(ui.muted(), f"{number + 1}   {key.seconds:.2f} s")
+    imgui.end_group()
+    if clicked:
+        viewpoint.choose_keyframe(viewer, key)
 
 
 def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
-    imgui.begin_disabled(key is None)
-    seconds = _number("##time of the keyframe", 0.0 if key is None else key.seconds, 0.5)
-    if seconds is not None and key is not None:
+    """Draw what can be done with the keyframe that is chosen."""
+    if key is None:
+        return
+    ui.beside("Time", hello_imgui.em_size(NUMBER_EM))
+    seconds = _number("Time", key.seconds, 0.5)
+    if seconds is not None:
         viewpoint.move_keyframe(viewer, key, seconds)
-    if ui.next_button("Set to this view") and key is not None:
+    if ui.next_button("Set to this view", "Put the current view in its place"):
         viewpoint.replace_keyframe(viewer, key)
-    ui.tip("Put the current view in its place")
+    if ui.next_button("Remove", "Take it off the path"):
+        viewpoint.delete_keyframe(viewer, key)
+
+
+# The panel "Record": films of the path.
+
+
+def draw_record(viewer: Viewer) -> None:
+    """Draw the panel "Record": which path is filmed, how, and where to."""
+    record = viewer.state.record
+    turns = ui.choice({False: "Keyframes", True: "Turntable"}, record.turns)
+    if turns != record.turns:
+        viewpoint.set_turning(viewer, turns)
+    imgui.begin_disabled(viewer.state.view is None)
+    if ui.button("Open the timeline", "Keyframes, and playing the path"):
+        settings.open_panel(viewer, "Timeline")
+    _films(viewer)
     imgui.end_disabled()
 
 
 def _films(viewer: Viewer) -> None:
     record = viewer.state.record
-    imgui.separator()
     imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM))
     changed, size = imgui.input_int2("Size", list(record.size))
     if changed:
@@ -181,8 +215,9 @@ def _films(viewer: Viewer) -> None:
                 settings.put(record, fps=fps)
         imgui.end_combo()
     imgui.set_next_item_width(-1)
-    hint = "film.mp4, .webp, .gif or a folder; empty: a new name"
+    hint = "film.mp4, .webp, .gif or a folder"
     _, typed = imgui.input_text_with_hint("##film", hint, record.film_file)
+    ui.tip("Where the film goes; empty: a new name beside the scene")
     settings.put(record, film_file=typed)
     if not ui.recorder_bar(viewer):
         ui.verbs(viewer, "Save film", "Picture of this size")

@@ -18,7 +18,7 @@ from langsplat_viewer.actions.opening import open_scene
 from langsplat_viewer.actions.queries import ask
 from langsplat_viewer.actions.settings import ask_for, open_panel
 from langsplat_viewer.panels import ui
-from langsplat_viewer.panels.layout import MIDDLE, Panel
+from langsplat_viewer.panels.layout import Panel
 from langsplat_viewer.state import FileChoice
 from langsplat_viewer.viewer import Viewer
 
@@ -115,7 +115,7 @@ def draw_library(viewer: Viewer) -> None:
     if entered:
         ask_library(viewer, typed)
     ui.small_wrapped(view.said, ui.muted())
-    if imgui.begin_child("library"):
+    if ui.begin_list("library"):
         for row, hit in enumerate(view.hits):
             imgui.push_id(row)
             _hit(viewer, view, row, hit)
@@ -145,4 +145,4 @@ def _hit(viewer: Viewer, view: LibraryView, row: int, hit: Hit) -> None:
     imgui.end_group()
 
 
-PANEL = Panel(TITLE, MIDDLE, draw_library, is_open=False)
+PANEL = Panel(TITLE, draw_library)
