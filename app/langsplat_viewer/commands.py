@@ -25,7 +25,7 @@ from langsplat_viewer.viewer import Viewer
 class Button:
     """One way to look at the scene."""
 
-    label: str  # of a radio button, with imgui's suffix where another has the same
+    label: str  # of its button, with imgui's suffix where another has the same
     display: Display
     latent_level: int | None = None  # index into LEVELS
 

@@ -24,7 +24,7 @@ from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import extent_of, frame_of
 from langsplat_viewer.camera.overlays import PlacedText, placed
 from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
-from langsplat_viewer.panels import ui
+from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.navigation import chord
 from langsplat_viewer.panels.overlays import pointed_figures, said
@@ -167,6 +167,34 @@ def test_long_lines_are_cut_where_they_fit():
     assert elided("a red mug on the table", 10, len) == "a red m..."
     assert elided("two\nlines", 20, len) == "two lines"
     assert elided("anything", 1, len) == "..."
+
+
+# The theme.
+
+
+def blended(over: str, below: tuple[float, ...]) -> tuple[float, ...]:
+    *colour, alpha = theme.rgba(over)
+    return tuple(alpha * top + (1 - alpha) * low for top, low in zip(colour, below, strict=True))
+
+
+def luminance(colour: tuple[float, ...]) -> float:
+    """Relative luminance, as WCAG 2 defines it."""
+    linear = (part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in colour)
+    return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+@pytest.mark.parametrize("name", theme.THEMES)
+def test_every_text_stands_out_from_what_it_lies_on(name):
+    chosen = theme.THEMES[name]
+    plain = [blended(getattr(chosen, ground), (0.0,) * 3) for ground in ("ground", "raised", "glass")]
+    grounds = [*plain, blended(chosen.glass, (1.0,) * 3)]  # glass, over black and white scenes
+    over = [blended(getattr(chosen, part), low) for low in grounds for part in ("field", "button", "hover")]
+    lit = [blended(getattr(chosen, part), low) for low in grounds for part in ("pressed", "grab")]
+    for text in ("ink", "soft", "accent", "good", "weak", "bad"):
+        colour = luminance(theme.rgba(getattr(chosen, text))[:3])
+        for place in (*grounds, *over, *(lit if text == "ink" else ())):
+            low, high = sorted((luminance(place), colour))
+            assert (high + 0.05) / (low + 0.05) >= 4.5, (text, place)
 
 
 # Letters beyond Latin.

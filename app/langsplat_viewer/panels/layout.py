@@ -1,7 +1,7 @@
 """The layout of the window: the inspector and its sections, what is docked, what floats over the scene."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
 
@@ -220,16 +220,16 @@ def _float_search(viewer: Viewer, area: ui.Area, left: float) -> ui.Area:
     width = min(hello_imgui.em_size(CARD_EM), CARD_SHARE * area.width)
     imgui.set_next_window_pos(ImVec2(area.left + left + margin, area.top + margin))
     if search.TITLE not in opened(viewer.state):
-        with ui.floating("search button"):
+        with ui.floating("search button", padding=hello_imgui.em_to_vec2(0.3, 0.3)):
             if imgui.button(f"{icons_fontawesome_6.ICON_FA_MAGNIFYING_GLASS}##search"):
                 queries.focus_search(viewer)
             ui.tip(with_key("Search", queries.focus_search))
-        return area
+            width = imgui.get_window_width()
+        return area.right_of(left + margin + width)
     imgui.set_next_window_size_constraints(ImVec2(width, 0), ImVec2(width, area.height - 2 * margin))
     with ui.floating(search.TITLE):
         search.draw(viewer)
-    taken = left + margin + width
-    return replace(area, left=area.left + taken, width=max(area.width - taken, 1.0))
+    return area.right_of(left + margin + width)
 
 
 def _said(viewer: Viewer) -> str:

@@ -223,9 +223,7 @@ def draw_help(viewer: Viewer) -> None:
     if not viewer.state.show_help:
         return
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
-    area, room = ui.scene_area(), imgui.get_main_viewport().work_size
-    half = hello_imgui.em_size(KEYS_EM + DOES_EM + 4) / 2
-    centre = ImVec2(min(area.left + area.width / 2, room.x - half), area.top + area.height / 2)
+    centre, room = imgui.get_main_viewport().get_work_center(), imgui.get_main_viewport().work_size
     imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, ui.MOST_OVER * room.y))
     imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)

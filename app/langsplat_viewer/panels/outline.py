@@ -107,13 +107,12 @@ def _eye(viewer: Viewer, node: int, left: float, side: float) -> None:
     """Draw the button that hides a node or shows it again."""
     hidden = bool(outline.hidden_nodes(viewer)[node])
     imgui.same_line(left)
-    imgui.push_style_color(imgui.Col_.button, ImVec4(0, 0, 0, 0))
     text = ui.muted() if hidden else imgui.get_style_color_vec4(imgui.Col_.text)
     imgui.push_style_color(imgui.Col_.text, ImVec4(text.x, text.y, text.z, 0.45 if hidden else 1.0))
     icon = icons.ICON_FA_EYE_SLASH if hidden else icons.ICON_FA_EYE
-    if imgui.button(f"{icon}###eye", ImVec2(side, side)):
+    if ui.small(f"{icon}###eye", side):
         (outline.show if hidden else outline.hide)(viewer, node)
-    imgui.pop_style_color(2)
+    imgui.pop_style_color()
     ui.tip("Show it again" if hidden else "Hide it")
 
 

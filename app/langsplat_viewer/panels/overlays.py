@@ -25,6 +25,7 @@ from langsplat_viewer.session import Note, Point, Ruler
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
 
+TOOLS_EM = 3.8  # of the left edge that the tools take
 GRIP = 12.0  # width of what can be taken hold of, window units
 WHITE, SHADE = 0xFFFFFFFF, 0xA0000000
 UNMOVED = ui.OVER | ui.FIXED | imgui.WindowFlags_.no_background | imgui.WindowFlags_.no_nav
@@ -48,10 +49,13 @@ def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Textur
         if place:
             paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), SHADE, 4.0)
             paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), WHITE, 1.5)
-    gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
+    gap, card = hello_imgui.em_size(0.6), imgui.internal.find_window_by_name("Search")
     for place, (part, name) in enumerate(zip(parts, names, strict=False) if len(parts) > 1 else ()):
         is_left = split.has_line and not place  # and ends at the line
-        text_on_shade(name, part.left + (part.width - gap - ui.width_of(name) if is_left else gap), top, area)
+        x = part.left + (part.width - gap - ui.width_of(name) if is_left else gap)
+        x = max(x, area.left + hello_imgui.em_size(TOOLS_EM))
+        is_under = card is not None and card.active and x < card.pos.x + card.size.x
+        text_on_shade(name, x, (card.pos.y + card.size.y if is_under else area.top) + gap, area)
 
 
 def parts_of(area: ui.Area, split: Split) -> list[ui.Area]:
@@ -198,7 +202,12 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
         foot.append(f"orthographic, {span} across the shorter side")
     line = imgui.get_text_line_height()
     for number, text in enumerate(foot, 1):
-        text_on_shade(text, area.left + 0.6 * line, area.top + area.height - 1.6 * number * line, area)
+        text_on_shade(
+            text,
+            area.left + hello_imgui.em_size(TOOLS_EM),
+            area.top + area.height - 1.6 * number * line,
+            area,
+        )
     if not imgui.get_io().want_capture_mouse:
         _take_click(viewer, area)
 
@@ -505,6 +514,6 @@ def draw_notes(viewer: Viewer) -> None:
         if changed and not imgui.is_key_pressed(imgui.Key.escape):  # which would take back what was typed
             settings.write_note(viewer, note, text)
         imgui.same_line()
-        if imgui.button("x", ImVec2(side, 0)):
+        if ui.small("x", side):
             settings.remove_note(viewer, note)
         imgui.pop_id()

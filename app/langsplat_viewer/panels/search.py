@@ -148,7 +148,7 @@ def _answers(viewer: Viewer) -> None:
 def _line(viewer: Viewer, query: Query) -> None:
     """Colour, phrase, verdict and a button to take it off; the phrase gets what the others leave."""
     spacing, side = imgui.get_style().item_spacing.x, imgui.get_frame_height()
-    verdict_width = ui.width_of("found, by chance 5 %")
+    verdict_width = ui.width_of("found, by chance 0.00 %")
     left, right = imgui.get_cursor_pos_x(), imgui.get_content_region_avail().x
     room = right - 2 * side - verdict_width - 3 * spacing
     _swatch(viewer, query, side)
@@ -162,7 +162,7 @@ def _line(viewer: Viewer, query: Query) -> None:
     imgui.align_text_to_frame_padding()
     _verdict(viewer, query, verdict_width)
     imgui.same_line(left + right - side)
-    if imgui.button("x", ImVec2(side, 0)):
+    if ui.small("x", side):
         queries.remove(viewer, query.phrase)
     ui.tip("Take it off the list")
 

@@ -29,12 +29,12 @@ class Theme:
 
 
 DARK = Theme(
-    *("#eef1f6", "#a9b2c3", "#12161e", "#12161ee6", "#1b202b", "#0000005c", "#ffffff1c", "#ffffff14"),
-    *("#ffffff26", "#ffffff30", "#6b542f", "#ffb454", "#7bd88f", "#ffd166", "#ff9d8a"),
+    *("#eef1f6", "#b6becd", "#12161e", "#12161ee6", "#1b202b", "#0000005c", "#ffffff1c", "#ffffff14"),
+    *("#ffffff20", "#ffffff30", "#6b542f", "#ffb454", "#7bd88f", "#ffd166", "#ffa796"),
 )
 LIGHT = Theme(
     *("#1b2130", "#4b5567", "#f3f5f9", "#f8f9fcf0", "#ffffff", "#ffffff", "#1b213026", "#1b213010"),
-    *("#1b21301f", "#1b21302b", "#f3cf94", "#8f4d00", "#17693a", "#7d5200", "#b02a1c"),
+    *("#1b21301f", "#1b21302b", "#f3cf94", "#7a4100", "#145c33", "#6d4800", "#9f2417"),
 )
 THEMES = {"dark": DARK, "light": LIGHT}
 CLEAR = ImVec4(0, 0, 0, 0)

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -53,6 +53,10 @@ class Area:
     @property
     def corners(self) -> tuple[ImVec2, ImVec2]:
         return ImVec2(self.left, self.top), ImVec2(self.left + self.width, self.top + self.height)
+
+    def right_of(self, taken: float) -> "Area":
+        """Return the area without so much of its left."""
+        return replace(self, left=self.left + taken, width=max(self.width - taken, 1.0))
 
     def columns(self, count: int) -> list["Area"]:
         """Return the area cut into columns of one width."""
@@ -159,6 +163,17 @@ def button(label: str, about: str = "", *, enabled: bool = True) -> bool:
     imgui.end_disabled()
     tip(about)
     return clicked
+
+
+def small(label: str, side: float) -> bool:
+    """Draw a square button without a frame, for a letter or an icon; return whether it was clicked."""
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, imgui.get_style().frame_padding.y))
+    imgui.push_style_var(imgui.StyleVar_.frame_border_size, 0.0)
+    imgui.push_style_color(imgui.Col_.button, theme.CLEAR)
+    clicked = imgui.button(label, ImVec2(side, side))
+    imgui.pop_style_color()
+    imgui.pop_style_var(2)
+    return bool(clicked)
 
 
 def next_button(label: str, about: str = "", *, enabled: bool = True) -> bool:
@@ -361,7 +376,7 @@ def listed(
             tip(row.about)
             imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
             imgui.begin_disabled(keeps_chosen and row.chosen)
-            gone = number if imgui.button("x", ImVec2(side, 0)) else gone
+            gone = number if small("x", side) else gone
             imgui.end_disabled()
             tip("Take it off the list")
             imgui.pop_id()
