@@ -309,7 +309,7 @@ def _export(viewer: Viewer, form: ExportForm) -> None:
     ui.small_wrapped(row.about, ui.muted())
     suffix, only = form.suffix, form.only_selected
     if len(row.sizes) > 1:
-        suffix = ui.radio({name: name for name in row.sizes}, suffix)
+        suffix = ui.choice({name: name for name in row.sizes}, suffix)
     for flag, value in values.items():
         label, default, limits = saving.OPTIONS[flag]
         if default is False:

@@ -236,7 +236,6 @@ def _running(viewer: Viewer, process: Training) -> None:
 
 def draw_messages(viewer: Viewer) -> None:
     """Draw the panel "Messages", the latest first."""
-    ui.recorder_bar(viewer)
     if imgui.begin_child("messages"):
         for message in reversed(viewer.state.messages):
             ui.small_wrapped(message.text, ui.bad() if message.is_error else ui.muted())

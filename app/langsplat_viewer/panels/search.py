@@ -16,6 +16,7 @@ from langsplat_viewer.actions import opening, queries, settings, viewpoint
 from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
 from langsplat_viewer.session import Query
+from langsplat_viewer.state import QueryAnswer
 from langsplat_viewer.viewer import Viewer
 
 TITLE = "Search"
@@ -209,8 +210,13 @@ def _details(viewer: Viewer, query: Query) -> None:
         queries.explain(viewer, query)
     if answer.like is not None and ui.next_button("Like it", "Find what is like it, too"):
         queries.show_alike(viewer, query)
-    if not imgui.tree_node_ex("Threshold, scores, place", imgui.TreeNodeFlags_.no_tree_push_on_open):
-        return
+    if _is_covered(viewer, answer):
+        ui.small_wrapped("All of it lies below this panel: Focus goes there", theme.colour("weak"))
+    if imgui.tree_node_ex("Threshold, scores, place", imgui.TreeNodeFlags_.no_tree_push_on_open):
+        _figures(viewer, query, answer, result)
+
+
+def _figures(viewer: Viewer, query: Query, answer: QueryAnswer, result: QueryResult) -> None:
     _cut(viewer, query, result)
     _scores(result)
     if result.place is not None:
@@ -218,6 +224,18 @@ def _details(viewer: Viewer, query: Query) -> None:
         ui.tip("Where it is relevant most; world units")
     if not answer.has_evidence:
         ui.small_wrapped(NO_EVIDENCE, ui.muted())
+
+
+def _is_covered(viewer: Viewer, answer: QueryAnswer) -> bool:
+    """Return whether all that was found is in the part of the image that the search lies over."""
+    state, area = viewer.state, ui.scene_area()
+    if state.view is None or not answer.things:
+        return False
+    corners = np.concatenate([thing.oriented.corners for thing in answer.things])
+    pixels, depths = state.view.camera(*area.size).project(corners)
+    low, size = imgui.get_window_pos() - (area.left, area.top), imgui.get_window_size()
+    under = (pixels >= tuple(low)) & (pixels <= tuple(low + size))
+    return bool((under.all(1) & (depths > 0)).all())
 
 
 def _scores(result: QueryResult) -> None:

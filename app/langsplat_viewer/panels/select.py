@@ -178,7 +178,7 @@ def draw_hint(viewer: Viewer, area: ui.Area) -> None:
         text = f"{tool.capitalize()}: {HINTS[tool]}. {TOOL_KEYS}"
     else:
         return
-    say(text, area, "tool", hello_imgui.em_size(0.7))
+    say(text, area, "tool", hello_imgui.em_size(0.7 if state.session.split.mode == "off" else 3))
 
 
 # The panel "Transform": gizmo, numbers, crop box; and the gizmo over the scene.
