@@ -313,7 +313,7 @@ def test_project_restores_the_whole_session(opened, saved, again):
     np.testing.assert_allclose(after.view.target, before.view.target, atol=1e-6)
     assert len(after.session.keyframes) == 1
     assert settings.take(again.state, "wanted_panel") == ""
-    assert after.shows_panels == ("Search", "Notes")
+    assert after.preferences.panels == ("Search", "Notes")
     assert not after.is_unsaved
     assert (before.preferences.recent[0], after.preferences.recent[0]) == (str(saved), str(saved))
     queries.remove_all(again)
@@ -456,7 +456,7 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
     assert [(key.seconds, key.pose.span is None) for key in session.keyframes] == [(0.0, True), (2.0, False)]
     assert [bookmark.name for bookmark in session.bookmarks] == ["from the left"]
     np.testing.assert_allclose(state.view.eye, [-3.551118, -1.122909, -3.418507], atol=1e-5)
-    assert state.shows_panels == ("Search", "Notes")
+    assert state.preferences.panels == ("Search", "Notes")
 
 
 def test_other_files_of_version_1_open_and_mean_the_same():
