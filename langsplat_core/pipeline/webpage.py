@@ -284,9 +284,14 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
         for region, own in enumerate(each, sum(map(len, regions.nodes[:level]))):
             points, parent = means[own] - centre, parents[region]
             places[region], boxes[region] = place_of(means[own])
-            # A part's box lies along that of its whole, which was settled before.
-            turned = axes[parent] if parent >= 0 else oriented_box(points[:: -(-len(own) // BOXED)]).axes
-            low, high = axis_aligned_box(points @ turned)
+            if parent < 0:
+                ways = [oriented_box(points[:: -(-len(own) // BOXED)]).axes]
+            else:  # along the whole, which was settled before, or along itself
+                spread = points - points.mean(0)
+                ways = [axes[parent], np.linalg.eigh(spread.T @ spread)[1]]
+            ends = [axis_aligned_box(points @ way) for way in ways]
+            areas = [np.inner(sides := high - low, np.roll(sides, 1)) for low, high in ends]
+            (low, high), turned = ends[np.argmin(areas)], ways[np.argmin(areas)]
             axes[region] = turned
             corners[region] = OrientedBox(turned @ ((low + high) / 2), turned, (high - low) / 2).corners
         if level == WHOLE:

@@ -53,14 +53,14 @@ function sortWorker() {
   };
 }
 
-// Which Gaussians are of the quarter that covers most: by opacity, and their faces' area.
+// Which Gaussians are of the two fifths that cover most: by opacity, and the area of their faces.
 function large(geometry, count, texels) {
   const covered = Float32Array.from({ length: count }, (_, i) => {
     const at = 4 * (texels + i); // its scales
     const [x, y, z] = [geometry[at], geometry[at + 1], geometry[at + 2]];
     return geometry[4 * i + 3] * (x * y + y * z + z * x);
   });
-  const least = covered.toSorted()[Math.trunc(0.75 * count)];
+  const least = covered.toSorted()[Math.trunc(0.6 * count)];
   return Uint8Array.from(covered, (area) => (area >= least ? 1 : 0));
 }
 

@@ -470,7 +470,7 @@ def test_page_draws_coarsely_however_slow_it_is(browser: Any, thin: Path) -> Non
         tab.page.wait_for_function("() => widths.length > 2 && widths.at(-1) === 1")  # once it rests
         widths = tab.run("() => widths")
         assert min(widths) < 0.5
-        tab.page.wait_for_function("() => drawn.at(-1) > 3 * Math.min(...drawn)")  # the large ones first
+        tab.page.wait_for_function("() => drawn.at(-1) > 2 * Math.min(...drawn)")  # the large ones first
         assert sum(width == 1 for width in widths) <= 3  # at first, and at rest
 
 
