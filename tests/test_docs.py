@@ -8,7 +8,6 @@ import shlex
 import shutil
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from importlib.resources import files
 from io import StringIO
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from langsplat_core.cli.run import main
 from langsplat_viewer.program import parse as parse_viewer
 from tests.benchmarks.__main__ import parse as parse_benchmarks
 from tests.support.file_samples import compressed_ply
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import DEMO, random_gaussians
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -95,7 +94,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder: the files that the README's commands name."""
-    for path in Path(str(files("langsplat_assets") / "demo")).glob("scene.*"):
+    for path in DEMO.parent.glob("scene.*"):
         shutil.copy(path, tmp_path / path.name)
     (tmp_path / "guitar.compressed.ply").write_bytes(compressed_ply(random_gaussians(300)))
     monkeypatch.chdir(tmp_path)
@@ -143,8 +142,7 @@ def example_phrases() -> set[str]:
 def test_every_example_is_found_in_the_bundled_scene(capsys: pytest.CaptureFixture[str]) -> None:
     phrases = sorted(example_phrases())
     assert {"blue gift", "lid of the teapot", "duck on the table", "toy, not teddy bear"} <= {*phrases}
-    scene = str(files("langsplat_assets") / "demo" / "scene.ply")
-    assert main("langsplat", lambda: parse(["query", scene, *phrases, "--json", "-q"])) == 0
+    assert main("langsplat", lambda: parse(["query", str(DEMO), *phrases, "--json", "-q"])) == 0
     answers = json.loads(capsys.readouterr().out)
     assert len(answers) == len(phrases)
     assert [a["phrase"] for a in answers if not a["found"]] == []

@@ -262,15 +262,6 @@ def test_installed_package_adds_a_format_and_a_command(example: Path, tmp_path: 
     assert len(refused.stderr.splitlines()) == 1
 
 
-def write_extension(site: Path, name: str, code: str) -> None:
-    """Write a module with an entry point of the group, as an installed package has them."""
-    (site / f"{name}.py").write_text(code)
-    about = site / f"{name}-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{name} = {name}:EXTENSION\n")
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(
     "code",
@@ -282,7 +273,11 @@ def write_extension(site: Path, name: str, code: str) -> None:
     ids=["raises", "is none", "names nothing"],
 )
 def test_broken_extension_costs_one_warning(code: str, tmp_path: Path) -> None:
-    write_extension(tmp_path, "broken", code)
+    (tmp_path / "broken.py").write_text(code)
+    about = tmp_path / "broken-1.0.dist-info"  # an entry point of the group, as an installed package has it
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[{registry.GROUP}]\nbroken = broken:EXTENSION\n")
     save_scene(tmp_path / "a.ply", Scene(random_gaussians(20)))
     done = langsplat(tmp_path, "convert", tmp_path / "a.ply", tmp_path / "b.splat")
     assert done.returncode == 0

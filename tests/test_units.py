@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property
-from importlib.resources import files
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -69,10 +68,9 @@ from langsplat_viewer.program import draw
 from langsplat_viewer.projects import write_flight
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.rendering.request import depth_range, image_formation, plain_request
-from tests.support.scenes import SHORT, capture
+from tests.support.scenes import DEMO, SHORT, capture
 from tests.support.windowless import render_image
 
-DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"
 EVERY = 10  # every so-manyth Gaussian of the bundled scene, as much larger
 SCALES = (1e-4, 1e-2, 1.0, 1e2, 1e4)
 QUICK = (1e-4, 1e4)  # of them, in the quick suite

@@ -13,9 +13,8 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +33,9 @@ from langsplat_viewer.program import ViewerCommand
 from langsplat_viewer.program import entry as viewer_entry
 from langsplat_viewer.program import parse as viewer_parse
 from tests.support.processes import refusal, run
+from tests.support.scenes import DEMO
 from tests.support.tiny_models import tiny_clip
 
-DEMO = str(files("langsplat_assets") / "demo" / "scene.ply")
 EVERY = {
     "viewer": ViewerCommand,
     **{name: load_command(name) for name in command_names()},
@@ -215,11 +214,19 @@ def odd_places(name: str) -> Iterator[tuple[list[str], list[str], int]]:
             yield [*words, *more, action.option_strings[-1]], [], count
 
 
-def check_odd_values(name: str, values: Callable[[], Iterable[str]], corner: Path, here: Path) -> None:
+@pytest.mark.parametrize(
+    "every", [pytest.param(False, marks=pytest.mark.long), pytest.param(True, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_odd_values_are_refused_in_a_line_or_used(name, every, corner, tmp_path, monkeypatch):
+    """In each place one that is drawn or, in the slow tier, all of them."""
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    rng = np.random.default_rng(len(name))
     begin, used = (viewer_parse, []) if name == "viewer" else (parse, name.split())
     for number, (before, behind, count) in enumerate(odd_places(name)):
-        for odd in values():
-            folder = here / str(number)
+        for odd in ODD if every else [str(rng.choice(ODD))]:
+            folder = tmp_path / str(number)
             shutil.copytree(corner, folder, dirs_exist_ok=True)
             line = ["-q", *used, *before, *[odd] * count, *behind]
             said = io.StringIO()
@@ -232,23 +239,6 @@ def check_odd_values(name: str, values: Callable[[], Iterable[str]], corner: Pat
             assert all(text.isprintable() and len(text) <= 1100 for text in errors), line
             assert [str(one.message) for one in warned if one.category is RuntimeWarning] == [], line
             shutil.rmtree(folder)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", EVERY)
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_an_odd_value_is_refused_in_a_line_or_used(name, corner, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "stdin", io.StringIO())
-    rng = np.random.default_rng(len(name))
-    check_odd_values(name, lambda: [str(rng.choice(ODD))], corner, tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", EVERY)
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_odd_values_are_refused_in_a_line_or_used(name, corner, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "stdin", io.StringIO())
-    check_odd_values(name, lambda: ODD, corner, tmp_path)
 
 
 # Endings.

@@ -239,22 +239,18 @@ def test_16_bits_and_12_in_them_become_8(tmp_path: Path) -> None:
 # Transparency: no part of the thing.
 
 
-def write_cut_out(folder: Path, inside: bool) -> None:
-    """Photographs with one transparent part: all around the thing, or a spot inside."""
-    write_colmap(folder)
-    for path in (folder / "images").iterdir():
-        alpha = np.full((30, 40), 255 * inside, np.uint8)
-        alpha[8:22, 10:30] = 255 * (not inside)
-        alpha[8, 10:30] = 100
-        image = Image.open(path)
-        image.putalpha(Image.fromarray(alpha))
-        image.save(path)
-
-
 @pytest.mark.parametrize("alpha", ["auto", "mask", "background"])
 @pytest.mark.parametrize("inside", [True, False])
 def test_transparency_is_a_mask_or_an_empty_background(tmp_path, inside, alpha, caplog):
-    write_cut_out(tmp_path, inside)
+    """Photographs with one transparent part: all around the thing, or a spot inside."""
+    write_colmap(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        shades = np.full((30, 40), 255 * inside, np.uint8)
+        shades[8:22, 10:30] = 255 * (not inside)
+        shades[8, 10:30] = 100
+        image = Image.open(path)
+        image.putalpha(Image.fromarray(shades))
+        image.save(path)
     config = replace(CONFIG, alpha=alpha)
     capture = load_photographs(tmp_path, config, tmp_path / "work")
     assert capture.cut_out == (not inside if alpha == "auto" else alpha == "background")

@@ -15,13 +15,13 @@ import pytest
 import torch
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import GSPLAT, INRIA, RadianceConfig, RasterSettings
+from langsplat_core.config import GSPLAT, INRIA, RadianceConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer
-from langsplat_core.raster.opengl.rasterizer import GlRasterizer, create_egl_context
+from langsplat_core.raster.opengl.rasterizer import create_egl_context
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
-from langsplat_core.scene import Camera, Gaussians
+from langsplat_core.scene import Camera
 from langsplat_core.training.radiance.differentiable import (
     CpuRenderer,
     CudaRenderer,
@@ -52,27 +52,6 @@ def raster(gl_rasterizers):
     return gl_rasterizers["single"]
 
 
-def agree(
-    raster: GlRasterizer,
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RasterSettings = SMOOTH,
-    channels: int = 4,
-) -> None:
-    """Image, alpha and expected depth within `SINGLE` (depth: relative, where anything is seen)."""
-    values = random_values(len(gaussians), channels, seed=5)
-    reference = ReferenceRasterizer().view(gaussians, camera, settings)
-    view = raster.view(gaussians, camera, settings)
-    want, want_alpha = reference.splat(values)
-    image, alpha = view.splat(values)
-    assert image.shape == want.shape
-    np.testing.assert_allclose(image, want, atol=SINGLE)
-    np.testing.assert_allclose(alpha, want_alpha, atol=SINGLE)
-    seen = want_alpha > 0.01
-    np.testing.assert_allclose(view.depth()[seen], reference.depth()[seen], rtol=SINGLE)
-    assert view.dropped == reference.dropped
-
-
 NEAR = random_gaussians(60, scale_range=(0.01, 0.03)), random_camera(distance=0.3)
 AGREEING = [
     *(
@@ -92,7 +71,19 @@ AGREEING = [
 
 @pytest.mark.parametrize("case", AGREEING)
 def test_images_equal_the_reference(gl, raster, case):
-    agree(raster, *case)
+    """Image, alpha and expected depth within `SINGLE` (depth: relative, where anything is seen)."""
+    gaussians, camera, settings, channels = (*case, *(SMOOTH, 4)[len(case) - 2 :])
+    values = random_values(len(gaussians), channels, seed=5)
+    reference = ReferenceRasterizer().view(gaussians, camera, settings)
+    view = raster.view(gaussians, camera, settings)
+    want, want_alpha = reference.splat(values)
+    image, alpha = view.splat(values)
+    assert image.shape == want.shape
+    np.testing.assert_allclose(image, want, atol=SINGLE)
+    np.testing.assert_allclose(alpha, want_alpha, atol=SINGLE)
+    seen = want_alpha > 0.01
+    np.testing.assert_allclose(view.depth()[seen], reference.depth()[seen], rtol=SINGLE)
+    assert view.dropped == reference.dropped
 
 
 def test_gsplats_profile_draws_what_is_nearer(gl, raster):

@@ -30,7 +30,7 @@ from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians
 from tests.support.backends import Backend, Measure, assert_adjoint
 from tests.support.hard_cases import CASES, HUGE_IMAGE, ROW, Case, Drawing, Seen, altered, balls, crowd, draw
-from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
+from tests.support.scenes import DEMO, random_camera, random_gaussians, random_values, without_perspective
 
 Drawn = tuple[Gaussians, Camera, RasterSettings]
 
@@ -393,7 +393,6 @@ def test_too_many_tile_intersections_are_refused() -> None:
 
 # The bundled scene, real scenes, and the corner of a large image.
 
-DEMO = Path(__file__).parent.parent.parent / "assets" / "demo" / "scene.ply"
 REAL = ("guitar.compressed.ply", "playbot_8k_sog", "playbot_31k_sog")
 
 

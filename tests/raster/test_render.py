@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
+from scipy.spatial.transform import Rotation
 
 import langsplat_core
 from langsplat_core import Scene, render
@@ -62,12 +63,7 @@ def test_a_tilted_ellipsoid_projects_to_the_textbook_covariance():
     g = random_gaussians(1, seed=3, scale_range=(0.05, 0.3))
     camera = random_camera(4)
     f = RASTER.view(g, camera).footprints
-    w, x, y, z = g.quats_wxyz[0].astype(float) / np.linalg.norm(g.quats_wxyz[0].astype(float))
-    axis_angle = np.array([x, y, z])
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turn = (
-        np.eye(3) * (w * w - axis_angle @ axis_angle) + 2 * np.outer(axis_angle, axis_angle) + 2 * w * cross
-    )
+    turn = Rotation.from_quat(g.quats_wxyz[0, [1, 2, 3, 0]]).as_matrix()
     sigma = turn @ np.diag(np.exp(2 * g.log_scales[0].astype(float))) @ turn.T
 
     def to_pixel(point):

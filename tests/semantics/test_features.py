@@ -148,8 +148,8 @@ def test_a_store_keeps_any_name_in_its_folder(tmp_path: Path, name: str) -> None
 
 
 def test_the_key_changes_with_image_mask_source_and_encoder() -> None:
-    image, others = red_and_blue(), ColourEncoder()
-    others.id = "others"
+    image, others, thresholds = red_and_blue(), ColourEncoder(), Halves()
+    others.id, thresholds.key = "others", "other thresholds"
     made_by = fingerprint(ColourEncoder())
     first = feature_key(image, None, Halves(), made_by)
     assert (
@@ -157,7 +157,7 @@ def test_the_key_changes_with_image_mask_source_and_encoder() -> None:
     )  # upside down this picture is the same one
     keys = {
         first,
-        feature_key(image, None, OtherHalves(), made_by),
+        feature_key(image, None, thresholds, made_by),
         feature_key(red_and_blue(20, 10), None, Halves(), made_by),
         feature_key(image, None, Halves(), fingerprint(others)),
         feature_key(image, image[..., 0] > 0, Halves(), made_by),
@@ -194,12 +194,6 @@ def test_an_interrupted_run_continues_where_it_stopped(tmp_path: Path) -> None:
     assert encoder.calls == 4
     assert np.unique(found[0].labels).tolist() == [-1, 0, 1, 2]
     np.testing.assert_allclose(found[0].vectors[:2], [[1, 0, 0], [0, 0, 1]], atol=1e-4)
-
-
-class OtherHalves(Halves):
-    """Halves by other settings."""
-
-    key = "other thresholds"
 
 
 class InTwoParts(Halves):

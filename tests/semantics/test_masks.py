@@ -35,10 +35,6 @@ from tests.support.tiny_models import change_json, tiny_sam, tiny_sam2, tiny_sam
 pytestmark = pytest.mark.long
 
 
-def level_masks(*levels: np.ndarray) -> LevelMasks:
-    return LevelMasks(levels, tuple(np.ones(len(masks), np.float32) for masks in levels))
-
-
 def rendering(seed: int = 0, height: int = 120, width: int = 160) -> tuple[np.ndarray, np.ndarray]:
     """Three shaded balls on a grey floor: image (H, W, 3) uint8 and (H, W) which ball, -1 for the floor."""
     rng = np.random.default_rng(seed)
@@ -65,7 +61,8 @@ def test_later_masks_cover_earlier_ones_and_hidden_masks_have_no_row() -> None:
     left[:, :2], right[:, 2:], everything[:] = True, True, True
     first = np.stack([left, everything, right])  # `left` ends with no visible pixel
     second = np.stack([right])
-    maps = label_maps(level_masks(first, second, np.zeros((0, 2, 4), bool)))
+    levels = (first, second, np.zeros((0, 2, 4), bool))
+    maps = label_maps(LevelMasks(levels, tuple(np.ones(len(masks), np.float32) for masks in levels)))
     assert maps.dtype == np.int32
     assert maps[0].tolist() == [[0, 0, 1, 1]] * 2
     assert maps[1].tolist() == [[-1, -1, 2, 2]] * 2

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -70,7 +69,7 @@ from tests.support.file_samples import (
     zipped,
 )
 from tests.support.photographs import write_colmap, write_nerfstudio
-from tests.support.scenes import random_camera, random_gaussians, tree_of
+from tests.support.scenes import DEMO, random_camera, random_gaussians, tree_of
 
 HEADER = 600  # bytes at the beginning in which half of the mutations fall
 INTEGERS = (0, 1, -1, *(2**k + d for k in (7, 8, 15, 16, 24, 31, 32, 53, 63) for d in (-1, 0)))
@@ -583,7 +582,7 @@ def encoded(path: Path) -> float:
 
 @cache
 def _demo() -> Scene:
-    return load_scene(Path(str(files("langsplat_assets"))) / "demo" / "scene.ply")
+    return load_scene(DEMO)
 
 
 def settings_files(_: Path) -> list[bytes]:

@@ -4,6 +4,8 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib.resources import files
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +23,8 @@ from langsplat_core.scene.surface import Surface, build_surface, build_tree, sur
 from langsplat_core.scene.transform import C0
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.training.language.lift import MaskWeights, view_pairs
+
+DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"  # the bundled scene
 
 
 def random_gaussians(

@@ -150,16 +150,12 @@ def similarity(turn: tuple[float, float, float], step: tuple[float, float, float
     return Similarity(Rotation.from_rotvec(turn).as_matrix(), np.array(step), scale)
 
 
-def degrees_apart(one: Array, other: Array) -> float:
-    return float(np.degrees(np.arccos(np.clip(one @ other, -1, 1))))
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("there", [IDENTITY, similarity((0.2, -0.1, 0.7), (3.0, -1.0, 5.0), 2.0)])
 def test_floor_and_up_are_found(seed, there):
     room = find_room(transform_scene(box_room(seed), there))
     up = there.rotation[:, 2]
-    assert degrees_apart(room.up, up) < 2
+    assert np.degrees(np.arccos(np.clip(room.up @ up, -1, 1))) < 2
     assert room.floor is not None
     ground = there.scale * FLOOR + there.translation @ up
     assert room.ground == pytest.approx(ground, abs=0.03 * there.scale * WALL)

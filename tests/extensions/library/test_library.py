@@ -4,7 +4,6 @@ damaged. Two scenes of one place: what appeared, is gone, moved or has another c
 import json
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +42,7 @@ from tests.support.fakes import CENTRES, NAMES, PER_BLOB, WORDS, FakeEncoder, ax
 from tests.support.file_kinds import FileKind, few_and_many, in_safetensors
 from tests.support.file_samples import FIELDS
 from tests.support.processes import refusal, run
-from tests.support.scenes import unturned_gaussians
+from tests.support.scenes import DEMO, unturned_gaussians
 
 MUG, BOOK, PLANT = (slice(k * PER_BLOB, (k + 1) * PER_BLOB) for k in range(3))
 
@@ -452,7 +451,6 @@ def test_changes_are_said_in_words_and_in_json(scans, capsys):
 
 # The rule for answers by the engine and by the index over scans.
 
-DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"
 EVERY = 8  # every so-manyth Gaussian of the bundled scene
 LIKE = 0.1  # spreads and logits within which 8 bits of a codeword may tip a verdict
 
@@ -482,11 +480,7 @@ def test_index_answers_200_phrases_as_the_engine_does(tmp_path):
     for want, (fits, verdict) in zip(expected, index, strict=True):
         np.testing.assert_allclose(fits, want.fits, atol=0.05)
         assert verdict.margin == pytest.approx(want.judgement.margin, abs=0.2)
-        if min(abs(verdict.margin), abs(verdict.margin - weakest(verdict, want))) > LIKE:
+        even = np.log(want.probability) - np.log1p(-want.probability)
+        weakest = want.judgement.margin - even  # at which a verdict becomes a weak match: the odds are even
+        if min(abs(verdict.margin), abs(verdict.margin - weakest)) > LIKE:
             assert verdict.outcome == want.verdict
-
-
-def weakest(verdict: Any, want: Any) -> float:
-    """The margin at which a verdict becomes a weak match: the odds are even."""
-    even = np.log(want.probability) - np.log1p(-want.probability)
-    return float(want.judgement.margin - even)
