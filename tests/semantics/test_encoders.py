@@ -129,18 +129,6 @@ def test_names_in_files_neither_fetch_nor_end_the_program(name: str, monkeypatch
     assert asked == []
 
 
-def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
-    tiny_clip(tmp_path)
-    config = tmp_path / "config.json"
-    text = config.read_text(encoding="utf-8")
-    config.write_text(text.replace('"intermediate_size": 48', '"intermediate_size": 40'), encoding="utf-8")
-    with pytest.raises(EncoderError, match="6 do not fit, such as"):
-        load_encoder(str(tmp_path), "cpu")
-    config.write_text(text.replace('"num_hidden_layers": 2', '"num_hidden_layers": 3'), encoding="utf-8")
-    with pytest.raises(EncoderError, match=r"16 do not fit, such as .*layers\.2"):
-        load_encoder(str(tmp_path), "cpu")
-
-
 def said(encoder):
     return encoder.temperature, encoder.found, encoder.calibration
 
@@ -174,16 +162,16 @@ BROKEN_NORMALISATIONS += tuple(f'{{"image_std": [1, 1, {number}]}}' for number i
 
 
 @pytest.mark.parametrize(
-    ("name", "said", "text"),
+    ("name", "text"),
     [
-        *(("reading.json", "reading.json", text) for text in BROKEN_READINGS),
-        *(("preprocessor_config.json", "preprocessor_config.json", text) for text in BROKEN_NORMALISATIONS),
+        *(("reading.json", text) for text in BROKEN_READINGS),
+        *(("preprocessor_config.json", text) for text in BROKEN_NORMALISATIONS),
     ],
 )
-def test_broken_files_beside_weights_are_named(tmp_path, name, said, text):
+def test_broken_files_beside_weights_are_named(tmp_path, name, text):
     tiny_clip(tmp_path)
     (tmp_path / name).write_text(text, encoding="utf-8")
-    with pytest.raises(EncoderError, match=re.escape(said)):
+    with pytest.raises(EncoderError, match=re.escape(name)):
         load_encoder(str(tmp_path), "cpu")
 
 
@@ -425,6 +413,8 @@ def replace(config: dict[str, Any], name: str, value: object) -> None:
         ("hidden_size", 10**9),
         ("num_hidden_layers", 10**9),
         ("num_hidden_layers", 1),  # one fewer than the weights have
+        ("num_hidden_layers", 3),
+        ("intermediate_size", 40),
         ("blocks_per_stage", [10**9]),
     ],
 )

@@ -52,10 +52,6 @@ def rendering(seed: int = 0, height: int = 120, width: int = 160) -> tuple[np.nd
     return (noisy.clip(0, 1) * 255).astype(np.uint8), ball
 
 
-def iou(a: np.ndarray, b: np.ndarray) -> float:
-    return float((a & b).sum() / (a | b).sum())
-
-
 def test_later_masks_cover_earlier_ones_and_hidden_masks_have_no_row() -> None:
     left, right, everything = np.zeros((3, 2, 4), bool)
     left[:, :2], right[:, 2:], everything[:] = True, True, True
@@ -91,8 +87,9 @@ def test_partitions_are_nested_and_cover_everything(seed: int) -> None:
 def test_shaded_balls_are_found_whole() -> None:
     image, ball = rendering()
     wholes = nested_partitions(image)[2]
-    for k in range(3):
-        assert max(iou(wholes == i, ball == k) for i in np.unique(wholes)) > 0.9
+    for one in (ball == k for k in range(3)):
+        found = (wholes == i for i in np.unique(wholes))
+        assert max((some & one).sum() / (some | one).sum() for some in found) > 0.9
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (2, 3), (3, 500)])

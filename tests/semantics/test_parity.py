@@ -274,7 +274,7 @@ class Drawn:
 
 def test_the_filters_of_segment_anything_but_for_its_boxes(field, monkeypatch, measured):
     """Its boxes end at the last pixel, ours behind it: with ours in their place every mask is the same, bit
-    by bit. What LangSplat adds, `mask_nms`, lets all pass here: test_mask_filters.py has it."""
+    by bit. What LangSplat adds, `mask_nms`, lets all pass here: test_masks.py has it."""
     config = MaskConfig(points_per_side=16, crop_layers=1, min_region=30, **PASSING)
     module = field.segment_anything.automatic_mask_generator
     theirs = module.batched_mask_to_box
