@@ -262,7 +262,10 @@ def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) 
     camera, channels = seen.drawing.camera, seen.drawing.features().shape[1]
     assert seen.image.shape == (camera.height, camera.width, channels)
     assert np.isfinite(seen.image).all()
-    check_depth(seen)
+    assert np.isfinite(seen.view.depth()).all()
+    median = seen.view.median_depth()
+    assert np.isfinite(median).all()
+    assert not median[seen.alpha < 0.5 - 1e-6].any()
     assert seen.alpha.shape == (camera.height, camera.width)
     assert seen.alpha.min() >= 0
     assert seen.alpha.max() <= 1
@@ -275,14 +278,6 @@ def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) 
     if hasattr(seen.view, "backward"):
         check_gradients(seen.view, seen.drawing.features(), ~seen.drawing.gaussians.valid())
     return seen
-
-
-def check_depth(seen: Seen) -> None:
-    """Finite, and positive only where something is drawn."""
-    assert np.isfinite(seen.view.depth()).all()
-    median = seen.view.median_depth()
-    assert np.isfinite(median).all()
-    assert not median[seen.alpha < 0.5 - 1e-6].any()
 
 
 def compare(seen: Seen, measured: Measure) -> None:
@@ -396,18 +391,13 @@ def test_too_many_tile_intersections_are_refused() -> None:
 REAL = ("guitar.compressed.ply", "playbot_8k_sog", "playbot_31k_sog")
 
 
-def part_of(camera: Camera, width: int = 48, height: int = 36) -> Camera:
-    """The middle of a photograph at its own resolution."""
-    left, top = (camera.width - width) // 2, (camera.height - height) // 2
-    return replace(camera, width=width, height=height, cx=camera.cx - left, cy=camera.cy - top)
-
-
 @lru_cache
 def drawing_of(path: Path, antialiased: bool = False) -> Drawing:
-    """A scene in its first photograph or, without any, as the camera that frames it sees it."""
+    """The middle of a scene's first photograph or, without any, of what the camera that frames it sees."""
     scene, size = load_scene(path), (320, 240)
     camera = scene.cameras[0].resized(*size) if scene.cameras else scene.framing_camera(size)
-    return Drawing(scene.gaussians, part_of(camera), replace(INRIA, antialiased=antialiased))
+    camera = replace(camera, width=48, height=36, cx=camera.cx - 136, cy=camera.cy - 102)
+    return Drawing(scene.gaussians, camera, replace(INRIA, antialiased=antialiased))
 
 
 def check_scene(backend: Backend, drawing: Drawing, group: str, measured: Measure) -> None:
