@@ -8,14 +8,7 @@ from typing import Annotated, Any, Literal, Protocol
 
 import tyro
 
-from langsplat_core.config import (
-    CODEC_CONFIGS,
-    CodecConfig,
-    Positive,
-    annotations,
-    check_settings,
-    named_values,
-)
+from langsplat_core import config
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.io.files import check_output_file, check_output_folder
 
@@ -56,20 +49,20 @@ WrittenScene = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Scene t
 EncoderOption = Annotated[str, _encoder]
 JsonOption = Annotated[bool, tyro.conf.arg(help="Print JSON, lengths in world units.")]
 ScaleOption = Annotated[
-    Positive | None, tyro.conf.arg(help="Metres per world unit, in place of what the scene says.")
+    config.Positive | None, tyro.conf.arg(help="Metres per world unit, in place of what the scene says.")
 ]
 WordsOption = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help=_taught)]
 
 
 def check_arguments(command: object) -> None:
     """Raise InputError for an argument out of its range, unused, not UTF-8, or not to be written to."""
-    check_settings(command)
-    for option, value, hint in named_values(command):
+    config.check_settings(command)
+    for option, value, hint in config.named_values(command):
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str) and text != text.encode("utf-8", "ignore").decode():
                 plain = text[:40].encode("utf-8", "backslashreplace").decode()
                 raise InputError(f"{option} {plain}: is not UTF-8; use a terminal that is set to UTF-8")
-        for part in annotations(hint):
+        for part in config.annotations(hint):
             if isinstance(part, OutputPath) and value is not None:
                 (check_output_file if part.kind == "file" else check_output_folder)(value)
             unused = isinstance(part, Needs) and not getattr(command, part.field)
@@ -88,16 +81,16 @@ def named(args: Sequence[str], option: str) -> str:
     return values[-1] if values else ""
 
 
-def codec_settings(args: Sequence[str], default: CodecConfig) -> CodecConfig:
+def codec_settings(args: Sequence[str], default: config.CodecConfig) -> config.CodecConfig:
     """Return the default settings of the codec that `args` choose by `--codec.kind`.
 
     That is `default` itself where it is of that kind or none is chosen. InputError for an unknown kind.
     """
     kind = named(args, "--codec.kind") or default.kind
-    if kind not in CODEC_CONFIGS:
+    if kind not in config.CODEC_CONFIGS:
         said = printable_line(str(kind), 60)
-        raise InputError(f"--codec.kind {said}: choose one of {', '.join(CODEC_CONFIGS)}")
-    return default if kind == default.kind else CODEC_CONFIGS[kind]()
+        raise InputError(f"--codec.kind {said}: choose one of {', '.join(config.CODEC_CONFIGS)}")
+    return default if kind == default.kind else config.CODEC_CONFIGS[kind]()
 
 
 def with_codec(command: type[Runnable], args: Sequence[str]) -> type[Runnable]:
@@ -106,6 +99,6 @@ def with_codec(command: type[Runnable], args: Sequence[str]) -> type[Runnable]:
     if entry is None:
         return command
     default = entry.default_factory() if entry.default is MISSING else entry.default
-    chosen = ("codec", CodecConfig, codec_settings(args, default))
+    chosen = ("codec", config.CodecConfig, codec_settings(args, default))
     names = {"__doc__": command.__doc__}
     return make_dataclass(command.__name__, [chosen], bases=(command,), frozen=True, namespace=names)

@@ -29,15 +29,8 @@ from langsplat_core.io.scenes import check_writable, save_scene
 from langsplat_core.io.sidecar import read_words
 from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import TerminalProgress
+from langsplat_core.query import compose
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import (
-    Number,
-    check_phrase,
-    count_things,
-    encode_phrases,
-    joined,
-    run_phrase,
-)
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance
@@ -132,7 +125,7 @@ def listed(instances: Sequence[Instance]) -> dict[str, Any]:
 
 def found_answer(engine: QueryEngine, text: str, level: LevelChoice) -> QueryResult:
     """Return the answer to a phrase; InputError where it was not found."""
-    answer = run_phrase(engine, text, level).answer
+    answer = compose.run_phrase(engine, text, level).answer
     if not answer.found or not answer.members.any():
         raise InputError(
             f"'{answer.phrase}' was not found (score {answer.peak:.3f}): nothing to select; ask in other "
@@ -219,7 +212,7 @@ class QueryScene:
                 pixels.add(result, answer)
             things = engine.instances(result, self.instances) if result.found else ()
             counts = result.found or (isinstance(tree, Counted) and result.verdict == "weak match")
-            number = count_things(engine, result) if counts else Number(0, 0, 0)
+            number = compose.count_things(engine, result) if counts else compose.Number(0, 0, 0)
             answer |= {"count": {"best": number.best, "least": number.least, "most": number.most}}
             because = {} if explain is None else {"evidence": explain(engine, result, of)}
             answer |= basis_fields(engine) | {"metres_per_unit": unit.metres, **listed(things), **because}
@@ -240,7 +233,7 @@ class QueryScene:
         phrases = [phrase for text in self.texts for phrase in split_phrases(text) or [text]]
         reasons: dict[str, list[str]] = {}  # why not -> these phrases
         if len(phrases) > 1:
-            encode_phrases(engine, phrases)
+            compose.encode_phrases(engine, phrases)
         for phrase in dict.fromkeys(phrases):
             try:
                 if self.mode == "paper":
@@ -248,7 +241,7 @@ class QueryScene:
                         raise InputError(NOT_DECODED)
                     engine.text_vectors([phrase])
                 else:
-                    check_phrase(engine, phrase, camera)
+                    compose.check_phrase(engine, phrase, camera)
             except LangSplatError as error:
                 reasons.setdefault(str(error), []).append(phrase)
         unasked = {phrase for same in reasons.values() for phrase in same}
@@ -264,7 +257,7 @@ class QueryScene:
         """Return the answer, the phrase's tree where it has structure, and the words of what is asked for."""
         if self.mode == "paper":
             return engine.run(text, self.level), None, (text,)
-        composed = run_phrase(engine, text, self.level, camera)
+        composed = compose.run_phrase(engine, text, self.level, camera)
         simple = isinstance(composed.tree, Atom)
         return composed.answer, None if simple else composed.tree, heads(composed.tree)
 
@@ -477,7 +470,7 @@ class Select:
         unit = unit_of(self.scale or scene.metres_per_unit, scene.origin)
         engine = _engine(scene, load_text_encoder, self.encoder, self.taught)
         answers = [found_answer(engine, text, self.level) for text in self.texts]
-        answer = answers[0] if len(answers) == 1 else joined(answers, all_needed=True)
+        answer = answers[0] if len(answers) == 1 else compose.joined(answers, all_needed=True)
         found = engine.instances(answer)
         rows = np.concatenate([instance.members for instance in chosen_instances(found, self.instance)])
         selected = of_rows(rows, len(answer.members))

@@ -21,13 +21,7 @@ from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.summary import disk_bytes, summarise
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.semantics.encoders import (
-    DEMO,
-    OPEN_MODEL,
-    keep_calibration,
-    load_encoder,
-    load_text_encoder,
-)
+from langsplat_core.semantics import encoders
 
 log = logging.getLogger("langsplat")
 OPTIONAL = ("torch", "transformers", "pycolmap", "matplotlib", "gsplat")
@@ -111,12 +105,12 @@ class Doctor:
             machine = _machine()
             print_json(machine) if self.json else _print_rows(machine.items())
             return
-        if self.calibrate and self.encoder == DEMO:
+        if self.calibrate and self.encoder == encoders.DEMO:
             raise InputError("--calibrate: the demo encoder has its own, and holds in drawn rooms alone")
         from langsplat_core.pipeline.encoder_check import check_encoder, report_lines
 
         with TerminalProgress() as progress:
-            encoder = load_encoder(self.encoder, option="--encoder")
+            encoder = encoders.load_encoder(self.encoder, option="--encoder")
             report = check_encoder(encoder, progress)
         if self.json:
             print_json({"machine": _machine(), **asdict(report)})
@@ -125,7 +119,7 @@ class Doctor:
         if self.calibrate:
             if report.calibration is None:
                 raise InputError(f"--calibrate: nothing to keep; {report.reason}")
-            kept = keep_calibration(encoder, report.calibration)
+            kept = encoders.keep_calibration(encoder, report.calibration)
             log.info("kept in %s; without that file verdicts are by chance again", kept)
 
 
@@ -170,11 +164,11 @@ def _opengl() -> str:
 def _encoder() -> str:
     """State of the bundled encoder, and what real photographs want."""
     try:
-        encoder = load_text_encoder("demo")
+        encoder = encoders.load_text_encoder("demo")
         encoder.encode_texts(["red mug"])
     except LangSplatError as error:
         return str(error)
-    return f"demo: works; for real photographs `hf download {OPEN_MODEL}`, see docs/encoders.md"
+    return f"demo: works; for real photographs `hf download {encoders.OPEN_MODEL}`, see docs/encoders.md"
 
 
 def _version(package: str) -> str:

@@ -20,15 +20,7 @@ from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.colour import as_srgb, coded_as
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics, pinhole_for, resample, source_positions
 from langsplat_core.errors import InputError, Tell, report_loss, shortened
-from langsplat_core.io.hostile import (
-    MOST_PIXELS,
-    MOST_PIXELS_REDUCED,
-    PHOTO_SUFFIXES,
-    PictureError,
-    decode_name,
-    is_video,
-    opened,
-)
+from langsplat_core.io import hostile
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
@@ -62,7 +54,7 @@ def find_photos(folder: Path, below: bool = False) -> list[Path]:
     if below:
         inside = (find_photos(path) for path in listed if path.name != "masks")
         return [photo for photos in inside for photo in photos]
-    return [path for path in listed if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()]
+    return [path for path in listed if path.suffix.lower() in hostile.PHOTO_SUFFIXES and path.is_file()]
 
 
 def photo_folder(folder: Path) -> tuple[Path, list[Path]]:
@@ -81,7 +73,7 @@ def photo_folder(folder: Path) -> tuple[Path, list[Path]]:
 def count_photographs(dataset: Path) -> int:
     """Return the number of photographs in a dataset, 0 where it cannot be read; of a video the default."""
     try:
-        if is_video(dataset):
+        if hostile.is_video(dataset):
             return DatasetConfig.frames
         folder = dataset if dataset.is_dir() else dataset.parent
         return len(find_photos(folder / "images") or photo_folder(folder)[1])
@@ -98,7 +90,9 @@ def finder(folder: Path) -> Callable[[str], Path]:
     @cache
     def listed(inside: Path) -> dict[str, str]:
         try:
-            return {normalize("NFC", decode_name(os.fsencode(name))): name for name in os.listdir(inside)}
+            return {
+                normalize("NFC", hostile.decode_name(os.fsencode(name))): name for name in os.listdir(inside)
+            }
         except (OSError, ValueError):
             return {}
 
@@ -162,7 +156,7 @@ def optics(path: Path) -> Image.Exif:
     """
     kept = Image.Exif()
     try:
-        with opened(path) as image:
+        with hostile.opened(path) as image:
             source = image.getexif()
             kept.update({tag: source[tag] for tag in (_MAKER, _MODEL) if tag in source})
             inner = source.get_ifd(EXIF_IFD)
@@ -171,7 +165,7 @@ def optics(path: Path) -> Image.Exif:
                 lens |= _on_film(inner, image.size)
             kept.get_ifd(EXIF_IFD).update(lens)
             kept.tobytes()
-    except PictureError:
+    except hostile.PictureError:
         return Image.Exif()
     return kept
 
@@ -190,7 +184,7 @@ def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:
 def place(path: Path) -> tuple[float, float]:
     """Return latitude and longitude of a photograph, degrees, north and east positive; NaN without them."""
     try:
-        with opened(path) as image:
+        with hostile.opened(path) as image:
             # What stands behind a PNG's pixels is read by decoding them all.
             tags = image.getexif().get_ifd(GPS_IFD) if image.format != "PNG" or "exif" in image.info else {}
             latitude, longitude = (
@@ -199,7 +193,7 @@ def place(path: Path) -> tuple[float, float]:
                 for tag, signs in ((2, {"N": 1, "S": -1}), (4, {"E": 1, "W": -1}))
             )
     # Absent, or not what the standard says.
-    except (PictureError, KeyError, TypeError, ValueError, ZeroDivisionError):
+    except (hostile.PictureError, KeyError, TypeError, ValueError, ZeroDivisionError):
         return math.nan, math.nan
     known = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0, 0)
     return (latitude, longitude) if known else (math.nan, math.nan)
@@ -214,10 +208,10 @@ def read_photo(path: Path, upright: bool, tell: Tell = lambda _: None) -> Image.
     With `upright` it is turned as its EXIF data ask; unreadable EXIF data count as none. What is larger than
     other images may be is reduced as it is read. tell: is told what was guessed. Raises PictureError.
     """
-    with opened(path, most=MOST_PIXELS_REDUCED) as stored:
+    with hostile.opened(path, most=hostile.MOST_PIXELS_REDUCED) as stored:
         image: Image.Image = stored
         coded = coded_as(stored)
-        large = stored.width * stored.height > MOST_PIXELS
+        large = stored.width * stored.height > hostile.MOST_PIXELS
         if large:
             stored.draft(None, (stored.width // 2, stored.height // 2))
         if upright:
@@ -226,7 +220,7 @@ def read_photo(path: Path, upright: bool, tell: Tell = lambda _: None) -> Image.
                 image = ImageOps.exif_transpose(stored)
             except Exception:  # noqa: BLE001  Pillow's parser lets through what damaged tags cause
                 image = stored.copy()
-        if large and image.width * image.height > MOST_PIXELS:
+        if large and image.width * image.height > hostile.MOST_PIXELS:
             image = image.reduce(2)
         if image.mode.startswith("I") or image.mode == "F":  # Pillow's own conversion would clip
             image = _of_8_bits(image, path, tell)
@@ -242,7 +236,7 @@ def _of_8_bits(image: Image.Image, path: Path, tell: Tell) -> Image.Image:
     """Return a grey image of 16 bits as one of 8; of 12 bits where no pixel has more."""
     values = np.asarray(image)
     if image.mode == "F" or not 0 <= values.min(initial=0) <= values.max(initial=0) <= 65535:
-        raise PictureError(path, "more than 16 bits per channel")
+        raise hostile.PictureError(path, "more than 16 bits per channel")
     most = int(values.max(initial=0))
     if 255 < most <= 4095:
         tell("no value is above 4095 of 65535, and 12 bits are taken for white")
@@ -402,7 +396,7 @@ def develop(photos: Sequence[Photo], config: DatasetConfig, progress: Progress) 
         photo = photos[index]
         try:
             camera, image, mask, alpha = developed(photo, lambda what: told.append((what, photo.label)))
-        except PictureError as error:
+        except hostile.PictureError as error:
             return f"{photo.label} ({error.reason})"
         if (counted := _counted(mask, alpha, True)) is not None and not counted.any():
             return f"{photo.label} (its mask leaves nothing of it)"

@@ -22,17 +22,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import pycolmap
 
+from langsplat_core.datasets import workspace
 from langsplat_core.datasets.colmap import read_model
-from langsplat_core.datasets.workspace import (
-    DIGEST,
-    FEWEST_MATCHES,
-    MASKS,
-    MATCHES,
-    CameraGroup,
-    Pair,
-    digest_of_model,
-    disk_full,
-)
 from langsplat_core.errors import FormatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress
@@ -56,7 +47,7 @@ def opened(folder: Path) -> Any:
     return pycolmap.Database.open(folder / "database.db")
 
 
-def extract_features(folder: Path, groups: Sequence[CameraGroup], progress: Progress) -> None:
+def extract_features(folder: Path, groups: Sequence[workspace.CameraGroup], progress: Progress) -> None:
     """Put SIFT features of every photograph of `groups` into the database; those it has are kept."""
     paths = {"database_path": folder / "database.db", "image_path": folder / "images"}
     readers = []
@@ -68,8 +59,8 @@ def extract_features(folder: Path, groups: Sequence[CameraGroup], progress: Prog
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model, reader.camera_params = group.model, group.params
         reader.existing_camera_id = known.get(group.names[0], -1)  # -1: a new camera
-        if (folder / MASKS).is_dir():
-            reader.mask_path = folder / MASKS
+        if (folder / workspace.MASKS).is_dir():
+            reader.mask_path = folder / workspace.MASKS
         readers.append(reader)
         lacking = [name for name in group.names if name not in known]
         if lacking:
@@ -100,7 +91,7 @@ def extract_features(folder: Path, groups: Sequence[CameraGroup], progress: Prog
     progress("finding features", 1.0)
 
 
-def match_features(folder: Path, pairs: Sequence[Pair], progress: Progress) -> None:
+def match_features(folder: Path, pairs: Sequence[workspace.Pair], progress: Progress) -> None:
     """Match and verify `pairs` into the database; pairs it has are kept."""
     with opened(folder) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
@@ -166,15 +157,15 @@ def store_model(model: Model, folder: Path) -> None:
     try:
         written = read_model(unfinished)
     except FormatError:
-        raise disk_full(folder) from None
+        raise workspace.disk_full(folder) from None
     if len(written.points) != model.num_points3D():
-        raise disk_full(folder)
-    (unfinished / DIGEST).write_text(digest_of_model(unfinished))
+        raise workspace.disk_full(folder)
+    (unfinished / workspace.DIGEST).write_text(workspace.digest_of_model(unfinished))
     shutil.rmtree(folder / "sparse", ignore_errors=True)
     unfinished.rename(folder / "sparse")
     for name in ("database.db", "pairs.txt"):
         (folder / name).unlink(missing_ok=True)
-    for name in ("images", MASKS, "attempts"):
+    for name in ("images", workspace.MASKS, "attempts"):
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
@@ -192,7 +183,7 @@ _CLOSE_PAIRS = {"init_min_tri_angle": 4.0, "init_max_forward_motion": 1.0, "init
 # For long walks: each photograph shares little with those before it, and what it shares lies far ahead.
 _FEW_SHARED = _CLOSE_PAIRS | {
     "init_min_tri_angle": 2.0,
-    "abs_pose_min_num_inliers": FEWEST_MATCHES,
+    "abs_pose_min_num_inliers": workspace.FEWEST_MATCHES,
     "abs_pose_min_inlier_ratio": 0.1,
     "filter_min_tri_angle": 0.5,
 }
@@ -328,5 +319,5 @@ def keep_matches(folder: Path) -> None:
         pairs, inliers = database.read_two_view_geometry_num_inliers()
     ends = [[names[number] for number in pycolmap.pair_id_to_image_pair(pair)] for pair in pairs]
     kept = [[*end, int(count)] for end, count in zip(ends, inliers, strict=True) if count]
-    with atomic_path(folder / MATCHES) as temporary:
+    with atomic_path(folder / workspace.MATCHES) as temporary:
         temporary.write_text(json.dumps({"features": features, "pairs": sorted(kept)}))

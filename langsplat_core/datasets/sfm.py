@@ -14,6 +14,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets import workspace as workspaces
 from langsplat_core.datasets.capture import Capture, capture_of, random_points
 from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
 from langsplat_core.datasets.photos import (
@@ -24,19 +25,6 @@ from langsplat_core.datasets.photos import (
     optics,
     over_black,
     read_photo,
-)
-from langsplat_core.datasets.workspace import (
-    DIGEST,
-    FAILURES,
-    MASKS,
-    UNREADABLE,
-    CameraGroup,
-    Matches,
-    Pair,
-    digest_of_model,
-    open_workspace,
-    read_matches,
-    run_apart,
 )
 from langsplat_core.errors import FormatError, InputError, printable_line, report_loss, shortened
 from langsplat_core.io.files import atomic_path
@@ -63,18 +51,22 @@ def load_photos(
     labels = {path: path.relative_to(folder).as_posix() for path in paths}
     contents = [(labels[path], _content(path)) for path in paths]
     masked = [(labels[path], _content(mask)) for path in paths if (mask := mask_beside(path))]
-    workspace = open_workspace(work, ["photographs", 4, SIDE, contents, *([masked] if masked else [])])
+    workspace = workspaces.open_workspace(
+        work, ["photographs", 4, SIDE, contents, *([masked] if masked else [])]
+    )
     files, before = numbered(paths), has_model(workspace / "sparse")
     if not before:
         try:
-            run_apart(_locate, workspace, files, workspace=workspace, progress=progress)
-        except FAILURES as error:
+            workspaces.run_apart(_locate, workspace, files, workspace=workspace, progress=progress)
+        except workspaces.FAILURES as error:
             reason = str(error).partition("\n")[0]
             raise InputError(
                 f"structure from motion failed ({reason}); remove {workspace} and try again"
             ) from None
     model = _stored_model(workspace) if has_model(workspace / "sparse") else None
-    matches = read_matches(workspace, files, {image.name for image in model.images} if model else ())
+    matches = workspaces.read_matches(
+        workspace, files, {image.name for image in model.images} if model else ()
+    )
     lost = _left_out(matches, contents)
     found = len(matches.located)
     if model is None or (found < max(MIN_PHOTOS, FEWEST * len(files)) and not config.allow_few_cameras):
@@ -84,7 +76,7 @@ def load_photos(
             f"({_listed(lost, 10)}); {matches.joined()}{matches.advice()}{anyway}"
         )
     if not before:
-        lost.pop(UNREADABLE, None)  # which the process has told of, with the reasons
+        lost.pop(workspaces.UNREADABLE, None)  # which the process has told of, with the reasons
     if lost:
         share = f"{sum(map(len, lost.values()))} of {len(files)} photographs"
         what = "could not be located and are left out"
@@ -111,7 +103,7 @@ def _content(path: Path) -> str:
         return ""
 
 
-def _left_out(matches: Matches, contents: Sequence[tuple[str, str]]) -> dict[str, list[str]]:
+def _left_out(matches: workspaces.Matches, contents: Sequence[tuple[str, str]]) -> dict[str, list[str]]:
     """Return photographs without a camera by the reason; contents: names and digests of all photographs."""
     first: dict[str, str] = {}
     groups: dict[str, list[str]] = {}
@@ -147,7 +139,7 @@ def match_photos(workspace: Path, files: dict[str, Path], progress: Progress) ->
     return len(names)
 
 
-def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> list[CameraGroup]:
+def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> list[workspaces.CameraGroup]:
     """Write copies that COLMAP can read and finds the same way up as we do; unreadable files are left out.
 
     Photographs of one size and one set of optics (maker, camera, focal length) share a camera.
@@ -184,19 +176,20 @@ def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> l
         share = f"{len(broken)} of {len(files)} photographs"
         report_loss("%s cannot be read and are left out: %s", share, shortened(broken))
     return [
-        CameraGroup(tuple(names), "SIMPLE_RADIAL", side=max(size)) for (size, _), names in members.items()
+        workspaces.CameraGroup(tuple(names), "SIMPLE_RADIAL", side=max(size))
+        for (size, _), names in members.items()
     ]
 
 
 def _write_mask(images: Path, name: str, mask: Image.Image) -> None:
     """Write an image's mask for COLMAP. Where some have one, those without are white, or it finds nothing."""
-    path = images.with_name(MASKS) / f"{name}.png"
+    path = images.with_name(workspaces.MASKS) / f"{name}.png"
     path.parent.mkdir(exist_ok=True)
     with atomic_path(path) as temporary:
         mask.save(temporary)
 
 
-def pairs_by_name(names: Sequence[str]) -> list[Pair]:
+def pairs_by_name(names: Sequence[str]) -> list[workspaces.Pair]:
     """Return every pair of up to 80 photographs; of more, all would cost too much.
 
     Then each is paired with its next 10 neighbours in name order and with those at distances 16, 32, 64 ...,
@@ -231,15 +224,15 @@ def _triangulated(
     capture: Capture, views: Sequence[int], work: Path, progress: Progress
 ) -> tuple[Array, Array, str]:
     """Return points, their colours, and why there are none, for people; "" where nothing failed."""
-    workspace = open_workspace(work, ["known poses", 3, SIDE, capture.digest(views)])
+    workspace = workspaces.open_workspace(work, ["known poses", 3, SIDE, capture.digest(views)])
     try:
         if not has_model(workspace / "sparse"):
             names = [f"{index:05d}.png" for index in range(len(views))]
             cameras = _write_images(workspace / "images", names, capture, views, progress)
-            run_apart(
+            workspaces.run_apart(
                 _match_and_triangulate, workspace, names, cameras, workspace=workspace, progress=progress
             )
-    except (*FAILURES, InputError) as error:
+    except (*workspaces.FAILURES, InputError) as error:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), f" ({printable_line(error, 200)})"
     return *good_points(_stored_model(workspace)), ""
 
@@ -247,8 +240,8 @@ def _triangulated(
 def _stored_model(workspace: Path) -> SparseModel:
     """Return the finished model of a workspace; FormatError where its files changed since it was written."""
     folder = workspace / "sparse"
-    stated = folder / DIGEST  # none in earlier versions
-    if stated.is_file() and stated.read_bytes() != digest_of_model(folder).encode():
+    stated = folder / workspaces.DIGEST  # none in earlier versions
+    if stated.is_file() and stated.read_bytes() != workspaces.digest_of_model(folder).encode():
         raise FormatError(f"{workspace}: its model changed since it was written; delete it and run again")
     return read_model(folder)
 
@@ -263,7 +256,10 @@ def _match_and_triangulate(
     for name, camera in zip(names, cameras, strict=True):
         params = ",".join(repr(float(value)) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
         members.setdefault((params, max(camera.width, camera.height)), []).append(name)
-    groups = [CameraGroup(tuple(group), "PINHOLE", params, side) for (params, side), group in members.items()]
+    groups = [
+        workspaces.CameraGroup(tuple(group), "PINHOLE", params, side)
+        for (params, side), group in members.items()
+    ]
     extract_features(workspace, groups, progress)
     pairs = [(names[i], names[j]) for i, j in neighbouring_pairs(cameras)]
     match_features(workspace, pairs, progress)

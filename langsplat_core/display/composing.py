@@ -11,30 +11,13 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.displays import (
-    COLOUR_MAPS,
-    EDGE_PX,
-    HEAT_BASE,
-    HEAT_EDGE,
-    HEAT_FADE,
-    HEAT_LIGHTNESS,
-    LEAST_ALPHA,
-    NODES,
-    QUERY_COLOURS,
-    SEGMENT_OPACITY,
-    SELECTED,
-    SELECTED_OPACITY,
-    STRIPE_PX,
-    Channels,
-    Drawing,
-    Ranges,
-    drawing_of,
-    full_ranges,
-    oklab,
-)
+from langsplat_core.display import displays
+from langsplat_core.display.displays import Channels, Drawing
 
-_TABLES = {name: np.ascontiguousarray(table / np.float32(255)) for name, table in COLOUR_MAPS.items()}
-_LABS = {name: oklab(table).astype(np.float32) for name, table in _TABLES.items()}
+_TABLES = {
+    name: np.ascontiguousarray(table / np.float32(255)) for name, table in displays.COLOUR_MAPS.items()
+}
+_LABS = {name: displays.oklab(table).astype(np.float32) for name, table in _TABLES.items()}
 
 
 class Style(NamedTuple):
@@ -53,7 +36,7 @@ class Style(NamedTuple):
     table: Array  # (NODES, 3) the colour map, for heat in OKLab, as are the tints then
 
 
-def compose(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> Array:
+def compose(channels: Channels, picture: PictureConfig, ranges: displays.Ranges = ()) -> Array:
     """(H, W, 3) uint8 image; with `picture.transparent` (H, W, 4), its colours not premultiplied.
 
     Where a display's further channel is absent it shows the plain colours. `ranges`: see `full_ranges`.
@@ -62,11 +45,11 @@ def compose(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> 
     return np.ascontiguousarray(image if picture.transparent else image[..., :3])
 
 
-def compose_upwards(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> Array:
+def compose_upwards(channels: Channels, picture: PictureConfig, ranges: displays.Ranges = ()) -> Array:
     """(H, W, 4) uint8, the image of `compose` as OpenGL has it: row 0 at the bottom, opaque by default."""
     extra = channels.alpha[..., None] if channels.extra is None else channels.extra
     planes = tuple(np.asarray(plane, np.float32) for plane in (channels.rgb, channels.alpha, extra))
-    drawing = drawing_of(picture.display, channels.extra is not None)
+    drawing = displays.drawing_of(picture.display, channels.extra is not None)
     hot = drawing is Drawing.HEAT
     style = Style(
         drawing=int(drawing),
@@ -77,8 +60,8 @@ def compose_upwards(channels: Channels, picture: PictureConfig, ranges: Ranges =
         dim=np.float32(picture.dim),
         heat_opacity=np.float32(picture.heat_opacity),
         backdrop=np.asarray((0, 0, 0) if picture.transparent else picture.background, np.float32),
-        limits=full_ranges(ranges).astype(np.float32),
-        tints=(oklab(QUERY_COLOURS) if hot else QUERY_COLOURS).astype(np.float32),
+        limits=displays.full_ranges(ranges).astype(np.float32),
+        tints=(displays.oklab(displays.QUERY_COLOURS) if hot else displays.QUERY_COLOURS).astype(np.float32),
         table=(_LABS if hot else _TABLES)[picture.colour_map],
     )
     height, width = channels.alpha.shape
@@ -86,11 +69,11 @@ def compose_upwards(channels: Channels, picture: PictureConfig, ranges: Ranges =
     shared_workers().run(_rows, height, image, planes, style)
     # In passes of their own: they ask for other pixels, and would keep the one above from its speed.
     if hot:
-        mark = np.float32(HEAT_EDGE), style.gate, np.ones(3, np.float32), np.float32(0)
+        mark = np.float32(displays.HEAT_EDGE), style.gate, np.ones(3, np.float32), np.float32(0)
         shared_workers().run(_mark, height, image, planes[2], planes[1], mark)
     if channels.selected is not None:
-        selected, colour = np.asarray(channels.selected, np.float32), np.array(SELECTED, np.float32)
-        mark = style.threshold, style.gate, colour, np.float32(SELECTED_OPACITY)
+        selected, colour = np.asarray(channels.selected, np.float32), np.array(displays.SELECTED, np.float32)
+        mark = style.threshold, style.gate, colour, np.float32(displays.SELECTED_OPACITY)
         shared_workers().run(_mark, height, image, selected, planes[1], mark)
     return image
 
@@ -102,8 +85,8 @@ def _clip(value: Any) -> Any:
 
 @helper
 def _map(shown: Array, t: Any, table: Array) -> None:
-    position = _clip(t) * np.float32(NODES - 1)
-    low = min(int(position), NODES - 2)
+    position = _clip(t) * np.float32(displays.NODES - 1)
+    low = min(int(position), displays.NODES - 2)
     part = position - np.float32(low)
     for k in range(3):
         shown[k] = table[low, k] * (1 - part) + table[low + 1, k] * part
@@ -114,7 +97,7 @@ def _shade(shown: Array, base: Array) -> None:
     """Turn a colour of OKLab into RGB, with most of the lightness of `base`: its luminance's cube root."""
     red, green, blue = base[0] * base[0], base[1] * base[1], base[2] * base[2]
     own = np.cbrt(np.float32(0.2126) * red + np.float32(0.7152) * green + np.float32(0.0722) * blue)
-    lightness, a, b = own + np.float32(HEAT_LIGHTNESS) * (shown[0] - own), shown[1], shown[2]
+    lightness, a, b = own + np.float32(displays.HEAT_LIGHTNESS) * (shown[0] - own), shown[1], shown[2]
     long = lightness + np.float32(0.3963378) * a + np.float32(0.2158038) * b
     middle = lightness - np.float32(0.1055613) * a - np.float32(0.0638542) * b
     short = lightness - np.float32(0.0894842) * a - np.float32(1.2914855) * b
@@ -136,7 +119,7 @@ def _query_of(mean: Array, y: int, x: int, least: Any) -> int:
         count += mean[j] >= least
         if abs(mean[j]) > abs(mean[found]):
             found = j
-    left = (x + y) // STRIPE_PX % count if count > 1 else -1
+    left = (x + y) // displays.STRIPE_PX % count if count > 1 else -1
     for j in range(len(mean)):
         if mean[j] >= least:
             if left == 0:
@@ -147,10 +130,12 @@ def _query_of(mean: Array, y: int, x: int, least: Any) -> int:
 
 @helper
 def _heat(shown: Array, base: Array, mean: Array, y: int, x: int, style: Style) -> None:
-    slot = _query_of(mean, y, x, np.float32(HEAT_EDGE))
+    slot = _query_of(mean, y, x, np.float32(displays.HEAT_EDGE))
     value, low, high = mean[slot], style.limits[slot, 0], style.limits[slot, 1]
     heat = _clip((value - low) / (high - low))
-    cover = _clip(heat / np.float32(HEAT_FADE) if value < 0 else value / np.float32(HEAT_BASE))
+    cover = _clip(
+        heat / np.float32(displays.HEAT_FADE) if value < 0 else value / np.float32(displays.HEAT_BASE)
+    )
     mix = style.heat_opacity * cover * cover * (3 - 2 * cover)  # smoothstep
     if style.own_colours:
         mix *= np.float32(0.5) + np.float32(0.5) * heat
@@ -168,7 +153,7 @@ def _heat(shown: Array, base: Array, mean: Array, y: int, x: int, style: Style) 
 def _segment(shown: Array, base: Array, mean: Array, y: int, x: int, style: Style) -> None:
     winner = _query_of(mean, y, x, style.threshold)
     low, high = style.limits[winner, 0], style.limits[winner, 1]
-    opacity = np.float32(SEGMENT_OPACITY) * _clip((1 - low) / (high - low))
+    opacity = np.float32(displays.SEGMENT_OPACITY) * _clip((1 - low) / (high - low))
     inside = mean[winner] > style.threshold
     for k in range(3):
         mixed = base[k] * (1 - opacity) + style.tints[winner, k] * opacity
@@ -195,7 +180,7 @@ def _rows(first: int, last: int, image: Array, planes: tuple[Array, Array, Array
             alpha = alphas[y, x]
             is_open = alpha > style.gate
             scale = 1 / alpha if is_open else np.float32(0)
-            share = 1 / max(alpha, np.float32(LEAST_ALPHA)) if style.transparent else np.float32(1)
+            share = 1 / max(alpha, np.float32(displays.LEAST_ALPHA)) if style.transparent else np.float32(1)
             for k in range(3):
                 own = extra[y, x, k] if style.drawing == Drawing.SUMS else rgb[y, x, k]
                 mixed = _clip(own * share + (1 - alpha) * style.backdrop[k])
@@ -228,8 +213,8 @@ def _on_edge(layer: Array, alphas: Array, y: int, x: int, least: Any, gate: Any)
     for slot in range(layer.shape[2]):
         if not _inside(layer, alphas, y, x, slot, least, gate):
             continue
-        above, below = max(y - EDGE_PX, 0), min(y + EDGE_PX, len(alphas) - 1)
-        left, right = max(x - EDGE_PX, 0), min(x + EDGE_PX, alphas.shape[1] - 1)
+        above, below = max(y - displays.EDGE_PX, 0), min(y + displays.EDGE_PX, len(alphas) - 1)
+        left, right = max(x - displays.EDGE_PX, 0), min(x + displays.EDGE_PX, alphas.shape[1] - 1)
         if not (
             _inside(layer, alphas, above, x, slot, least, gate)
             and _inside(layer, alphas, below, x, slot, least, gate)

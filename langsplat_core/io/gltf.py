@@ -25,16 +25,8 @@ from msgspec import Meta, Struct
 
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError, malformed, quoted, report_losses, unread
+from langsplat_core.io import hostile
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import (
-    FREE,
-    SMALL_RATIO,
-    Allowance,
-    decode_json,
-    is_plain_name,
-    other_entries,
-    read_file,
-)
 from langsplat_core.io.quantised import mirrored, to_bytes
 from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene, about_origin
@@ -262,11 +254,11 @@ class _File:
         self.bare = 0  # placed primitives without Gaussians
         self.shown: set[int] = set()  # meshes that nodes place
         self.antialiased: set[bool] = set()  # what primitives say
-        text = memoryview(read_file(path, 2**32))
+        text = memoryview(hostile.read_file(path, 2**32))
         self._binary = text[:0]
         # Numbers as they are stored, which an honest file shows once or a few times; Gaussians packed in it
-        self._shown = Allowance(path, len(text), 1, FREE // 4)
-        self.room = Allowance(path, len(text), SMALL_RATIO)
+        self._shown = hostile.Allowance(path, len(text), 1, hostile.FREE // 4)
+        self.room = hostile.Allowance(path, len(text), hostile.SMALL_RATIO)
         self._buffers: dict[int, bytes | memoryview] = {}
         if text[:4] == MAGIC:  # then version, length; size and kind of a chunk; JSON; the same of the buffer
             end = 20 + int.from_bytes(text[12:16], "little")
@@ -278,15 +270,15 @@ class _File:
             if len(text) - end - size > 3:
                 self.told.append(f"{len(text) - end - size} bytes behind its buffer not read")
             text = text[20:end]
-        about = decode_json(bytes(text), _About, path)  # first: other versions have other content
+        about = hostile.decode_json(bytes(text), _About, path)  # first: other versions have other content
         version = about.asset.get("version")
         if str(version)[:2] != "2.":
             raise malformed(path, f"glTF version {quoted(version)}; only 2 is read", "export it as glTF 2.0")
         for name in about.extensions_required:
             if name not in KNOWN:
                 raise malformed(path, f"needs {quoted(name)}, which is not read", "export it without")
-        self.content = decode_json(bytes(text), _Content, path)
-        self.told.append(other_entries(bytes(text), ENTRIES, path))
+        self.content = hostile.decode_json(bytes(text), _Content, path)
+        self.told.append(hostile.other_entries(bytes(text), ENTRIES, path))
 
     def losses(self) -> Iterator[str]:
         """Yield what of the file was passed over or guessed, once its Gaussians are read."""
@@ -340,10 +332,10 @@ class _File:
                     self._buffers[index] = base64.b64decode(data, validate=True)
                 except ValueError:
                     raise malformed(self.path, f"buffer {index} is not base64") from None
-            elif is_plain_name(name := unquote(str(uri))):
-                self._buffers[index] = read_file(self.path.parent / name, 2**32)
+            elif hostile.is_plain_name(name := unquote(str(uri))):
+                self._buffers[index] = hostile.read_file(self.path.parent / name, 2**32)
                 self._shown.left += len(self._buffers[index])
-                self.room.left += SMALL_RATIO * len(self._buffers[index])
+                self.room.left += hostile.SMALL_RATIO * len(self._buffers[index])
             else:
                 raise malformed(self.path, f"buffer {quoted(uri)} is no plain file name")
         return self._buffers[index]

@@ -31,17 +31,8 @@ from PIL import Image
 
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import malformed, quoted, report_losses, unread
+from langsplat_core.io import hostile
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import (
-    SMALL_RATIO,
-    Allowance,
-    decode_json,
-    is_plain_name,
-    opened,
-    opened_archive,
-    other_entries,
-    read_file,
-)
 from langsplat_core.io.quantised import check_steps, smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
@@ -114,8 +105,8 @@ def read_sog_scene(path: Path | str) -> Scene:
     if path.suffix.lower() == ".json":
         size = sum(file.stat().st_size for file in path.parent.glob("*") if file.is_file())
         images = [file.name for file in path.parent.glob("*.webp")]
-        return _decode(lambda name, limit: read_file(path.parent / name, limit), path, size, images)
-    with opened_archive(path, "SOG archive") as archive:
+        return _decode(lambda name, limit: hostile.read_file(path.parent / name, limit), path, size, images)
+    with hostile.opened_archive(path, "SOG archive") as archive:
         # The images are compressed already, so a member far larger than its archive is a trap.
         most = 16 * archive.size + META_LIMIT
         return _decode(
@@ -129,17 +120,17 @@ def read_sog_scene(path: Path | str) -> Scene:
 def _decode(fetch: Fetch, meta_path: Path, size: int, files: Iterable[str]) -> Scene:
     """Decode the scene, of `size` bytes, whose `files` `fetch` finds by the last part of `meta_path`."""
     text = fetch(meta_path.name, META_LIMIT)
-    version = decode_json(text, _Versioned, meta_path).version
+    version = hostile.decode_json(text, _Versioned, meta_path).version
     if version != 2:
         what = f"SOG version {quoted(version)}; only 2 is read"
         raise malformed(meta_path, what, "export the scene again")
-    meta = decode_json(text, _Meta, meta_path)
+    meta = hostile.decode_json(text, _Meta, meta_path)
     degree = meta.higher.bands if meta.higher is not None else 0
-    Allowance(meta_path, size, SMALL_RATIO).take_gaussians(meta.count, degree)
+    hostile.Allowance(meta_path, size, hostile.SMALL_RATIO).take_gaussians(meta.count, degree)
     antialiased = meta.model == "antialiased" or meta.antialias is True
     planes = _Planes(fetch, meta_path, meta.count)
     scene = Scene(_gaussians(planes, meta), antialiased=antialiased)
-    told = [*planes.told, other_entries(text, ENTRIES, meta_path)]
+    told = [*planes.told, hostile.other_entries(text, ENTRIES, meta_path)]
     if planes.beyond:
         told.append(f"pixels of {planes.beyond} Gaussians behind its {meta.count} not read")
     if meta.model not in (None, "antialiased") or meta.antialias not in (None, True, False):
@@ -208,12 +199,12 @@ class _Planes:
 
     def _image(self, name: str, suits: Callable[[int, int], bool]) -> Array:
         """(H, W, 4) uint8; `suits` judges (width, height) before anything is decoded."""
-        if not is_plain_name(name):
+        if not hostile.is_plain_name(name):
             raise malformed(self.path, f"{quoted(name)} is no plain file name")
         self.read.add(name)
         what = f"{self.path}: image {quoted(name)}"
         data = self._fetch(name, IMAGE_LIMIT)
-        with opened(data, what, ("WEBP", "PNG")) as image:
+        with hostile.opened(data, what, ("WEBP", "PNG")) as image:
             if not suits(*image.size):
                 size = f"{image.width}x{image.height}"
                 raise malformed(what, f"{size} pixels do not suit {self.count} Gaussians")

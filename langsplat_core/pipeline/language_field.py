@@ -54,26 +54,8 @@ from langsplat_core.semantics.features import (
     masked_crop,
 )
 from langsplat_core.semantics.relevancy import NARROWEST, bundled_vocabulary, everyday_vectors
-from langsplat_core.training.language.codec_fit import (
-    CodecReport,
-    codec_report,
-    contrasting_colours,
-    everyday_vocabulary,
-    fit_codec,
-    rounded,
-)
-from langsplat_core.training.language.lift import (
-    MaskGroups,
-    MaskWeights,
-    count_votes,
-    find_instances,
-    group_masks,
-    lift_by_gradient,
-    lift_latents,
-    lift_sample,
-    lift_weights,
-    view_pairs,
-)
+from langsplat_core.training.language import codec_fit, lift
+from langsplat_core.training.language.lift import MaskGroups, MaskWeights
 from langsplat_core.training.language.merge_tree import MergeTree, draw_patches, find_tree, nested_maps
 
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
@@ -120,7 +102,7 @@ def language_field(
     work: Path,
     progress: Progress,
     processes: ProcessGroup | None = None,
-) -> tuple[LanguageField, CodecReport]:
+) -> tuple[LanguageField, codec_fit.CodecReport]:
     """Return the field of the views' masks, and its codec's loss; InputError without any mask."""
     check_lift(config)
     check_masks(features for _, features in views)
@@ -131,8 +113,8 @@ def language_field(
     field = field_of((latents, confidence), codec, encoder, config.phrases)
     tree = stages.tree(field)
     if isinstance(codec, CodebookCodec):
-        colours = contrasting_colours(field, tree, build_surface(gaussians))
-        codec = codec if colours is None else replace(codec, palette=rounded(colours))
+        colours = codec_fit.contrasting_colours(field, tree, build_surface(gaussians))
+        codec = codec if colours is None else replace(codec, palette=codec_fit.rounded(colours))
     return replace(field, tree=tree, codec=codec), report
 
 
@@ -205,7 +187,7 @@ class _Stages:
         mask_weights = self.weights_in(folder)
 
         def make() -> Arrays:
-            groups = group_masks(vectors)
+            groups = lift.group_masks(vectors)
             return {"of_mask": np.concatenate(groups.of_mask), "vectors": groups.vectors}
 
         made = self.processes.once(lambda: kept(folder / "groups.npz", make))
@@ -218,7 +200,7 @@ class _Stages:
         drawn = self.rasterizer(), self.gaussians
         for index in self.each(len(files), "lifting masks onto the Gaussians"):
             if not files[index].exists():
-                write_array(files[index], view_pairs(*drawn, *self.views[index], self.formation))
+                write_array(files[index], lift.view_pairs(*drawn, *self.views[index], self.formation))
         return MaskWeights([open_array(path) for path in files], len(self.gaussians))
 
     def each(self, count: int, stage: str, begin: float = 0.0, end: float = 1.0) -> Iterator[int]:
@@ -238,30 +220,30 @@ class _Stages:
     def rasterizer(self) -> LiftingRasterizer:
         return load_lifting_rasterizer(self.config.lift.backend)
 
-    def codec(self) -> tuple[Codec, CodecReport]:
+    def codec(self) -> tuple[Codec, codec_fit.CodecReport]:
         """Return the codec, fitted to lifted vectors, where that helps also to the masks' own."""
 
         def make() -> Arrays:
             settings, masks = self.config.codec, np.concatenate(self.inputs[0])
-            vocabulary = everyday_vocabulary(self.encoder, self.config.phrases)
+            vocabulary = codec_fit.everyday_vocabulary(self.encoder, self.config.phrases)
             fitted, judged = self.lifted_samples() if self.by_weights else (masks, masks)
             further = masks if self.by_weights else None
-            codec = fit_codec(fitted, settings, vocabulary, self.progress, further)
-            report = codec_report(codec, judged if len(judged) else masks, vocabulary)
+            codec = codec_fit.fit_codec(fitted, settings, vocabulary, self.progress, further)
+            report = codec_fit.codec_report(codec, judged if len(judged) else masks, vocabulary)
             figures = np.array(list(asdict(report).values()))
             return {"kind": np.array(codec.kind), "report": figures, **codec.tensors()}
 
         fitted_to = self.lift.mode if self.by_weights else "masks"
         made = dict(self.kept(self.path("codec", 2, fitted_to, self.config.codec), make))
         kind, figures = str(made.pop("kind")), made.pop("report").tolist()
-        return codec_from_tensors(kind, made), CodecReport(*figures)
+        return codec_from_tensors(kind, made), codec_fit.CodecReport(*figures)
 
     def lifted_samples(self) -> tuple[Array, Array]:
         """(M, D) float32 vectors of Gaussians that a codec is fitted to, and of others that judge it."""
         order = np.random.default_rng(self.config.codec.seed).permutation(len(self.gaussians))
         robust, samples = self.lift.mode == "median", []
         for rows in (order[:FITTED], order[FITTED : FITTED + JUDGED]):
-            vectors, confidence = lift_sample(*self.mask_weights, np.sort(rows), robust, self.progress)
+            vectors, confidence = lift.lift_sample(*self.mask_weights, np.sort(rows), robust, self.progress)
             samples.append(vectors[confidence > 0])
         return samples[0], samples[1]
 
@@ -282,9 +264,11 @@ class _Stages:
                     part = read_arrays(blocks / f"{number:05d}.npz")
                     latents[:, first:last], confidence[:, first:last] = part["latents"], part["confidence"]
             elif self.lift.mode == "one-pass":
-                latents, confidence = lift_latents(self.rasterizer(), *scene, *shared)
+                latents, confidence = lift.lift_latents(self.rasterizer(), *scene, *shared)
             else:
-                latents, confidence = lift_by_gradient(self.rasterizer(), *scene, self.config.lift, *shared)
+                latents, confidence = lift.lift_by_gradient(
+                    self.rasterizer(), *scene, self.config.lift, *shared
+                )
             return {"latents": latents, "confidence": confidence}
 
         made = self.processes.once(lambda: kept(done, make))
@@ -296,16 +280,16 @@ class _Stages:
         """Lift this process's share of the blocks of Gaussians, each into a file."""
         mask_weights, groups = self.mask_weights
 
-        def lift(number: int) -> Arrays:
+        def lifted(number: int) -> Arrays:
             weights = mask_weights.block(number, groups)
             robust = self.lift.mode == "median"
-            vectors, confidence = lift_weights(weights, groups.vectors, robust)
+            vectors, confidence = lift.lift_weights(weights, groups.vectors, robust)
             latents = codec.encode(vectors.reshape(-1, vectors.shape[2])).reshape(*vectors.shape[:2], -1)
             latents = np.where(confidence[..., None] > 0, latents, 0).astype(latents.dtype)
             return {"latents": latents, "confidence": confidence}
 
         for number in self.each(len(mask_weights.blocks), "averaging mask vectors"):
-            kept(folder / f"{number:05d}.npz", partial(lift, number))
+            kept(folder / f"{number:05d}.npz", partial(lifted, number))
 
     def tree(self, field: LanguageField) -> Tree:
         """Return the scene's tree, without votes where latents are averaged, which needs no mask weights."""
@@ -316,9 +300,9 @@ class _Stages:
             if not self.by_weights:
                 return vars(build_tree(*parts))
             counts, mask_weights = [len(vectors) for vectors in self.inputs[0]], self.mask_weights[0]
-            things = [find_instances(mask_weights, counts, level) for level in range(len(LEVELS))]
+            things = [lift.find_instances(mask_weights, counts, level) for level in range(len(LEVELS))]
             tree = build_tree(*parts, np.stack(things))
-            return vars(replace(tree, votes=count_votes(tree, mask_weights, counts)))
+            return vars(replace(tree, votes=lift.count_votes(tree, mask_weights, counts)))
 
         return Tree(**self.kept(self.path("nodes", 4, self.lift, self.config.codec), make))
 

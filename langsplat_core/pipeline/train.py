@@ -21,21 +21,8 @@ from langsplat_core.errors import STRICTNESS, FormatError, InputError
 from langsplat_core.io.files import atomic_path, check_output_folder, shown, write_json
 from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
-from langsplat_core.pipeline.language_field import (
-    StoredViews,
-    agreed_features,
-    check_lift,
-    check_masks,
-    language_field,
-)
-from langsplat_core.pipeline.report import (
-    TrainReport,
-    quality_warnings,
-    read_report,
-    rehearsals_in_words,
-    work_folder,
-    write_reports,
-)
+from langsplat_core.pipeline import language_field
+from langsplat_core.pipeline import report as reports
 from langsplat_core.pipeline.stages import ProcessGroup, digest_of, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Gaussians, Scene
@@ -44,15 +31,8 @@ from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, Encoder, loa
 from langsplat_core.semantics.features import FeatureStore, StoredFeatures, describe_capture
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
+from langsplat_core.training.radiance import trainer
 from langsplat_core.training.radiance.differentiable import evaluate_views
-from langsplat_core.training.radiance.trainer import (
-    budget_text,
-    budgets_for,
-    checkpoints_of,
-    rehearse,
-    supported,
-    train_within,
-)
 
 FEWEST_VIEWS = 3
 VERSION = 7  # of what training and rehearsals make
@@ -69,7 +49,7 @@ def train_scene(
     masks_of: Callable[[Capture], MaskSource] | None = None,
     processes: ProcessGroup | None = None,
     gaussians_from: Path | None = None,
-) -> TrainReport:
+) -> reports.TrainReport:
     """Train `out` (a .ply; sidecar and cameras beside it) from the photographs in `dataset`.
 
     `masks_of` makes another mask source than ``config.masks`` names, once the photographs are read.
@@ -78,10 +58,10 @@ def train_scene(
     some.
     """
     check_settings(config)
-    check_lift(config)
+    language_field.check_lift(config)
     if out.suffix.lower() != ".ply":
         raise InputError(f"{out}: the scene must be named *.ply, for example --out {out.with_suffix('.ply')}")
-    work = work or work_folder(out)
+    work = work or reports.work_folder(out)
     check_writable(out)
     check_output_folder(work)
     # First: a scene that cannot be read should not cost an hour.
@@ -112,7 +92,9 @@ class _Run:
         log.debug("%s: %.1f s", stage, self.seconds[stage])
 
 
-def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: Scene | None) -> TrainReport:
+def _train(
+    run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: Scene | None
+) -> reports.TrainReport:
     """Train in a work folder that is this run's own; `given`: the scene whose Gaussians are taken."""
     config, processes, shared = run.config, run.processes, (run.work, run.progress, run.processes)
     with run.timed("photographs"):
@@ -129,7 +111,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
 
     with run.timed("masks and vectors"):
         views = _described_views(run, capture, train, mask_source, encoder)
-        check_masks(views.features)  # before the Gaussians, which may cost hours
+        language_field.check_masks(views.features)  # before the Gaussians, which may cost hours
 
     with run.timed("radiance"):
         if given is None:
@@ -140,11 +122,11 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
     if not mask_source.agrees:
         with run.timed("masks that agree"):
             photographs = [(capture.images[i], capture.mask(i)) for i in train]
-            features = agreed_features(gaussians, views, photographs, encoder, config, *shared)
-            views = StoredViews(views.cameras, features)
+            features = language_field.agreed_features(gaussians, views, photographs, encoder, config, *shared)
+            views = language_field.StoredViews(views.cameras, features)
 
     with run.timed("language field"):
-        language, codec_report = language_field(gaussians, views, encoder, config, *shared)
+        language, codec_report = language_field.language_field(gaussians, views, encoder, config, *shared)
         if not capture.drawn:
             language = replace(language, calibration=None)  # which holds in drawn rooms alone
 
@@ -157,7 +139,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
             small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
             near = config.radiance.near or scene.near  # as whoever opens the scene has it
             scores = evaluate_views(gaussians, capture, held_out, small=small, near=near) if held_out else []
-        report = TrainReport(
+        report = reports.TrainReport(
             views=len(views),
             held_out=len(scores),
             gaussians=len(gaussians),
@@ -172,15 +154,15 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
             relevancy_error=codec_report.error_mean,
             relevancy_error_p99=codec_report.error_p99,
             observed=float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
-            warnings=quality_warnings(scores, views.cameras),
+            warnings=reports.quality_warnings(scores, views.cameras),
             seconds=run.seconds,
             dataset=str(run.dataset.resolve()),
             held_out_views=tuple(scores),
             rehearsed=rehearsed,
         )
-        write_reports(run.work, report, capture, gaussians, near)
+        reports.write_reports(run.work, report, capture, gaussians, near)
     processes.barrier()
-    return read_report(run.work)
+    return reports.read_report(run.work)
 
 
 def _mean(scores: Iterable[float | None]) -> float | None:
@@ -203,7 +185,7 @@ def _photographs(run: _Run) -> Capture:
 
 def _described_views(
     run: _Run, capture: Capture, train: list[int], source: MaskSource, encoder: Encoder
-) -> StoredViews:
+) -> language_field.StoredViews:
     """Find the masks of the photographs at `train`, and their vectors where masks agree between photographs.
 
     Others are described once they agree. Kept by mask settings, encoder and image.
@@ -216,23 +198,23 @@ def _described_views(
     describe_capture(images, names, source, seen_by, store, run.progress, counted)
     run.processes.barrier()
     cameras = tuple(capture.cameras[i] for i in train)
-    return StoredViews(cameras, StoredFeatures(store, [camera.name for camera in cameras]))
+    return language_field.StoredViews(cameras, StoredFeatures(store, [camera.name for camera in cameras]))
 
 
 def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[str, list[float]]]:
     """Return Gaussians of the supported budget, and held-out PSNRs (dB) by budget; one process trains."""
     config = run.config.radiance
-    budgets = budgets_for(capture, config, len(train))
+    budgets = trainer.budgets_for(capture, config, len(train))
     found = run.processes.once(lambda: _rehearsals(run, capture, train, budgets))
-    budget = supported(found, budgets)
+    budget = trainer.supported(found, budgets)
     scores = [[round(decibels, 2) for decibels in each] for each in found]
-    rehearsed = dict(zip(map(budget_text, budgets), scores, strict=False))
+    rehearsed = dict(zip(map(trainer.budget_text, budgets), scores, strict=False))
     if budget != budgets[-1]:
         log.info(
             "training takes %s, not %s: with so few photographs more does not pay (held out: %s); "
             "--radiance.rehearsed-views 0 spends all",
-            *(budget_text(budget), budget_text(budgets[-1])),
-            rehearsals_in_words(rehearsed) or "none could be",
+            *(trainer.budget_text(budget), trainer.budget_text(budgets[-1])),
+            reports.rehearsals_in_words(rehearsed) or "none could be",
         )
     made = run.processes.once(
         lambda: trained_gaussians(capture, train, config, budget, run.work, run.progress)
@@ -248,8 +230,8 @@ def _rehearsals(
     done = run.work / f"{_radiance_key('rehearsal', capture, train, config)}.json"
     if not done.exists():
         checkpoint = done.with_suffix(".checkpoint.safetensors")
-        write_json(done, rehearse(capture, config, budgets, train, checkpoint, run.progress))
-        for left in checkpoints_of(checkpoint):
+        write_json(done, trainer.rehearse(capture, config, budgets, train, checkpoint, run.progress))
+        for left in trainer.checkpoints_of(checkpoint):
             left.unlink(missing_ok=True)
     try:
         found: list[list[float]] = json.loads(done.read_bytes())
@@ -277,7 +259,7 @@ def trained_gaussians(
         return found
     checkpoint = done.with_suffix(".checkpoint.safetensors")
     stated.unlink(missing_ok=True)
-    gaussians = train_within(capture, budget, config, train, checkpoint, progress)
+    gaussians = trainer.train_within(capture, budget, config, train, checkpoint, progress)
     write_ply(done, gaussians)
     with atomic_path(stated) as temporary:
         temporary.write_text(digest_of(read_ply(done)))

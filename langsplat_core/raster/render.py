@@ -20,33 +20,27 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import RasterSettings
-from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
-from langsplat_core.raster.protocol import (
-    Backend,
-    LiftingRasterizer,
-    LiftingView,
-    V,
-    View,
-    dilation,
-    farthest,
-)
+from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, protocol
 from langsplat_core.scene import Camera, Gaussians, Scene
 
 
 @overload
 def view_of(
     scene: Scene, camera: Camera, rasterizer: None = None, settings: RasterSettings | None = None
-) -> LiftingView: ...
+) -> protocol.LiftingView: ...
 @overload
-def view_of(
-    scene: Scene, camera: Camera, rasterizer: Backend[V], settings: RasterSettings | None = None
-) -> V: ...
 def view_of(
     scene: Scene,
     camera: Camera,
-    rasterizer: Backend[View] | None = None,
+    rasterizer: protocol.Backend[protocol.V],
     settings: RasterSettings | None = None,
-) -> View:
+) -> protocol.V: ...
+def view_of(
+    scene: Scene,
+    camera: Camera,
+    rasterizer: protocol.Backend[protocol.View] | None = None,
+    settings: RasterSettings | None = None,
+) -> protocol.View:
     """Project `scene` into `camera`, once for any number of images.
 
     rasterizer: by default that of the CPU, whose views can lift; settings of image formation: by default
@@ -57,7 +51,7 @@ def view_of(
 
 
 @cache
-def _cpu() -> LiftingRasterizer:
+def _cpu() -> protocol.LiftingRasterizer:
     """One for the process, since views of one rasterizer use its memory again."""
     return load_lifting_rasterizer("cpu")
 
@@ -91,7 +85,7 @@ def render(
     return splat_colours(view, scene.gaussians, values)
 
 
-def splat_colours(view: View, gaussians: Gaussians, values: Array | None = None) -> Rendering:
+def splat_colours(view: protocol.View, gaussians: Gaussians, values: Array | None = None) -> Rendering:
     """Draw the image of a view of `gaussians` in one pass; values as in `render`."""
     rows = view.rows
     seen = colours_seen(gaussians, view.camera, rows)
@@ -115,7 +109,7 @@ def pixel_weights(
     scene: Scene,
     camera: Camera,
     pixel: tuple[int, int],
-    rasterizer: LiftingRasterizer | None = None,
+    rasterizer: protocol.LiftingRasterizer | None = None,
     settings: RasterSettings | None = None,
 ) -> tuple[Array, Array]:
     """(M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and their (M,) float32 weights.
@@ -151,10 +145,10 @@ def _may_reach(
         if not camera.orthographic:
             x, y = x / z, y / z
             largest *= np.sqrt(1 + x * x + y * y) / z
-        variance = largest**2 + np.float32(dilation(camera, settings))
+        variance = largest**2 + np.float32(protocol.dilation(camera, settings))
         reach = np.sqrt(np.float32(2 * np.log(1 / settings.alpha_min)) * variance) + 1
         across = np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5))
         down = np.abs(camera.fy * y + np.float32(camera.cy - pixel[1] - 0.5))
-        in_front = (z > 0.999 * settings.near) & (z < 1.001 * farthest(settings))
+        in_front = (z > 0.999 * settings.near) & (z < 1.001 * protocol.farthest(settings))
         reached: Array = in_front & ~(np.maximum(across, down) > 1.01 * reach)
     return reached

@@ -27,17 +27,9 @@ from langsplat_core.errors import EncoderError, FormatError, InputError, Unknown
 from langsplat_core.io.files import write_json
 from langsplat_core.io.hostile import decode_json, read_text
 from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField
+from langsplat_core.semantics import weights as models
 from langsplat_core.semantics.clip_plain import TEMPERATURE, TOKENIZER, check_whole, plain_text_tower
-from langsplat_core.semantics.weights import (
-    OPEN_CLIP_CONFIG,
-    Weights,
-    asking_errors,
-    family_of,
-    load_config,
-    load_model,
-    open_weights,
-    weights_path,
-)
+from langsplat_core.semantics.weights import Weights
 
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 WORD = re.compile(r"[^\W_]+(?:'[^\W_]+)?")
@@ -227,7 +219,7 @@ class Encoder(PhraseEncoder):
         return unit(inferred(lambda: self._images.encode(inputs)))
 
 
-@asking_errors("the encoder")
+@models.asking_errors("the encoder")
 def inferred(forward: Callable[[], Any]) -> Array:
     """Return the float32 array of a torch tensor that `forward` computes, without gradients."""
     import torch
@@ -262,7 +254,7 @@ class Images:
 
         usual: (2, 3) mean and standard deviation of pixels, unless preprocessor_config.json states others.
         """
-        self._model, self._output = load_model(kind, weights, config), output
+        self._model, self._output = models.load_model(kind, weights, config), output
         self.image_size = int(self._model.config.image_size)
         self.statistics = _pixel_statistics(weights, usual)
 
@@ -273,7 +265,7 @@ class Images:
 def _pixel_statistics(weights: Weights, usual: Array) -> tuple[Array, Array]:
     """Return mean and deviation of the pixels a model was trained with. EncoderError for a broken file."""
     path = weights.folder / "preprocessor_config.json"
-    name = OPEN_CLIP_CONFIG if weights.converted else path.name
+    name = models.OPEN_CLIP_CONFIG if weights.converted else path.name
     try:
         settings = weights.converted.preprocessor if weights.converted else {}
         if not weights.converted and path.is_file():
@@ -308,7 +300,7 @@ class TorchText:
         self.temperature = TEMPERATURE
         self._device, self._output = weights.device, output
         self._length = int(config.max_position_embeddings)
-        self._model: Any = load_model(kind, weights, config)
+        self._model: Any = models.load_model(kind, weights, config)
         self.tokenizer = _tokenizer(weights, int(config.vocab_size))
         self._end = _special_token(weights, self.tokenizer, "eos_token", ("<|endoftext|>", "</s>", "<eos>"))
         self._begin = [_special_token(weights, self.tokenizer, "bos_token", (begin,))] if begin else []
@@ -398,7 +390,7 @@ def _clip_config(weights: Weights, tower: str) -> Any:
     """Return the configuration of one tower, "text" or "vision", with its projection."""
     from transformers import CLIPConfig
 
-    config = load_config(CLIPConfig, weights, "CLIP")
+    config = models.load_config(CLIPConfig, weights, "CLIP")
     tower_config = getattr(config, f"{tower}_config")
     tower_config.projection_dim = config.projection_dim  # some files state it for the pair only
     return tower_config
@@ -424,22 +416,22 @@ def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
     The device is the CPU unless told otherwise, because a phrase takes it a few milliseconds. Raises
     EncoderError where the weights are absent or are those of no family here.
     """
-    weights = open_weights(model, model_path(model, "--encoder"), device)
-    return PhraseEncoder(weights, family_of(weights, FAMILIES, "encoders").text(weights))
+    weights = models.open_weights(model, model_path(model, "--encoder"), device)
+    return PhraseEncoder(weights, models.family_of(weights, FAMILIES, "encoders").text(weights))
 
 
 @optional_imports(EncoderError)
 def load_encoder(model: str, device: str = "auto", batch: int = 32, option: str = "--clip.model") -> Encoder:
     """Load both halves of `model`, as `load_text_encoder` does; batch: images per forward pass."""
-    weights = open_weights(model, model_path(model, option), device)
-    family = family_of(weights, FAMILIES, "encoders")
+    weights = models.open_weights(model, model_path(model, option), device)
+    family = models.family_of(weights, FAMILIES, "encoders")
     return Encoder(weights, family.text(weights), family.images(weights), batch)
 
 
 def model_path(model: str, option: str) -> Path:
     """Return the folder or file of `model`; `option` is what messages name, see `weights.weights_path`."""
     if model != DEMO:
-        return weights_path(model, option)
+        return models.weights_path(model, option)
     folder = Path(str(files("langsplat_assets") / "demo_encoder"))
     if not folder.is_dir():
         raise EncoderError(f"the bundled demo encoder is missing ({folder}); reinstall, or pass {option}")

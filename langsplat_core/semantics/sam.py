@@ -21,6 +21,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
+from langsplat_core.semantics import weights as models
 from langsplat_core.semantics.masks import (
     GraphMasks,
     LevelMasks,
@@ -30,16 +31,7 @@ from langsplat_core.semantics.masks import (
     mask_boxes,
     mask_nms,
 )
-from langsplat_core.semantics.weights import (
-    Weights,
-    asking_errors,
-    family_of,
-    load_config,
-    load_model,
-    open_weights,
-    torch_device,
-    weights_path,
-)
+from langsplat_core.semantics.weights import Weights
 
 PIXEL_MEAN = (123.675, 116.28, 103.53)  # ImageNet's, values 0..255; of every model here
 PIXEL_STD = (58.395, 57.12, 57.375)
@@ -57,7 +49,7 @@ class EncodedImage:
     shape: tuple[int, int]  # (height, width) of the image itself, px
     ordered: bool  # whether the three answers to a point are subpart, part, whole, in this order
 
-    @asking_errors("the segmenter")
+    @models.asking_errors("the segmenter")
     def masks_at(self, points: Array) -> tuple[Any, Any]:
         """(P, 2) float32 x, y, px of the image -> (P, 3) predicted IoU, (P, 3, h, w) small logits."""
         import torch
@@ -123,7 +115,7 @@ class Sam:
     side: int  # of the images it takes, px
     ordered: bool  # SAM: images are padded, and its three masks of a point are subpart, part and whole
 
-    @asking_errors("the segmenter")
+    @models.asking_errors("the segmenter")
     def encode(self, image: Array) -> EncodedImage:
         import torch
 
@@ -138,10 +130,10 @@ def load_sam(weights: Weights) -> Sam:
     """Load a SAM."""
     from transformers import SamConfig, SamModel
 
-    settings = load_config(SamConfig, weights, "SAM")
+    settings = models.load_config(SamConfig, weights, "SAM")
     # Of the norms between attentions in segment_anything, PyTorch's; transformers has 1e-6 there.
     settings.mask_decoder_config.layer_norm_eps = 1e-5
-    model = load_model(SamModel, weights, settings)
+    model = models.load_model(SamModel, weights, settings)
     return Sam("SAM", model, int(model.config.vision_config.image_size), ordered=True)
 
 
@@ -149,7 +141,7 @@ def load_sam2(weights: Weights) -> Sam:
     """Load the image half of a SAM 2: the hub's files state the video model's configuration."""
     from transformers import Sam2Config, Sam2Model
 
-    model = load_model(Sam2Model, weights, load_config(Sam2Config, weights, "SAM 2"))
+    model = models.load_model(Sam2Model, weights, models.load_config(Sam2Config, weights, "SAM 2"))
     return Sam("SAM 2", model, int(model.config.prompt_encoder_config.image_size), ordered=False)
 
 
@@ -163,8 +155,8 @@ HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven time
 
 def load_segmenter(model: str, device: str = "auto") -> Segmenter:
     """Load `model`: a folder in Hugging Face layout, a file of segment_anything or sam2, or a hub id."""
-    weights = open_weights(model, weights_path(model, "--masks.sam"), device)
-    return family_of(weights, FAMILIES, "segmenters")(weights)
+    weights = models.open_weights(model, models.weights_path(model, "--masks.sam"), device)
+    return models.family_of(weights, FAMILIES, "segmenters")(weights)
 
 
 def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
@@ -179,7 +171,7 @@ def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
         return registry.part("mask_sources", config.source)(config, device)
     if not config.sam:
         raise InputError("masks.source sam: name weights too, such as `--masks.sam facebook/sam-vit-huge`")
-    half_on = HALF_ON if torch_device(device).startswith(HALF_ON) else None
+    half_on = HALF_ON if models.torch_device(device).startswith(HALF_ON) else None
     return SamMasks(load_segmenter(config.sam, device), config, half_on)
 
 

@@ -24,35 +24,9 @@ from langsplat_core.interrupts import Terminated, handled
 from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
 from langsplat_core.scene import Camera, Gaussians, near_plane
 from langsplat_core.training import one_torch_thread
-from langsplat_core.training.radiance.differentiable import (
-    DifferentiableRenderer,
-    evaluate_views,
-    rendered_depths,
-    renderer_for,
-)
-from langsplat_core.training.radiance.losses import (
-    fit_exposures,
-    no_exposures,
-    no_transients,
-    patch_means,
-    radiance_loss,
-    with_exposure,
-)
-from langsplat_core.training.radiance.state import (
-    TrainingState,
-    accumulate,
-    adam_step,
-    add_opacity_decay,
-    clean_gradients,
-    densify,
-    fingerprint,
-    initial_gaussians,
-    load_checkpoint,
-    remove_gaussians,
-    reset_opacities,
-    save_checkpoint,
-    start,
-)
+from langsplat_core.training.radiance import differentiable, losses
+from langsplat_core.training.radiance import state as training
+from langsplat_core.training.radiance.state import TrainingState
 from langsplat_core.training.radiance.stereo import DepthMap, find_depths, in_free_space
 
 log = logging.getLogger("langsplat")
@@ -160,7 +134,7 @@ def train_radiance(
     check_settings(config, "--radiance.")
     if not train_indices:
         raise InputError("no photographs to train on; give a capture with at least one training view")
-    made_from = fingerprint(capture, config, train_indices) if checkpoint else ""
+    made_from = training.fingerprint(capture, config, train_indices) if checkpoint else ""
     depths: list[DepthMap] = []
     if len(train_indices) <= config.few_views:
         # After a reset, what stands close before each of few cameras comes back first. A decay of opacities
@@ -168,36 +142,40 @@ def train_radiance(
         config = replace(config, opacity_reset_every=0, opacity_decay=max(config.opacity_decay, 0.01))
         depths = find_depths(capture, train_indices, progress)
         capture = _with_points(capture, depths, config)
-    first = initial_gaussians(capture, train_indices, config.sh_degree, config.max_gaussians, config.seed)
+    first = training.initial_gaussians(
+        capture, train_indices, config.sh_degree, config.max_gaussians, config.seed
+    )
     extent = _extent(capture, first)
-    renderer = renderer_for(config.backend, config.formation(near_plane(first, capture.cameras)))
+    renderer = differentiable.renderer_for(
+        config.backend, config.formation(near_plane(first, capture.cameras))
+    )
     views = _Views(capture, train_indices, renderer.device)
     run = _Run(config, schedule_for(config, extent), views, renderer, extent, depths)
     if checkpoint and checkpoint.exists():
-        state = load_checkpoint(checkpoint, made_from, renderer.device)
+        state = training.load_checkpoint(checkpoint, made_from, renderer.device)
     else:
-        state = start(first, config.seed, renderer.device)
-        state.exposures = no_exposures(len(views), renderer.device)
-        state.transients = no_transients(0 if config.transients == "off" else len(views))
+        state = training.start(first, config.seed, renderer.device)
+        state.exposures = losses.no_exposures(len(views), renderer.device)
+        state.transients = losses.no_transients(0 if config.transients == "off" else len(views))
 
-    losses: list[float] = []  # since the last mean
+    recent: list[float] = []  # since the last mean
     metrics: dict[str, float] = {}
     signals: list[int] = []  # held back while a step runs: half a step is no state to resume from
     with one_torch_thread(), handled(lambda number, _: signals.append(number)):
         try:
             while state.step < config.steps:
-                losses.append(run.step(state))
+                recent.append(run.step(state))
                 # Every photograph has another loss: what is told is the mean over each 200th of the run.
                 if state.step * 200 // config.steps > (state.step - 1) * 200 // config.steps:
-                    metrics, losses = {"loss": float(np.mean(losses))}, []
+                    metrics, recent = {"loss": float(np.mean(recent))}, []
                 progress(STAGE, state.step / config.steps, f"{len(state)} Gaussians", **metrics)
                 if signals:
                     raise Terminated if signal.SIGTERM in signals else KeyboardInterrupt
                 if checkpoint and (state.step % config.checkpoint_every == 0 or state.step == config.steps):
-                    save_checkpoint(checkpoint, state, made_from)
+                    training.save_checkpoint(checkpoint, state, made_from)
         except (KeyboardInterrupt, WorkCancelledError):
             if checkpoint:
-                save_checkpoint(checkpoint, state, made_from)
+                training.save_checkpoint(checkpoint, state, made_from)
             raise
     gaussians = state.gaussians()  # without those that no image can show
     return gaussians.take(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= INRIA.alpha_min))
@@ -242,7 +220,7 @@ class _Run:
     config: RadianceConfig
     schedule: Schedule
     views: _Views
-    renderer: DifferentiableRenderer
+    renderer: differentiable.DifferentiableRenderer
     extent: float  # world units
     depths: Sequence[DepthMap]  # of surfaces that Gaussians do not stay before; none for many views
 
@@ -259,28 +237,30 @@ class _Run:
         rendered = self.renderer.render(state.values, camera, schedule.active_sh_degree(step))
         image = rendered.image
         if exposing and step >= exposing[0]:
-            image = with_exposure(image, state.exposures[index])
+            image = losses.with_exposure(image, state.exposures[index])
         self.observe_transients(state, index, image, target, mask)
         loss = self.emptiness(rendered.alpha, mask)
         mask = self.counted(state, index, None if self.views.cut_out else mask, camera)
         if mask is not None:  # what is masked differs from nothing, and nothing flows back from it
             image = torch.where(mask[..., None], image, image.detach())
             target = torch.where(mask[..., None], target, image.detach())
-        loss = loss + radiance_loss(image, target, config.lambda_dssim)
+        loss = loss + losses.radiance_loss(image, target, config.lambda_dssim)
         loss.backward()
         if config.opacity_decay > 0:
-            add_opacity_decay(state, config.opacity_decay)
-        clean_gradients(state)
+            training.add_opacity_decay(state, config.opacity_decay)
+        training.clean_gradients(state)
         if step < schedule.densify_until:
-            accumulate(state, rendered.means_px_grad(), rendered.visible, (camera.width, camera.height))
-        adam_step(state, schedule.learning_rates(step))
+            training.accumulate(
+                state, rendered.means_px_grad(), rendered.visible, (camera.width, camera.height)
+            )
+        training.adam_step(state, schedule.learning_rates(step))
         if schedule.densifies(step):
-            densify(state, config, self.extent, prune_large=schedule.prunes_large(step))
+            training.densify(state, config, self.extent, prune_large=schedule.prunes_large(step))
         if self.depths and schedule.clears_free_space(step):
             means = state.values["means"].detach().cpu().numpy()
-            remove_gaussians(state, in_free_space(means, self.depths))
+            training.remove_gaussians(state, in_free_space(means, self.depths))
         if schedule.resets_opacity(step):
-            reset_opacities(state)
+            training.reset_opacities(state)
         state.step = step
         return float(loss.detach())
 
@@ -300,11 +280,11 @@ class _Run:
             counted = (slice(None), slice(None)) if mask is None else mask
             # One pixel in seven tells the exposure.
             pairs.append((image[counted].reshape(-1, 3)[::7], target[counted].reshape(-1, 3)[::7]))
-        exposures, gain = fit_exposures(pairs)
+        exposures, gain = losses.fit_exposures(pairs)
         log.debug("exposures of the photographs explain %.2f dB", gain)
         if gain >= 0.35 or self.config.exposure == "on":
             return exposures
-        return no_exposures(len(self.views), exposures.device)
+        return losses.no_exposures(len(self.views), exposures.device)
 
     @property
     def transients_from(self) -> int:
@@ -320,14 +300,14 @@ class _Run:
         """
         judged = state.step == self.transients_from and self.config.transients == "auto"
         if judged and state.transients.explained() < 0.24:
-            state.transients = no_transients(0)
+            state.transients = losses.no_transients(0)
         if len(state.transients.moving):
-            rendered = patch_means(image)
+            rendered = losses.patch_means(image)
             if mask is not None:
-                rendered[patch_means(mask[..., None].float())[..., 0] < 0.5] = np.nan
+                rendered[losses.patch_means(mask[..., None].float())[..., 0] < 0.5] = np.nan
             cameras = self.views.cameras
-            depths = rendered_depths(self.renderer, state.values, cameras[index])
-            state.transients.observe(index, cameras, rendered, patch_means(target), depths)
+            depths = differentiable.rendered_depths(self.renderer, state.values, cameras[index])
+            state.transients.observe(index, cameras, rendered, losses.patch_means(target), depths)
 
     def counted(self, state: TrainingState, index: int, mask: Tensor | None, camera: Camera) -> Tensor | None:
         """(H, W) bool pixels of view `index` that count, of those of its `mask`; None: all of them."""
@@ -421,7 +401,7 @@ def rehearse(
         small = capture.read_at(train_indices, budget.longer_side)
         train = [row for row in range(len(small)) if row not in without]
         gaussians = train_radiance(small, config.spending(budget), train, at, _steps_alone(part))
-        scores = evaluate_views(gaussians, small, without, config.backend, near=config.near)
+        scores = differentiable.evaluate_views(gaussians, small, without, config.backend, near=config.near)
         done.append(float(np.mean([score.psnr_exposed or score.psnr for score in scores])))
         log.debug("%s without %s: %.2f dB", budget_text(budget), without, done[-1])
         return done[-1]
