@@ -14,18 +14,10 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets import photos
 from langsplat_core.datasets import workspace as workspaces
 from langsplat_core.datasets.capture import Capture, capture_of, random_points
 from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
-from langsplat_core.datasets.photos import (
-    EXIF_IFD,
-    develop,
-    developer,
-    mask_beside,
-    optics,
-    over_black,
-    read_photo,
-)
 from langsplat_core.errors import FormatError, InputError, printable_line, report_loss, shortened
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
@@ -50,7 +42,7 @@ def load_photos(
         )
     labels = {path: path.relative_to(folder).as_posix() for path in paths}
     contents = [(labels[path], _content(path)) for path in paths]
-    masked = [(labels[path], _content(mask)) for path in paths if (mask := mask_beside(path))]
+    masked = [(labels[path], _content(mask)) for path in paths if (mask := photos.mask_beside(path))]
     workspace = workspaces.open_workspace(
         work, ["photographs", 4, SIDE, contents, *([masked] if masked else [])]
     )
@@ -81,12 +73,14 @@ def load_photos(
         share = f"{sum(map(len, lost.values()))} of {len(files)} photographs"
         what = "could not be located and are left out"
         report_loss("%s %s (%s); %s", share, what, _listed(lost, 5), matches.advice())
-    photos = [
-        replace(copy, path=path, label=labels[path], upright=True, mask=mask_beside(path))
+    located = [
+        replace(copy, path=path, label=labels[path], upright=True, mask=photos.mask_beside(path))
         for copy in located_photos(model, workspace / "images")
         for path in (files[copy.label],)
     ]
-    return replace(capture_of(develop(photos, config, progress), *good_points(model)), matches=matches)
+    return replace(
+        capture_of(photos.develop(located, config, progress), *good_points(model)), matches=matches
+    )
 
 
 def numbered(paths: Sequence[Path]) -> dict[str, Path]:
@@ -146,22 +140,22 @@ def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> l
     """
     members: dict[tuple[tuple[int, int], str], list[str]] = {}
     broken = []
-    any_masks = any(map(mask_beside, files.values()))
+    any_masks = any(map(photos.mask_beside, files.values()))
     for index, (name, path) in enumerate(files.items()):
         progress("preparing photographs", index / len(files))
         try:
             if not (folder / name).is_file():
-                image = over_black(read_photo(path, upright=True))
+                image = photos.over_black(photos.read_photo(path, upright=True))
                 image.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
                 with atomic_path(folder / name) as temporary:
-                    image.save(temporary, quality=95, exif=optics(path))
+                    image.save(temporary, quality=95, exif=photos.optics(path))
             with opened(folder / name) as copy:
                 exif, size = copy.getexif(), copy.size
-                lens = str(dict(exif) | dict(exif.get_ifd(EXIF_IFD)))
+                lens = str(dict(exif) | dict(exif.get_ifd(photos.EXIF_IFD)))
             if any_masks:
-                mask = mask_beside(path)
-                given = Image.new("RGB", size, "white") if mask is None else read_photo(mask, False)
-                counted = over_black(given).convert("L")
+                mask = photos.mask_beside(path)
+                given = Image.new("RGB", size, "white") if mask is None else photos.read_photo(mask, False)
+                counted = photos.over_black(given).convert("L")
                 _write_mask(folder, name, counted.resize(size, Image.Resampling.NEAREST))
             members.setdefault((size, lens), []).append(name)
         except PictureError as error:
@@ -272,7 +266,7 @@ def _write_images(
     folder: Path, names: Sequence[str], capture: Capture, views: Sequence[int], progress: Progress
 ) -> tuple[Camera, ...]:
     """Write images to seek features in and return their cameras: from the files, larger than for training."""
-    enlarge = developer(SIDE, capture.cut_out)
+    enlarge = photos.developer(SIDE, capture.cut_out)
     cameras = []
     for count, (name, index) in enumerate(zip(names, views, strict=True)):
         progress("preparing photographs", count / len(views))

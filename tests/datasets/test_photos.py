@@ -120,7 +120,7 @@ def test_photographs_are_counted_where_they_lie(tmp_path: Path) -> None:
 def test_photographs_larger_than_other_images_may_be_are_halved(name, tmp_path, monkeypatch):
     shade = np.linspace(0, 255, 160).astype(np.uint8)
     Image.fromarray(np.broadcast_to(shade, (120, 160)).copy()).save(tmp_path / name)
-    monkeypatch.setattr("langsplat_core.datasets.photos.MOST_PIXELS", 10_000)
+    monkeypatch.setattr("langsplat_core.io.hostile.MOST_PIXELS", 10_000)
     assert picture_size(tmp_path / name) == (160, 120)
     assert read_photo(tmp_path / name, upright=True).size == (80, 60)
 

@@ -18,6 +18,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel
 from langsplat_core.raster.cpu import projection as cp
+from langsplat_core.raster.cpu import tiles as tiling
 from langsplat_core.raster.cpu.lanes import (
     lanes,
     largest,
@@ -28,24 +29,7 @@ from langsplat_core.raster.cpu.lanes import (
     store_totals,
     where_greater,
 )
-from langsplat_core.raster.cpu.tiles import (
-    AHEAD,
-    CHECK_EVERY,
-    PIXELS,
-    TILE,
-    Tiles,
-    begin_rows,
-    blend_row,
-    correlate,
-    enter,
-    grown,
-    load_tile,
-    padded_inside,
-    rows_to_blend,
-    running_rows,
-    start_tile,
-    tile_at,
-)
+from langsplat_core.raster.cpu.tiles import PIXELS, TILE, Tiles
 
 # Columns of the partial sums (two are unused); the gradient by the values follows them.
 Q, QW, QV, QWW, QWV, QVV = range(6)
@@ -68,18 +52,18 @@ def _record(tile: int, tiles: Tiles, state: Array, spans: Array, tape: Array) ->
     used = 0
     top, bottom = 0, TILE
     for s in range(first, last):
-        if (s - first) % CHECK_EVERY == CHECK_EVERY - 1:
-            top, bottom = running_rows(state, top, bottom)
+        if (s - first) % tiling.CHECK_EVERY == tiling.CHECK_EVERY - 1:
+            top, bottom = tiling.running_rows(state, top, bottom)
             if top >= bottom:
                 return tape, used, s
         if used + TILE * _ENTRY > tape.shape[0]:
-            tape = grown(tape, used)
-        low, high = rows_to_blend(tiles.rows[s], top, bottom)
-        g = enter(tiles, s, min(s + AHEAD, last - 1))
-        step, peak, w, v, w_step, v_step = begin_rows(g, x, y + low)
+            tape = tiling.grown(tape, used)
+        low, high = tiling.rows_to_blend(tiles.rows[s], top, bottom)
+        g = tiling.enter(tiles, s, min(s + tiling.AHEAD, last - 1))
+        step, peak, w, v, w_step, v_step = tiling.begin_rows(g, x, y + low)
         start, most = used, lanes(np.float32(0))
         for row in range(low, high):
-            added, before = blend_row(state, row * TILE, step + w, peak - v * v, tiles.cutoffs)
+            added, before = tiling.blend_row(state, row * TILE, step + w, peak - v * v, tiles.cutoffs)
             w, v = w + w_step, v + v_step
             store(tape, used, added)
             store(tape, used + TILE, before)
@@ -105,16 +89,16 @@ def _backward_tile(
     """One tile; returns the tape, for the next tile to write over."""
     image_grad, alpha_grad = grads
     channels, columns = values.shape[1], partial.shape[1]
-    lines = padded_inside(channels)
+    lines = tiling.padded_inside(channels)
     left, top = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
-    state = start_tile(tile, tiles)
+    state = tiling.start_tile(tile, tiles)
     spans = np.zeros((last - first, 2), np.int64)
     tape, used, end = _record(tile, tiles, state, spans, tape)
     reached[end:last] = False
     planes, plane = np.empty(PIXELS * lines, np.float32), np.empty(PIXELS, np.float32)
-    load_tile(planes, image_grad, tile, tiles)
-    load_tile(plane, alpha_grad, tile, tiles)
+    tiling.load_tile(planes, image_grad, tile, tiles)
+    tiling.load_tile(plane, alpha_grad, tile, tiles)
     weights = np.empty(PIXELS, np.float32)
     behind = state
     behind[:] = 0
@@ -124,9 +108,9 @@ def _backward_tile(
         if low >= high:
             continue
         used -= (high - low) * _ENTRY
-        g = enter(tiles, s, max(s - AHEAD, first))
+        g = tiling.enter(tiles, s, max(s - tiling.AHEAD, first))
         x = values[tiles.ranks[s]]
-        step, _, offset, v, w_step, v_step = begin_rows(g, left, top + low)
+        step, _, offset, v, w_step, v_step = tiling.begin_rows(g, left, top + low)
         q0 = qw = qv = qww = qwv = qvv = none = lanes(np.float32(0))
         for row in range(low, high):
             w = step + offset
@@ -147,7 +131,7 @@ def _backward_tile(
             offset, v = offset + w_step, v + v_step
         store_totals(partial, s * columns, q0, qw, qv, qww)
         store_totals(partial, s * columns + QWV, qwv, qvv, none, none)
-        correlate(planes, lines, weights, low, high, partial, s, MOMENTS)
+        tiling.correlate(planes, lines, weights, low, high, partial, s, MOMENTS)
     return tape
 
 
@@ -168,7 +152,7 @@ def backward(
     """
     tape = np.empty(_TAPE, np.float32)
     for i in range(first, last):
-        tape = _backward_tile(tile_at(i, tiles), tiles, values, grads, partial, reached, tape)
+        tape = _backward_tile(tiling.tile_at(i, tiles), tiles, values, grads, partial, reached, tape)
 
 
 # Gradients of the CPU backend, second half: from a footprint back to the Gaussian's parameters.
@@ -196,14 +180,14 @@ class Sums(NamedTuple):
 @helper
 def _fetch(i: int, last: int, tiles: Tiles, sums: Sums) -> None:
     """Ask for the memory of rows after `i`, in steps: each needs what the one before brought."""
-    rank = sums.rank_of[min(i + 3 * AHEAD, last - 1)]
+    rank = sums.rank_of[min(i + 3 * tiling.AHEAD, last - 1)]
     if rank >= 0:
         prefetch(tiles.firsts, np.int64(rank))
         prefetch(tiles.geometry, np.int64(rank) * cp.COLUMNS)
-    rank = sums.rank_of[min(i + 2 * AHEAD, last - 1)]
+    rank = sums.rank_of[min(i + 2 * tiling.AHEAD, last - 1)]
     if rank >= 0:
         prefetch(tiles.slots, tiles.firsts[rank])
-    rank = sums.rank_of[min(i + AHEAD, last - 1)]
+    rank = sums.rank_of[min(i + tiling.AHEAD, last - 1)]
     if rank >= 0:
         for n in range(tiles.firsts[rank], min(tiles.firsts[rank + 1], tiles.firsts[rank] + 4)):
             if sums.reached[tiles.slots[n]]:

@@ -19,6 +19,7 @@ from langsplat_core.compiled import Workers, helper, kernel, plain, shared_worke
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import InputError
 from langsplat_core.raster.cpu import backward, projection
+from langsplat_core.raster.cpu import tiles as tiling
 from langsplat_core.raster.cpu.backward import GaussianGradients
 from langsplat_core.raster.cpu.lanes import (
     Lanes,
@@ -29,24 +30,7 @@ from langsplat_core.raster.cpu.lanes import (
     where_at_least,
     where_greater,
 )
-from langsplat_core.raster.cpu.tiles import (
-    AHEAD,
-    PIXELS,
-    TILE,
-    Tiles,
-    add_weighted,
-    bin_tiles,
-    correlate,
-    depth_order,
-    load_tile,
-    nothing_to_close,
-    nothing_to_open,
-    padded,
-    padded_inside,
-    tile_at,
-    walk,
-    write_tile,
-)
+from langsplat_core.raster.cpu.tiles import PIXELS, TILE, Tiles
 from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, LiftingView, mean_depth
 from langsplat_core.scene import Camera, Gaussians
 
@@ -63,22 +47,22 @@ def _fetch_values(work: Any, s: int, later: int) -> Array:
 @helper
 def _add_values(work: Any, x: Array, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
     channels = x.shape[0]
-    add_weighted(work[2], row * padded_inside(channels) * TILE, channels, weight, x)
+    tiling.add_weighted(work[2], row * tiling.padded_inside(channels) * TILE, channels, weight, x)
 
 
 @kernel
 def splat_tiles(first: int, last: int, tiles: Tiles, values: Array, image: Array, alpha: Array) -> None:
     """(M, C) values in depth order -> fills (H, W, C) image and (H, W, 1) alpha, all float32."""
-    sums = np.empty(PIXELS * padded_inside(image.shape[2]), np.float32)
+    sums = np.empty(PIXELS * tiling.padded_inside(image.shape[2]), np.float32)
     for i in range(first, last):
-        tile = tile_at(i, tiles)
+        tile = tiling.tile_at(i, tiles)
         sums[:] = 0
         work = (tiles.ranks, values, sums)
-        transmittance, _ = walk(tile, tiles, work, _fetch_values, _add_values, nothing_to_close)
+        transmittance, _ = tiling.walk(tile, tiles, work, _fetch_values, _add_values, tiling.nothing_to_close)
         for n in range(PIXELS):
             transmittance[n] = np.float32(1) - abs(transmittance[n])
-        write_tile(transmittance, alpha, tile, tiles)
-        write_tile(sums, image, tile, tiles)
+        tiling.write_tile(transmittance, alpha, tile, tiles)
+        tiling.write_tile(sums, image, tile, tiles)
 
 
 @helper
@@ -89,7 +73,7 @@ def _store_weight(work: Any, mine: Any, s: int, row: int, low: int, weight: Lane
 @helper
 def _correlate(work: Any, mine: Any, s: int, low: int, high: int) -> None:
     weights, planes, partial, start = work
-    correlate(planes, partial.shape[1], weights, low, high, partial, s - start, 0)
+    tiling.correlate(planes, partial.shape[1], weights, low, high, partial, s - start, 0)
 
 
 @kernel
@@ -97,9 +81,11 @@ def gather_tiles(first: int, last: int, tiles: Tiles, image: Array, partial: Arr
     """(H, W, C) float32 image -> fills (I, padded(C)) partial sums of ``W^T y``, a row per intersection."""
     planes, weights = np.empty(PIXELS * partial.shape[1], np.float32), np.empty(PIXELS, np.float32)
     for i in range(first, last):
-        tile = tile_at(i, tiles)
-        load_tile(planes, image, tile, tiles)
-        _, end = walk(tile, tiles, (weights, planes, partial, 0), nothing_to_open, _store_weight, _correlate)
+        tile = tiling.tile_at(i, tiles)
+        tiling.load_tile(planes, image, tile, tiles)
+        _, end = tiling.walk(
+            tile, tiles, (weights, planes, partial, 0), tiling.nothing_to_open, _store_weight, _correlate
+        )
         partial[end : tiles.starts[tile + 1]] = 0
 
 
@@ -111,7 +97,7 @@ def sum_partials(first: int, last: int, tiles: Tiles, order: Array, partial: Arr
     for rank in range(first, last):
         sums[:] = 0
         for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
-            prefetch(partial, np.int64(tiles.slots[min(n + 2 * AHEAD, end)]) * partial.shape[1])
+            prefetch(partial, np.int64(tiles.slots[min(n + 2 * tiling.AHEAD, end)]) * partial.shape[1])
             for channel in range(sums.shape[0]):
                 sums[channel] += partial[tiles.slots[n], channel]
         for channel in range(out.shape[1]):
@@ -136,10 +122,12 @@ def median_tiles(first: int, last: int, tiles: Tiles, depths: Array, out: Array)
     """(M,) depths in depth order -> (H, W, 1) depth of the Gaussian that takes T to 0.5 or below, else 0."""
     found = np.empty(PIXELS, np.float32)
     for i in range(first, last):
-        tile = tile_at(i, tiles)
+        tile = tiling.tile_at(i, tiles)
         found[:] = 0
-        walk(tile, tiles, (tiles.ranks, depths, found), _fetch_depth, _note_half, nothing_to_close)
-        write_tile(found, out, tile, tiles)
+        tiling.walk(
+            tile, tiles, (tiles.ranks, depths, found), _fetch_depth, _note_half, tiling.nothing_to_close
+        )
+        tiling.write_tile(found, out, tile, tiles)
 
 
 # ``W^T onehot(labels)`` in one walk: how much of every Gaussian lies in every region of label maps.
@@ -206,14 +194,14 @@ def _gather_regions(
     """(L, H, W) int32 maps -> tile t has lines[t] `sums` for each intersection, from offsets[t] on."""
     planes, weights = np.empty(PIXELS * lines.max(), np.float32), np.empty(PIXELS, np.float32)
     for i in range(first, last):
-        tile = tile_at(i, tiles)
+        tile = tiling.tile_at(i, tiles)
         start, stop = tiles.starts[tile], tiles.starts[tile + 1]
         if lines[tile] == 0 or stop == start:
             continue
         partial = sums[offsets[tile] : offsets[tile + 1]].reshape((stop - start, lines[tile]))
         _fill_planes(planes, maps, tile, tiles, labels[tile], lines[tile])
         work = (weights, planes, partial, start)
-        _, end = walk(tile, tiles, work, nothing_to_open, _store_weight, _correlate)
+        _, end = tiling.walk(tile, tiles, work, tiling.nothing_to_open, _store_weight, _correlate)
         partial[end - start :] = 0
 
 
@@ -264,7 +252,14 @@ def _add_to_plane(work: Any, plane: Any, s: int, row: int, low: int, weight: Lan
 def _paint_sets(first: int, last: int, tiles: Tiles, places: Array, planes: Array) -> None:
     """(I,) plane of each intersection -> its weights are added to (P * 256,) `planes`."""
     for i in range(first, last):
-        walk(tile_at(i, tiles), tiles, (places, planes), _fetch_place, _add_to_plane, nothing_to_close)
+        tiling.walk(
+            tiling.tile_at(i, tiles),
+            tiles,
+            (places, planes),
+            _fetch_place,
+            _add_to_plane,
+            tiling.nothing_to_close,
+        )
 
 
 # Views.
@@ -323,10 +318,10 @@ class CpuView(LiftingView):
         workers.run(projection.project, n, self._rows, self._kernel_camera, found)
         drawn = np.flatnonzero(found.status == projection.DRAWN).astype(np.int32)
         depths = found.depths[drawn]
-        order = depth_order(depths)
+        order = tiling.depth_order(depths)
         self.order, self._depths = drawn[order], depths[order]  # (M,) int32 rows, (M,) float64
         size = camera.width, camera.height
-        self.tiles = bin_tiles(found.geometry, self.order, size, settings, workers, self._empty)
+        self.tiles = tiling.bin_tiles(found.geometry, self.order, size, settings, workers, self._empty)
         self.dropped = int(np.count_nonzero(found.status == projection.INVALID))
 
     @property
@@ -368,7 +363,7 @@ class CpuView(LiftingView):
         values = np.zeros((self.count, channels), np.float32)
         for start in range(0, channels, CHANNELS_AT_ONCE):
             part = plain(image[..., start : start + CHANNELS_AT_ONCE])
-            partial = np.empty((len(self.tiles.ranks), padded(part.shape[2])), np.float32)
+            partial = np.empty((len(self.tiles.ranks), tiling.padded(part.shape[2])), np.float32)
             out = np.zeros((self.count, part.shape[2]), np.float32)
             self._over_tiles(gather_tiles, part, partial)
             self.workers.run(sum_partials, len(self.order), self.tiles, self.order, partial, out)
@@ -411,7 +406,7 @@ class CpuView(LiftingView):
             alpha_grad = np.zeros((height, width), np.float32)
         check_array("alpha_grad", alpha_grad, (height, width))
         grads = (plain(image_grad), plain(alpha_grad)[..., None])
-        met, columns = len(self.tiles.ranks), backward.MOMENTS + padded(channels)
+        met, columns = len(self.tiles.ranks), backward.MOMENTS + tiling.padded(channels)
         partial, reached = self._empty((met, columns), np.float32), np.empty(met, bool)
         self._over_tiles(backward.backward, plain(values[self.order]), grads, partial, reached)
         shapes = (3,), (3,), (4,), (), (channels,), (2,)
