@@ -282,50 +282,38 @@ class ClipConfig:
     device: Literal["auto", "cpu", "cuda"] = "auto"  # where it runs
 
 
-_KIND = tyro.conf.arg(
-    metavar="{codebook,autoencoder,linear}",
-    help="how a Gaussian keeps a CLIP vector, with settings of its own",
-)
-LatentDim = Annotated[int, Range(1, 4_096)]
+CodecKind = Literal["codebook", "autoencoder", "linear"]
 
 
 @dataclass(frozen=True)
-class CodebookConfig:
-    """A Gaussian keeps the number of a codeword."""
+class CodecConfig:
+    """How a Gaussian keeps a CLIP vector; each kind has settings of its own."""
 
-    kind: Annotated[Literal["codebook"], _KIND] = "codebook"
-    size: Annotated[int, Range(0, 65_535)] = 0  # codewords; 0: as many as `max_relevancy_error` asks for
-    # mean over the scene's vectors and a few hundred phrases
+    # the number of a codeword, latents of the paper's autoencoder (section 3.2), or coordinates in a linear
+    # basis of the scene's vectors
+    kind: CodecKind = "codebook"
+    # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
+    size: Annotated[int, Range(0, 65_535)] = 0
+    # mean over the scene's vectors and a few hundred phrases, of a codebook
     max_relevancy_error: Annotated[Share, tyro.conf.arg(aliases=["--max-relevancy-error"])] = 0.006
+    # numbers per Gaussian and level, of an autoencoder and a linear basis
+    latent_dim: Annotated[int, Range(1, 4_096)] = 3
+    steps: Count = 4_000  # of an autoencoder's training
+    batch: SeveralCount = 256  # vectors per step of that
+    lr: Rate = 3e-3  # of that; 7e-4 in the public code: with as many steps a quarter more error
     seed: Seed = 0  # of random numbers
 
-
-@dataclass(frozen=True)
-class AutoencoderConfig:
-    """A Gaussian keeps latents of the paper's autoencoder (section 3.2)."""
-
-    kind: Annotated[Literal["autoencoder"], _KIND] = "autoencoder"
-    latent_dim: LatentDim = 3  # numbers per Gaussian and level
-    steps: Count = 4_000  # of training
-    batch: SeveralCount = 256  # vectors per step
-    lr: Rate = 3e-3  # 7e-4 in the public code: with as many steps a quarter more error
-    seed: Seed = 0  # of random numbers
+    @property
+    def own(self) -> dict[str, Any]:
+        """The settings that its kind has, see `CODEC_SETTINGS`."""
+        return {name: getattr(self, name) for name in ("kind", "seed", *CODEC_SETTINGS[self.kind])}
 
 
-@dataclass(frozen=True)
-class LinearConfig:
-    """A Gaussian keeps coordinates in a linear basis of the scene's vectors."""
-
-    kind: Annotated[Literal["linear"], _KIND] = "linear"
-    latent_dim: LatentDim = 3  # numbers per Gaussian and level
-    seed: Seed = 0  # of the vectors that are sampled
-
-
-# The kinds of codecs. On the command line `--codec.kind` chooses one, whose settings are then options.
-CodecConfig = tyro.conf.AvoidSubcommands[CodebookConfig | AutoencoderConfig | LinearConfig]
-CODEC_CONFIGS: Mapping[str, type[CodebookConfig | AutoencoderConfig | LinearConfig]] = MappingProxyType(
-    {settings.kind: settings for settings in (CodebookConfig, AutoencoderConfig, LinearConfig)}
-)
+CODEC_SETTINGS: Mapping[CodecKind, tuple[str, ...]] = MappingProxyType({
+    "codebook": ("size", "max_relevancy_error"),
+    "autoencoder": ("latent_dim", "steps", "batch", "lr"),
+    "linear": ("latent_dim",),
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -351,7 +339,7 @@ class TrainConfig:
     radiance: RadianceConfig = field(default_factory=RadianceConfig)
     masks: MaskConfig = field(default_factory=MaskConfig)
     clip: ClipConfig = field(default_factory=ClipConfig)
-    codec: CodecConfig = field(default_factory=CodebookConfig)
+    codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     phrases: tuple[str, ...] = ()  # stored encoded in the scene: they can be asked without any encoder
 
@@ -364,7 +352,7 @@ PAPER = TrainConfig(
         coarse_fraction=0.0, few_views=0, rehearsed_views=0, exposure="off", transients="off", near=INRIA.near
     ),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
-    codec=AutoencoderConfig(steps=10_000, batch=64, lr=7e-4),
+    codec=CodecConfig("autoencoder", steps=10_000, batch=64, lr=7e-4),
     lift=LiftConfig(mode="gradient", start="zeros-as-published"),
 )
 TrainProfile = Literal["default", "paper"]

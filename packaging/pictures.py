@@ -13,7 +13,7 @@ from imgui_bundle.immapp import testing  # isort: skip
 
 import numpy as np
 
-from langsplat_core.config import AutoencoderConfig
+from langsplat_core.config import CodecConfig
 from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.training.language.codec_fit import train_autoencoder
@@ -104,7 +104,7 @@ def _beside(ctx: Any, window: Window) -> None:
     assert scene.language is not None
     field = scene.language
     codewords = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None])
-    codec = train_autoencoder(codewords, AutoencoderConfig(steps=2_000))
+    codec = train_autoencoder(codewords, CodecConfig("autoencoder", steps=2_000))
     latents = np.where(field.known[..., None], codec.encode(codewords)[field.latents[..., 0]], 0)
     language = replace(field, latents=latents, codec=codec, tree=None)
     save_scene(path, replace(scene, language=language, path=path))

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from langsplat_core import registry
-from langsplat_core.cli.arguments import Runnable, with_codec
+from langsplat_core.cli.arguments import Runnable, check_codec
 from langsplat_core.cli.run import main, parsed
 from langsplat_core.errors import InputError
 
@@ -40,7 +40,8 @@ def parse(args: list[str]) -> Runnable:
         args = with_file(args)
         commands = {name: train_command(args)}
     elif name in command_names():
-        commands = {name: with_codec(load_command(name), args)}
+        check_codec(args)
+        commands = {name: load_command(name)}
     elif name in groups:
         commands = {name: _group(name, args[1:2])}
     else:  # all of them, but for those of extensions that are broken

@@ -1,15 +1,15 @@
 """Arguments that several commands have, with their types, help and checks."""
 
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, fields, make_dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Literal, Protocol
 
 import tyro
 
 from langsplat_core import config
-from langsplat_core.errors import InputError, printable_line
+from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_file, check_output_folder
 
 Level = Literal["subpart", "part", "whole"]
@@ -81,24 +81,11 @@ def named(args: Sequence[str], option: str) -> str:
     return values[-1] if values else ""
 
 
-def codec_settings(args: Sequence[str], default: config.CodecConfig) -> config.CodecConfig:
-    """Return the default settings of the codec that `args` choose by `--codec.kind`.
-
-    That is `default` itself where it is of that kind or none is chosen. InputError for an unknown kind.
-    """
-    kind = named(args, "--codec.kind") or default.kind
-    if kind not in config.CODEC_CONFIGS:
-        said = printable_line(str(kind), 60)
-        raise InputError(f"--codec.kind {said}: choose one of {', '.join(config.CODEC_CONFIGS)}")
-    return default if kind == default.kind else config.CODEC_CONFIGS[kind]()
-
-
-def with_codec(command: type[Runnable], args: Sequence[str]) -> type[Runnable]:
-    """`command` with the settings of the codec that `args` choose, where it has a field `codec`."""
-    entry: Any = next((entry for entry in fields(command) if entry.name == "codec"), None)  # type: ignore[arg-type]
-    if entry is None:
-        return command
-    default = entry.default_factory() if entry.default is MISSING else entry.default
-    chosen = ("codec", config.CodecConfig, codec_settings(args, default))
-    names = {"__doc__": command.__doc__}
-    return make_dataclass(command.__name__, [chosen], bases=(command,), frozen=True, namespace=names)
+def check_codec(args: Sequence[str], default: config.CodecKind = "codebook") -> None:
+    """Raise InputError for a codec's setting among `args` that the kind which they choose has not."""
+    kind = named(args, "--codec.kind") or default
+    own = config.CODEC_SETTINGS.get(kind, ())  # type: ignore[call-overload]  # whatever was typed
+    typed = {word.partition("=")[0].replace("_", "-").replace("--max-", "--codec.max-") for word in args}
+    for name in sorted(set().union(*config.CODEC_SETTINGS.values()) - {*own} if own else ()):
+        if (option := f"--codec.{name.replace('_', '-')}") in typed:
+            raise InputError(f"{option}: is no setting of a codec of kind {kind}; leave it out")

@@ -10,7 +10,7 @@ import tyro
 
 from langsplat_core import registry
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, Level, WrittenScene
-from langsplat_core.config import CodebookConfig, CodecConfig, Positive, Range
+from langsplat_core.config import CodecConfig, Positive, Range
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_file, check_output_folder
 from langsplat_core.io.ply import write_metres
@@ -105,7 +105,7 @@ class Convert:
     """Levels of the checkpoints with features, in their order, where files and folders do not tell."""
     phrases: tuple[str, ...] = ()
     """Stored encoded in a scene made of checkpoints: they can be asked without any encoder."""
-    codec: CodecConfig = CodebookConfig()  # noqa: RUF009  (frozen)
+    codec: CodecConfig = CodecConfig()  # noqa: RUF009  (frozen)
     """How the Gaussians of checkpoints with whole vectors keep them."""
 
     @property
@@ -142,7 +142,7 @@ class Convert:
                 scene, lines = importer.read(request, progress)
             print(*lines, sep="\n")
             return scene
-        if self.levels or self.phrases or self.codec != CodebookConfig():
+        if self.levels or self.phrases or self.codec != CodecConfig():
             raise InputError(
                 "--levels, --phrases and --codec are for checkpoints; leave them out for a scene"
             )

@@ -5,13 +5,13 @@ import io
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from langsplat_core.cli.arguments import OutFile, OutFolder, codec_settings, named
+from langsplat_core.cli.arguments import OutFile, OutFolder, check_codec, named
 from langsplat_core.cli.run import one_line
 from langsplat_core.config import PAPER, TrainConfig, TrainPreset, TrainProfile, check_settings, with_preset
 from langsplat_core.errors import InputError, printable_line
@@ -93,7 +93,7 @@ def train_command(args: Sequence[str]) -> type[Train]:
     """Return `Train` with the settings of the profile and preset that `args` name as defaults."""
     profile, preset = named(args, "--profile"), named(args, "--preset")
     config = PAPER if profile == "paper" else TrainConfig()
-    config = replace(config, codec=codec_settings(args, config.codec))
+    check_codec(args, config.codec.kind)
     for known in get_args(TrainPreset):
         if known == preset:
             config = with_preset(config, known)

@@ -27,7 +27,7 @@ from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.surface import SMALLEST
-from langsplat_core.semantics.features import FeatureStore, ImageFeatures, StoredFeatures
+from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from langsplat_core.training.language.lift import SHOWN, VOTE
 from langsplat_core.training.language.merge_tree import SOLID
 
@@ -160,7 +160,7 @@ def _nearest(seen: ImageFeatures, shown: Array) -> tuple[int, float]:
 # What training kept beside a scene.
 
 
-def kept_features(path: Path, scene: Scene, work: Path | None = None) -> StoredFeatures:
+def kept_features(path: Path, scene: Scene, work: Path | None = None) -> Sequence[ImageFeatures]:
     """Return masks and vectors of a scene's photographs, from `work` or beside it; InputError without."""
     store = FeatureStore((work or work_folder(path)) / "features")
     missing = [camera.name for camera in scene.cameras if not exists(store.path(camera.name))]
@@ -170,7 +170,7 @@ def kept_features(path: Path, scene: Scene, work: Path | None = None) -> StoredF
             f"{store.folder}: {what}; evidence needs the masks that `langsplat train` keeps beside a scene, "
             "which bundled and imported ones come without: train it, or name its folder with --work"
         )
-    return StoredFeatures(store, [camera.name for camera in scene.cameras])
+    return store.of([camera.name for camera in scene.cameras])
 
 
 def is_kept(path: Path, scene: Scene) -> bool:

@@ -48,7 +48,7 @@ from langsplat_core.semantics.encoders import Encoder, PhraseEncoder
 from langsplat_core.semantics.features import (
     FeatureStore,
     ImageFeatures,
-    StoredFeatures,
+    OnDemand,
     embed_regions,
     fingerprint,
     masked_crop,
@@ -65,18 +65,9 @@ LATENT_LIFTS = frozenset({"one-pass", "gradient"})  # modes that average latents
 MOST_CONFIDENCE = 65_504.0  # pixels; the largest number that float16 holds
 
 
-class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
-    """Cameras with what each saw, read when a view is looked at: label maps are more than memory holds."""
-
-    def __init__(self, cameras: tuple[Camera, ...], features: Sequence[ImageFeatures]) -> None:
-        self.cameras, self.features = cameras, features
-
-    def __len__(self) -> int:
-        return len(self.cameras)
-
-    def __getitem__(self, index: Any) -> Any:
-        """Return view `index`, a number; slices are not supported."""
-        return self.cameras[index], self.features[index]
+def views_of(cameras: Sequence[Camera], features: Sequence[ImageFeatures]) -> Views:
+    """Return cameras with what each saw, read when a view is looked at."""
+    return OnDemand(range(len(cameras)), lambda index: (cameras[index], features[index]))
 
 
 def check_lift(config: TrainConfig) -> None:
@@ -234,7 +225,7 @@ class _Stages:
             return {"kind": np.array(codec.kind), "report": figures, **codec.tensors()}
 
         fitted_to = self.lift.mode if self.by_weights else "masks"
-        made = dict(self.kept(self.path("codec", 2, fitted_to, self.config.codec), make))
+        made = dict(self.kept(self.path("codec", 2, fitted_to, self.config.codec.own), make))
         kind, figures = str(made.pop("kind")), made.pop("report").tolist()
         return codec_from_tensors(kind, made), codec_fit.CodecReport(*figures)
 
@@ -249,7 +240,7 @@ class _Stages:
 
     def latents(self, codec: Codec) -> Latents:
         """Return the latents of every Gaussian at every level, and the confidence in them."""
-        done = self.path("latents", 2, self.lift, self.config.codec)
+        done = self.path("latents", 2, self.lift, self.config.codec.own)
         blocks = done.with_suffix("")
         if self.by_weights and not done.exists():
             self.lift_blocks(codec, blocks)
@@ -304,7 +295,7 @@ class _Stages:
             tree = build_tree(*parts, np.stack(things))
             return vars(replace(tree, votes=lift.count_votes(tree, mask_weights, counts)))
 
-        return Tree(**self.kept(self.path("nodes", 4, self.lift, self.config.codec), make))
+        return Tree(**self.kept(self.path("nodes", 4, self.lift, self.config.codec.own), make))
 
 
 # Masks that all photographs agree on, in place of those that each photograph was given.
@@ -335,7 +326,7 @@ def agreed_features(
     work: Path,
     progress: Progress,
     processes: ProcessGroup | None = None,
-) -> StoredFeatures:
+) -> OnDemand[ImageFeatures]:
     """Describe masks by the consensus of all views' masks, whose vectors are not read.
 
     photographs: (H, W, 3) uint8 of each view, and its (H, W) bool mask of pixels that count (None: all do).
@@ -373,7 +364,7 @@ def agreed_features(
             maps = nested_maps(open_array(drawn[index]), cuts, LEAST)
             vectors = embed_regions(photographs[index][0], maps, encoder)
             store.save(name, ImageFeatures(maps, vectors), made_by)
-    return StoredFeatures(store, [camera.name for camera, _ in views])
+    return store.of([camera.name for camera, _ in views])
 
 
 def _alone(

@@ -28,7 +28,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import place_scene
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, Encoder, load_encoder
-from langsplat_core.semantics.features import FeatureStore, StoredFeatures, describe_capture
+from langsplat_core.semantics.features import FeatureStore, ImageFeatures, OnDemand, describe_capture
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.training.radiance import trainer
@@ -110,8 +110,9 @@ def _train(
         log.warning("%s", DEMO_ELSEWHERE)
 
     with run.timed("masks and vectors"):
-        views = _described_views(run, capture, train, mask_source, encoder)
-        language_field.check_masks(views.features)  # before the Gaussians, which may cost hours
+        cameras = tuple(capture.cameras[i] for i in train)
+        features = _described(run, capture, train, mask_source, encoder)
+        language_field.check_masks(features)  # before the Gaussians, which may cost hours
 
     with run.timed("radiance"):
         if given is None:
@@ -122,10 +123,11 @@ def _train(
     if not mask_source.agrees:
         with run.timed("masks that agree"):
             photographs = [(capture.images[i], capture.mask(i)) for i in train]
+            views = language_field.views_of(cameras, features)
             features = language_field.agreed_features(gaussians, views, photographs, encoder, config, *shared)
-            views = language_field.StoredViews(views.cameras, features)
 
     with run.timed("language field"):
+        views = language_field.views_of(cameras, features)
         language, codec_report = language_field.language_field(gaussians, views, encoder, config, *shared)
         if not capture.drawn:
             language = replace(language, calibration=None)  # which holds in drawn rooms alone
@@ -134,27 +136,27 @@ def _train(
         with run.timed("saving and held-out views"):
             said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
             metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
-            scene = Scene(gaussians, language, views.cameras, metres_per_unit=metres, origin=capture.origin)
+            scene = Scene(gaussians, language, cameras, metres_per_unit=metres, origin=capture.origin)
             save_scene(run.out, scene)
             small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
             near = config.radiance.near or scene.near  # as whoever opens the scene has it
             scores = evaluate_views(gaussians, capture, held_out, small=small, near=near) if held_out else []
         report = reports.TrainReport(
-            views=len(views),
+            views=len(cameras),
             held_out=len(scores),
             gaussians=len(gaussians),
             psnr=_mean(score.psnr for score in scores),
             psnr_small=_mean(score.psnr_small for score in scores),
             masks=mask_source.name,
             encoder=encoder.id,
-            mask_count=sum(len(item.vectors) for item in views.features),
+            mask_count=sum(len(item.vectors) for item in features),
             codec=language.codec.kind,
             codec_size=language.codec.size,
             codec_cosine=codec_report.cosine,
             relevancy_error=codec_report.error_mean,
             relevancy_error_p99=codec_report.error_p99,
             observed=float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
-            warnings=reports.quality_warnings(scores, views.cameras),
+            warnings=reports.quality_warnings(scores, cameras),
             seconds=run.seconds,
             dataset=str(run.dataset.resolve()),
             held_out_views=tuple(scores),
@@ -183,9 +185,9 @@ def _photographs(run: _Run) -> Capture:
     return capture
 
 
-def _described_views(
+def _described(
     run: _Run, capture: Capture, train: list[int], source: MaskSource, encoder: Encoder
-) -> language_field.StoredViews:
+) -> OnDemand[ImageFeatures]:
     """Find the masks of the photographs at `train`, and their vectors where masks agree between photographs.
 
     Others are described once they agree. Kept by mask settings, encoder and image.
@@ -197,8 +199,7 @@ def _described_views(
     seen_by = encoder if source.agrees else None
     describe_capture(images, names, source, seen_by, store, run.progress, counted)
     run.processes.barrier()
-    cameras = tuple(capture.cameras[i] for i in train)
-    return language_field.StoredViews(cameras, StoredFeatures(store, [camera.name for camera in cameras]))
+    return store.of([capture.cameras[i].name for i in train])
 
 
 def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[str, list[float]]]:

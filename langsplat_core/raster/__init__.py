@@ -9,14 +9,9 @@ from langsplat_core.errors import BackendError, InputError, optional_imports
 from langsplat_core.raster.protocol import LiftingRasterizer, LiftingView, Rasterizer, View
 
 __all__ = [
-    "BACKENDS",
-    "LiftingRasterizer",
-    "LiftingView",
-    "Rasterizer",
-    "View",
-    "load_lifting_rasterizer",
+    "BACKENDS", "LiftingRasterizer", "LiftingView", "Rasterizer", "View", "load_lifting_rasterizer",
     "load_rasterizer",
-]
+]  # fmt: skip
 
 
 class _Backend(NamedTuple):

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 from urllib.parse import quote
 
 import numpy as np
@@ -27,6 +27,8 @@ from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps, w
 
 VERSION = 1  # of what is stored of a photograph
 STAGE = "masks and vectors"
+K = TypeVar("K")
+T = TypeVar("T")
 
 log = logging.getLogger("langsplat")
 
@@ -96,6 +98,10 @@ class FeatureStore:
         except InputError as error:
             raise FormatError(f"{error}; delete it and run again") from None
 
+    def of(self, names: Sequence[str]) -> "OnDemand[ImageFeatures]":
+        """Return the features of photographs, each read when it is used."""
+        return OnDemand(names, self.load)
+
     def _read(self, name: str) -> tuple[ImageFeatures, str]:
         """Return the features and the key they were saved with. Raises InputError and FormatError."""
         path = self.path(name)
@@ -112,18 +118,18 @@ class FeatureStore:
         return features, str(key)
 
 
-class StoredFeatures(Sequence[ImageFeatures]):
-    """Features of photographs in a store, each read when it is used."""
+class OnDemand(Sequence[T]):
+    """Items that are read when they are used: label maps of all photographs are more than memory holds."""
 
-    def __init__(self, store: FeatureStore, names: Sequence[str]) -> None:
-        self._store, self._names = store, tuple(names)
+    def __init__(self, keys: Sequence[K], read: Callable[[K], T]) -> None:
+        self._keys, self._read = keys, read
 
     def __len__(self) -> int:
-        return len(self._names)
+        return len(self._keys)
 
     def __getitem__(self, index: Any) -> Any:
-        """Return the features of photograph `index`, a number; slices are not supported."""
-        return self._store.load(self._names[index])
+        """Return item `index`, a number; slices are not supported."""
+        return self._read(self._keys[index])
 
 
 # What CLIP is shown of a region, and the features of whole captures.
@@ -199,7 +205,7 @@ def describe_capture(
     store: FeatureStore,
     progress: Progress = silent,
     counted: Sequence[Array | None] = (),
-) -> StoredFeatures:
+) -> OnDemand[ImageFeatures]:
     """Find the masks and CLIP vectors of every photograph, in order; those that `store` has are not redone.
 
     Without an encoder the vectors have no numbers. images: (H, W, 3) uint8 each; names: unique, one per
@@ -231,4 +237,4 @@ def describe_capture(
         if before is not None:
             before.result()
     progress(STAGE, 1.0)
-    return StoredFeatures(store, names)
+    return store.of(names)

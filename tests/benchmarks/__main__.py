@@ -3,7 +3,7 @@
 import sys
 from typing import Union
 
-from langsplat_core.cli.arguments import Runnable, with_codec
+from langsplat_core.cli.arguments import Runnable, check_codec
 from langsplat_core.cli.run import main, parsed
 from tests.benchmarks.answers import Lifting, Rooms, Verdicts
 from tests.benchmarks.extensions import Changed, Clean, Maps, Meshes
@@ -17,11 +17,11 @@ PROGRAM = "python -m tests.benchmarks"
 def parse(args: list[str]) -> Runnable:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
-    known = (
+    check_codec(args)
+    reports = (
         *(Rooms, Verdicts, Phrases, Counts, Clean, Maps, Meshes),
         *(Lifting, Scale, Changed, Formats, Few),
     )
-    reports = tuple(with_codec(report, args) for report in known)
     command: Runnable = parsed(PROGRAM, Union[(*reports,)], args, about)
     return command
 

@@ -25,12 +25,9 @@ from assets.making.world import TIERS, Tier, part_words
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.cli.arguments import OutFile
 from langsplat_core.config import (
-    AutoencoderConfig,
-    CodebookConfig,
     CodecConfig,
     Count,
     LiftConfig,
-    LinearConfig,
 )
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.report import markdown
@@ -66,7 +63,7 @@ class Rooms(InRooms):
     seeds: Seeds = (101,)
     """One room of every tier each; never the bundled scene's."""
     masks: MaskOrigin = "truth"  # where outlines come from
-    codec: CodecConfig = field(default_factory=CodebookConfig)
+    codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     budget: bool = False  # also swap one stage at a time for one that makes no mistake
     codec_steps: Count = 4_000  # of training the autoencoder of --budget
@@ -102,12 +99,14 @@ def variants(command: Rooms, dim: int) -> list[Variant]:
     if not command.budget:
         return [method]
     perfect = [replace(method, name="perfect masks", masks="truth")] if command.masks != "truth" else []
-    decoded = replace(method, name="autoencoder, d = 3", codec=AutoencoderConfig(steps=command.codec_steps))
+    decoded = replace(
+        method, name="autoencoder, d = 3", codec=CodecConfig("autoencoder", steps=command.codec_steps)
+    )
     return [
         method,
         *perfect,
         replace(method, name="perfect embeddings", vectors="text"),
-        replace(method, name="no codec", codec=LinearConfig(latent_dim=dim)),
+        replace(method, name="no codec", codec=CodecConfig("linear", latent_dim=dim)),
         decoded,
         replace(decoded, name="autoencoder, the paper's order", query="paper"),
     ]
@@ -240,8 +239,8 @@ class MethodRow:
 def methods(command: Lifting, masks: MaskOrigin, dim: int) -> list[Variant]:
     """All methods. dim: numbers of the encoder's vectors."""
     ours = Variant(OURS, masks)
-    latents = {d: AutoencoderConfig(latent_dim=d, steps=command.codec_steps) for d in (1, 2, 3, 8)}
-    everything = LinearConfig(latent_dim=dim)  # which loses nothing
+    latents = {d: CodecConfig("autoencoder", latent_dim=d, steps=command.codec_steps) for d in (1, 2, 3, 8)}
+    everything = CodecConfig("linear", latent_dim=dim)  # which loses nothing
     trained = LiftConfig(mode="gradient", steps=command.gradient_steps)
     from_zeros = replace(trained, start="zeros-as-published")
     paper = replace(ours, codec=latents[3], lift=LiftConfig(mode="one-pass"), query="paper")
@@ -255,8 +254,8 @@ def methods(command: Lifting, masks: MaskOrigin, dim: int) -> list[Variant]:
     changed: dict[str, dict[str, Any]] = {
         "mean and autoencoder d = 3": {"codec": latents[3], "lift": LiftConfig(mode="mean")},
         "autoencoder d = 3": {"codec": latents[3]},
-        "64 linear numbers": {"codec": LinearConfig(latent_dim=64)},
-        **{f"codebook of {size}": {"codec": CodebookConfig(size=size)} for size in (256, 1_024, 4_096)},
+        "64 linear numbers": {"codec": CodecConfig("linear", latent_dim=64)},
+        **{f"codebook of {size}": {"codec": CodecConfig(size=size)} for size in (256, 1_024, 4_096)},
         f"all {dim} numbers": {"codec": everything},
         **{f"level {level} alone": {"level": level} for level in ("subpart", "part", "whole")},
     }
@@ -323,7 +322,7 @@ class Verdicts(InRooms):
     rates, the ROC curve's area, and how well the probabilities are calibrated."""
 
     masks: MaskOrigin = "truth"  # where outlines come from
-    codec: CodecConfig = field(default_factory=CodebookConfig)
+    codec: CodecConfig = field(default_factory=CodecConfig)
     fit: OutFile | None = None
     """Fit the encoder's calibration to these rooms and write it into this reading.json; measure elsewhere."""
     by_chance: bool = False  # judge as where no calibration is known

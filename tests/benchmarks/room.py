@@ -25,7 +25,6 @@ from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import OutFolder
 from langsplat_core.config import (
     ClipConfig,
-    CodebookConfig,
     CodecConfig,
     Count,
     DatasetConfig,
@@ -112,7 +111,7 @@ class Variant:
     name: str
     masks: MaskOrigin
     vectors: Literal["image", "text"] = "image"  # text: of every region's true words
-    codec: CodecConfig = CodebookConfig()  # noqa: RUF009 (frozen)
+    codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
     lift: LiftConfig = LiftConfig()  # noqa: RUF009
     query: Literal["blend answers", "paper"] = "blend answers"  # paper: blend latents, then decode
     level: LevelChoice = "auto"  # that is asked

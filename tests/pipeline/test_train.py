@@ -16,11 +16,9 @@ from safetensors.numpy import load_file
 from langsplat_core.cli.app import parse
 from langsplat_core.config import (
     PAPER,
-    AutoencoderConfig,
     ClipConfig,
-    CodebookConfig,
+    CodecConfig,
     LiftConfig,
-    LinearConfig,
     TrainConfig,
 )
 from langsplat_core.errors import EncoderError, FormatError, InputError
@@ -142,13 +140,13 @@ def test_the_same_command_repeats_no_stage(room, trained):
 def test_a_setting_repeats_only_what_depends_on_it(room, trained):
     work = trained.with_name("scene.work")
     before = kept_results(work)
-    train_scene(room, trained, replace(tiny_settings(room), codec=CodebookConfig(size=9)))
+    train_scene(room, trained, replace(tiny_settings(room), codec=CodecConfig(size=9)))
     added = {Path(name).name.partition("-")[0] for name in set(kept_results(work)) - set(before)}
     assert added == {"codec", "latents", "nodes"}
     train_scene(room, trained, replace(tiny_settings(room), lift=LiftConfig(backend="cpu")))
     assert len(kept_results(work)) == len(before) + 3  # who computes changes nothing
     for steps in (10, 20):
-        lift, codec = LiftConfig(mode="gradient", steps=steps), AutoencoderConfig(steps=30)
+        lift, codec = LiftConfig(mode="gradient", steps=steps), CodecConfig("autoencoder", steps=30)
         train_scene(room, trained, replace(tiny_settings(room), lift=lift, codec=codec))
     # More steps of lifting do not fit the codec again.
     assert (len(list(work.glob("codec-*.npz"))), len(list(work.glob("latents-*.npz")))) == (3, 4)
@@ -180,11 +178,11 @@ def test_a_damaged_stage_ends_in_one_line(room, trained, name, damage):
 
 @pytest.mark.parametrize("mode", ["mean", "one-pass", "gradient"])
 def test_every_lifting_mode_trains(room, tmp_path, mode):
-    linear = LinearConfig(latent_dim=8)
+    linear = CodecConfig("linear", latent_dim=8)
     config = replace(tiny_settings(room), lift=LiftConfig(mode=mode, steps=30), codec=linear)
     if mode != "mean":
         with pytest.raises(InputError, match=r"add --codec\.kind autoencoder"):
-            train_scene(room, tmp_path / "scene.ply", replace(config, codec=CodebookConfig()))
+            train_scene(room, tmp_path / "scene.ply", replace(config, codec=CodecConfig()))
     train_scene(room, tmp_path / "scene.ply", config)
     field = load_scene(tmp_path / "scene.ply").language
     assert field is not None
@@ -272,7 +270,7 @@ def test_given_gaussians_are_described_and_not_trained(room, tmp_path):
 
 def test_profiles_are_defaults_that_options_override():
     plain = parse(["train", "photos", "--out", "s.ply", "--max-relevancy-error", "0.01"])
-    assert plain.config == replace(TrainConfig(), codec=CodebookConfig(max_relevancy_error=0.01))
+    assert plain.config == replace(TrainConfig(), codec=CodecConfig(max_relevancy_error=0.01))
     words = ["train", "photos", "--out", "s.ply", "--profile", "paper"]
     assert parse(words).config == PAPER
     assert (PAPER.codec.kind, PAPER.codec.latent_dim, PAPER.lift.steps) == ("autoencoder", 3, 30_000)

@@ -31,7 +31,7 @@ from transformers import (
 
 from langsplat_core.config import (
     ClipConfig,
-    CodebookConfig,
+    CodecConfig,
     DatasetConfig,
     MaskConfig,
     RadianceConfig,
@@ -250,6 +250,6 @@ def tiny_settings(room: Path) -> TrainConfig:
         radiance=RadianceConfig(steps=20, sh_degree=0, checkpoint_every=5),
         masks=MaskConfig(source="graph"),
         clip=ClipConfig(model=str(room / "encoder"), device="cpu"),
-        codec=CodebookConfig(),
+        codec=CodecConfig(),
         phrases=("red mug",),
     )

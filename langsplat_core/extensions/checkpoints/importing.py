@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import CodebookConfig, CodecConfig, check_settings
+from langsplat_core.config import CodecConfig, check_settings
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.extensions.checkpoints.features import (
     FEATURE_3DGS,
@@ -242,7 +242,7 @@ def import_scene(
     Raises EncoderError where the encoder cannot be loaded, InputError where its vectors have another length
     or no Gaussian has a feature, FormatError for features that are not finite.
     """
-    config = config or CodebookConfig()
+    config = config or CodecConfig()
     check_settings(config, "--codec.")
     if foreign.dim == 0:
         return foreign.scene, None

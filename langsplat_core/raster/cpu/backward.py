@@ -76,65 +76,6 @@ def _record(tile: int, tiles: Tiles, state: Array, spans: Array, tape: Array) ->
     return tape, used, last
 
 
-@helper
-def _backward_tile(
-    tile: int,
-    tiles: Tiles,
-    values: Array,
-    grads: tuple[Array, Array],
-    partial: Array,
-    reached: Array,
-    tape: Array,
-) -> Array:
-    """One tile; returns the tape, for the next tile to write over."""
-    image_grad, alpha_grad = grads
-    channels, columns = values.shape[1], partial.shape[1]
-    lines = tiling.padded_inside(channels)
-    left, top = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
-    first, last = tiles.starts[tile], tiles.starts[tile + 1]
-    state = tiling.start_tile(tile, tiles)
-    spans = np.zeros((last - first, 2), np.int64)
-    tape, used, end = _record(tile, tiles, state, spans, tape)
-    reached[end:last] = False
-    planes, plane = np.empty(PIXELS * lines, np.float32), np.empty(PIXELS, np.float32)
-    tiling.load_tile(planes, image_grad, tile, tiles)
-    tiling.load_tile(plane, alpha_grad, tile, tiles)
-    weights = np.empty(PIXELS, np.float32)
-    behind = state
-    behind[:] = 0
-    for s in range(end - 1, first - 1, -1):
-        low, high = spans[s - first, 0], spans[s - first, 1]
-        reached[s] = low < high
-        if low >= high:
-            continue
-        used -= (high - low) * _ENTRY
-        g = tiling.enter(tiles, s, max(s - tiling.AHEAD, first))
-        x = values[tiles.ranks[s]]
-        step, _, offset, v, w_step, v_step = tiling.begin_rows(g, left, top + low)
-        q0 = qw = qv = qww = qwv = qvv = none = lanes(np.float32(0))
-        for row in range(low, high):
-            w = step + offset
-            at = used + (row - low) * _ENTRY
-            alpha, before = load(tape, at), load(tape, at + TILE)
-            weight = alpha * before
-            store(weights, (row - low) * TILE, weight)
-            slope = load(plane, row * TILE)
-            for line in range(channels):
-                slope = slope + load(planes, (row * lines + line) * TILE) * x[line]
-            hidden = load(behind, row * TILE)
-            store(behind, row * TILE, hidden + weight * slope)
-            q = weight * slope - hidden * alpha * reciprocal(1.0 - alpha)
-            q = where_greater(tiles.cutoffs.alpha_max, alpha, q, 0.0)
-            moved, lifted = q * w, q * v
-            q0, qw, qv = q0 + q, qw + moved, qv + lifted
-            qww, qwv, qvv = qww + moved * w, qwv + moved * v, qvv + lifted * v
-            offset, v = offset + w_step, v + v_step
-        store_totals(partial, s * columns, q0, qw, qv, qww)
-        store_totals(partial, s * columns + QWV, qwv, qvv, none, none)
-        tiling.correlate(planes, lines, weights, low, high, partial, s, MOMENTS)
-    return tape
-
-
 @kernel
 def backward(
     first: int,
@@ -150,9 +91,54 @@ def backward(
     Fills (I,) bool `reached`, and (I, 8 + padded(C)) partial sums where that is True. float32, for tiles
     [first, last).
     """
+    image_grad, alpha_grad = grads
+    channels, columns = values.shape[1], partial.shape[1]
+    lines = tiling.padded_inside(channels)
     tape = np.empty(_TAPE, np.float32)
     for i in range(first, last):
-        tape = _backward_tile(tiling.tile_at(i, tiles), tiles, values, grads, partial, reached, tape)
+        tile = tiling.tile_at(i, tiles)
+        left, top = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
+        start, stop = tiles.starts[tile], tiles.starts[tile + 1]
+        state = tiling.start_tile(tile, tiles)
+        spans = np.zeros((stop - start, 2), np.int64)
+        tape, used, end = _record(tile, tiles, state, spans, tape)
+        reached[end:stop] = False
+        planes, plane = np.empty(PIXELS * lines, np.float32), np.empty(PIXELS, np.float32)
+        tiling.load_tile(planes, image_grad, tile, tiles)
+        tiling.load_tile(plane, alpha_grad, tile, tiles)
+        weights = np.empty(PIXELS, np.float32)
+        behind = state
+        behind[:] = 0
+        for s in range(end - 1, start - 1, -1):
+            low, high = spans[s - start, 0], spans[s - start, 1]
+            reached[s] = low < high
+            if low >= high:
+                continue
+            used -= (high - low) * _ENTRY
+            g = tiling.enter(tiles, s, max(s - tiling.AHEAD, start))
+            x = values[tiles.ranks[s]]
+            step, _, offset, v, w_step, v_step = tiling.begin_rows(g, left, top + low)
+            q0 = qw = qv = qww = qwv = qvv = none = lanes(np.float32(0))
+            for row in range(low, high):
+                w = step + offset
+                at = used + (row - low) * _ENTRY
+                alpha, before = load(tape, at), load(tape, at + TILE)
+                weight = alpha * before
+                store(weights, (row - low) * TILE, weight)
+                slope = load(plane, row * TILE)
+                for line in range(channels):
+                    slope = slope + load(planes, (row * lines + line) * TILE) * x[line]
+                hidden = load(behind, row * TILE)
+                store(behind, row * TILE, hidden + weight * slope)
+                q = weight * slope - hidden * alpha * reciprocal(1.0 - alpha)
+                q = where_greater(tiles.cutoffs.alpha_max, alpha, q, 0.0)
+                moved, lifted = q * w, q * v
+                q0, qw, qv = q0 + q, qw + moved, qv + lifted
+                qww, qwv, qvv = qww + moved * w, qwv + moved * v, qvv + lifted * v
+                offset, v = offset + w_step, v + v_step
+            store_totals(partial, s * columns, q0, qw, qv, qww)
+            store_totals(partial, s * columns + QWV, qwv, qvv, none, none)
+            tiling.correlate(planes, lines, weights, low, high, partial, s, MOMENTS)
 
 
 # Gradients of the CPU backend, second half: from a footprint back to the Gaussian's parameters.

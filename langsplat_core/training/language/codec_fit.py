@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import AutoencoderConfig, CodebookConfig, CodecConfig, check_settings
+from langsplat_core.config import CodecConfig, check_settings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
@@ -94,9 +94,9 @@ def fit_codec(
     check_settings(config, "--codec.")
     if further is not None and (KINDS[config.kind].blends or len(vectors) == 0):
         vectors = np.concatenate([further, vectors])
-    if isinstance(config, CodebookConfig):
+    if config.kind == "codebook":
         return fit_codebook(vectors, config, vocabulary, progress)
-    if isinstance(config, AutoencoderConfig):
+    if config.kind == "autoencoder":
         return train_autoencoder(vectors, config, progress)
     # The leading right singular vectors, the best basis by least squares; through the D x D Gram matrix: D is
     # 512, M may be a million. float64 keeps its squared condition usable.
@@ -111,9 +111,7 @@ ENCODER_WIDTHS = (256, 128, 64, 32)  # each with batch normalisation and ReLU
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)  # each with ReLU
 
 
-def train_autoencoder(
-    vectors: Array, config: AutoencoderConfig, progress: Progress = silent
-) -> AutoencoderCodec:
+def train_autoencoder(vectors: Array, config: CodecConfig, progress: Progress = silent) -> AutoencoderCodec:
     """Train the autoencoder of (M, D) unit vectors, with latents of length 1.
 
     By the paper's loss, L1 plus cosine distance, and Adam with a cosine schedule on random batches. Progress
@@ -177,7 +175,7 @@ def folded_layers(network: Any) -> Layers:
 
 
 def fit_codebook(
-    vectors: Array, config: CodebookConfig, vocabulary: Vocabulary, progress: Progress = silent
+    vectors: Array, config: CodecConfig, vocabulary: Vocabulary, progress: Progress = silent
 ) -> CodebookCodec:
     """Fit a codebook to (M, D) float32 unit vectors.
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import CodebookConfig, LinearConfig
+from langsplat_core.config import CodecConfig
 from langsplat_core.errors import STRICTNESS, EncoderError, FormatError, InputError
 from langsplat_core.extensions.checkpoints.convert import export_langsplat, export_occam
 from langsplat_core.extensions.checkpoints.importing import ForeignScene, import_scene, read_foreign
@@ -430,7 +430,7 @@ def test_many_vectors_keep_the_stated_error(tmp_path, clip):
     g = random_gaussians(n)
     vectors = unit(FEATURES[rng.integers(0, 7, n)] + rng.normal(scale=0.02, size=(n, D))).astype(np.float32)
     path = save_model(tmp_path / "a_3.pth", g, tensor(vectors))
-    config = CodebookConfig(max_relevancy_error=0.02)
+    config = CodecConfig(max_relevancy_error=0.02)
     scene, loss = import_scene(read_foreign([path]), clip, (), config)
     assert scene.language is not None
     assert loss is not None
@@ -440,7 +440,7 @@ def test_many_vectors_keep_the_stated_error(tmp_path, clip):
     assert 7 < scene.language.codec.size <= n // 4
     assert np.abs(got - want).mean() <= 1.1 * loss.error_mean  # most of these were fitted to
     assert loss.error_mean <= 1.2 * config.max_relevancy_error
-    linear, _ = import_scene(read_foreign([path]), clip, (), LinearConfig(latent_dim=D))
+    linear, _ = import_scene(read_foreign([path]), clip, (), CodecConfig("linear", latent_dim=D))
     assert linear.language is not None
     np.testing.assert_allclose(decoded(linear.language, 2), vectors, atol=1e-5)
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import AutoencoderConfig, CodebookConfig, LinearConfig
+from langsplat_core.config import CodecConfig
 from langsplat_core.scene import (
     NO_NODE,
     Codec,
@@ -42,9 +42,9 @@ D = 48
 TEXTS = unit(np.random.default_rng(9).normal(size=(24, D))).astype(np.float32)
 WORDS = Vocabulary(TEXTS[4:], Scale(TEXTS[:4], TEXTS[4:], 10.0))
 QUICK = {
-    "codebook": CodebookConfig(size=9),
-    "autoencoder": AutoencoderConfig(latent_dim=4, steps=20),
-    "linear": LinearConfig(latent_dim=4),
+    "codebook": CodecConfig(size=9),
+    "autoencoder": CodecConfig("autoencoder", latent_dim=4, steps=20),
+    "linear": CodecConfig("linear", latent_dim=4),
 }
 
 
@@ -116,7 +116,7 @@ def test_latents_have_distances_and_colours(codec: Codec) -> None:
 @pytest.mark.parametrize("d", [2, 3])
 def test_autoencoder_keeps_a_scenes_vectors_apart(d: int) -> None:
     vectors, labels = clusters(12, 34)
-    made = fit_codec(vectors, AutoencoderConfig(latent_dim=d, steps=700, batch=128, lr=2e-3), WORDS)
+    made = fit_codec(vectors, CodecConfig("autoencoder", latent_dim=d, steps=700, batch=128, lr=2e-3), WORDS)
     latents = made.encode(vectors)
     np.testing.assert_allclose(np.linalg.norm(latents, axis=1), 1, atol=1e-5)
     assert codec_report(made, vectors, WORDS).cosine > 0.9
@@ -127,7 +127,7 @@ def test_autoencoder_keeps_a_scenes_vectors_apart(d: int) -> None:
 
 def test_linear_codec_is_the_best_subspace() -> None:
     vectors, _ = clusters(12, 34)
-    made = fit_codec(vectors, LinearConfig(latent_dim=6), WORDS)
+    made = fit_codec(vectors, CodecConfig("linear", latent_dim=6), WORDS)
     assert isinstance(made, LinearCodec)
     np.testing.assert_allclose(made.basis @ made.basis.T, np.eye(6), atol=1e-5)
     singular = np.linalg.svd(vectors.astype(np.float64), compute_uv=False)
@@ -151,20 +151,20 @@ def test_codebook_is_the_smallest_within_its_error_budget() -> None:
     vectors, _ = clusters(100, 20, noise=0.01)
     sizes = []
     for budget in (0.15, 0.06, 0.02):
-        made = fit_codebook(vectors, CodebookConfig(max_relevancy_error=budget), WORDS)
+        made = fit_codebook(vectors, CodecConfig(max_relevancy_error=budget), WORDS)
         sizes.append(made.size)
         # judged on all vectors, chosen by a fifth of them
         assert codec_report(made, vectors, WORDS).error_mean < 1.05 * budget
     assert sizes == sorted(sizes)
     assert sizes[0] < sizes[-1]
-    half = fit_codebook(vectors, CodebookConfig(size=sizes[1] // 2), WORDS)
+    half = fit_codebook(vectors, CodecConfig(size=sizes[1] // 2), WORDS)
     assert codec_report(half, vectors, WORDS).error_mean > 0.06
 
 
 @pytest.mark.parametrize(("count", "each"), [(9, 100), (1, 1), (2, 1), (7, 1)])
 def test_few_distinct_vectors_get_few_codewords(count: int, each: int) -> None:
     vectors, _ = clusters(count, each, noise=0.0)
-    made = fit_codebook(vectors, CodebookConfig(), WORDS)
+    made = fit_codebook(vectors, CodecConfig(), WORDS)
     assert 1 <= made.size <= count
     if each > 1:
         assert made.size == count
@@ -173,7 +173,7 @@ def test_few_distinct_vectors_get_few_codewords(count: int, each: int) -> None:
 
 def test_similar_codewords_have_similar_float16_colours() -> None:
     vectors, _ = clusters(12, 300, noise=0.03)
-    made = fit_codebook(vectors, CodebookConfig(size=60), WORDS)
+    made = fit_codebook(vectors, CodecConfig(size=60), WORDS)
     for numbers in (made.vectors, made.palette):
         np.testing.assert_array_equal(rounded(numbers), numbers)
     assert np.ptp(made.palette, axis=0).min() > 0.5
