@@ -12,15 +12,7 @@ import tyro
 from PIL import Image
 
 from langsplat_core.arrays import Array, length_text
-from langsplat_core.cli.arguments import (
-    EncoderOption,
-    JsonOption,
-    Needs,
-    OutFile,
-    ScaleOption,
-    TrainedScene,
-    WordsOption,
-)
+from langsplat_core.cli import arguments
 from langsplat_core.cli.run import print_json
 from langsplat_core.config import Count, CountOrZero, LevelChoice, PictureConfig
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
@@ -167,11 +159,11 @@ NOT_DECODED = "--mode paper decodes pixels, and what was shown is compared with 
 class QueryScene:
     """Ask a scene for phrases: score, level, pixel, place in world units, box."""
 
-    scene: TrainedScene
+    scene: arguments.TrainedScene
     texts: tyro.conf.Positional[tuple[str, ...]] = ()
     """Phrases, each in quotes if it has several words; "," and ";" separate them too. What cannot be asked
     is named on stderr, and the rest is answered; with nothing left the exit code is 2."""
-    taught: WordsOption = None
+    taught: arguments.WordsOption = None
     level: LevelChoice = "auto"
     """Semantic level; auto takes the one that answers best, for a thing rather the whole."""
     mode: Literal["splat", "paper"] = "splat"
@@ -179,18 +171,18 @@ class QueryScene:
     asked whole, without looking for structure such as "lid of the teapot"."""
     camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
     """Training view in which the pixel is reported."""
-    encoder: EncoderOption = ""
+    encoder: arguments.EncoderOption = ""
     instances: CountOrZero = 5
     """How many of a phrase's things are listed, the best first."""
-    scale: ScaleOption = None
-    why: OutFile | None = None
+    scale: arguments.ScaleOption = None
+    why: arguments.OutFile | None = None
     """Draw the evidence here, *.png: the photographs and masks that the best region of each answer stands on,
     best and worst. --json then has it, too."""
-    work: Annotated[Path | None, Needs("why")] = None
+    work: Annotated[Path | None, arguments.Needs("why")] = None
     """Folder of the training, with its masks, for --why (default: <scene>.work)."""
-    photographs: Annotated[Path | None, Needs("why")] = None
+    photographs: Annotated[Path | None, arguments.Needs("why")] = None
     """The dataset of the training, for --why, if it is elsewhere now."""
-    json: JsonOption = False
+    json: arguments.JsonOption = False
 
     def run(self) -> None:
         """Ask, and print the answers."""
@@ -447,10 +439,10 @@ class Select:
     Prints the things that were found, best first.
     """
 
-    scene: TrainedScene
+    scene: arguments.TrainedScene
     texts: tyro.conf.Positional[tuple[str, ...]]
     """Phrases, each in quotes if it has several words; what any of them names is taken."""
-    out: OutFile
+    out: arguments.OutFile
     """Scene to write: .ply, .spz, .sog, .glb, .gltf or .splat."""
     remove: bool = False
     """Write everything else instead."""
@@ -458,10 +450,10 @@ class Select:
     """Semantic level; auto takes for each phrase the one with the highest score."""
     instance: tuple[Count, ...] = ()
     """Numbers of the things to take, as printed, the best is 1; all if none is given."""
-    scale: ScaleOption = None
-    encoder: EncoderOption = ""
-    taught: WordsOption = None
-    json: JsonOption = False
+    scale: arguments.ScaleOption = None
+    encoder: arguments.EncoderOption = ""
+    taught: arguments.WordsOption = None
+    json: arguments.JsonOption = False
 
     def run(self) -> None:
         """Select, write the file, and print what is in it."""

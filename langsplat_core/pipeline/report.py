@@ -123,19 +123,17 @@ def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> 
 
 def camera_groups(positions: Array) -> list[Array]:
     """Return rows of (M, 3) positions of two or more that lie `APART` as groups, the largest first."""
-    from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
-    from scipy.spatial.distance import pdist, squareform
+    from scipy.cluster.hierarchy import fcluster, linkage
 
     whole = [np.arange(len(positions))]
     if len(positions) < 4:
         return whole
-    tree = minimum_spanning_tree(squareform(pdist(positions))).toarray()
-    steps = tree[tree > 0]
+    links = linkage(positions, "single")  # whose distances are the steps of a minimum spanning tree
+    steps = links[links[:, 2] > 0, 2]
     if len(steps) == 0:
         return whole
-    tree[tree > APART * np.median(steps)] = 0
-    count, labels = connected_components(tree, directed=False)
-    groups = [np.flatnonzero(labels == label) for label in range(count)]
+    labels = fcluster(links, APART * np.median(steps), "distance")
+    groups = [np.flatnonzero(labels == label) for label in np.unique(labels)]
     return sorted((group for group in groups if len(group) > 1), key=len, reverse=True) or whole
 
 

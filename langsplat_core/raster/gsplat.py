@@ -7,9 +7,9 @@ of 0.005, and `gather` sums with atomics, so its last digits vary between runs.
 """
 
 import subprocess
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,27 +22,27 @@ from langsplat_core.raster.protocol import LiftingView, dilation, farthest, mean
 from langsplat_core.scene import Camera, Gaussians, look_at
 
 DEVICE = "cuda"
+RAW = ("means", "log_scales", "quats_wxyz", "opacity_logits")  # of what is drawn
 FARTHEST = 1e10  # world units: where gsplat's far plane is when it is not told
 
 
-@dataclass(frozen=True, eq=False)
-class DeviceGaussians:
-    """N Gaussians as float32 tensors on the CUDA device, raw as in `Gaussians`."""
-
-    means: Tensor  # (N, 3)
-    log_scales: Tensor  # (N, 3)
-    quats_wxyz: Tensor  # (N, 4)
-    opacity_logits: Tensor  # (N,)
+# N Gaussians by the names of `Gaussians`, as float32 tensors on the CUDA device, raw as there; without sh.
+DeviceGaussians = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True, eq=False)
 class DifferentiableImage:
-    """An image that can be differentiated by the Gaussians and their values."""
+    """One image, still attached to the Gaussians and values that it came from."""
 
-    image: Tensor  # (H, W, C)
-    alpha: Tensor  # (H, W)
-    means_px: Tensor  # gsplat's projected means; keeps its gradient where it has one
-    visible: Tensor  # (N,) bool
+    image: Tensor  # (H, W, C) blended values on black, not clamped above
+    alpha: Tensor  # (H, W) in [0, 1]
+    visible: Tensor  # (N,) bool: the Gaussian's extent meets the image
+    means_px: Tensor  # its `grad`, after `backward`, is the loss gradient by the projected means, 1/px
+
+    def means_px_grad(self) -> Tensor:
+        """Return the (N, 2) gradient; zeros when nothing was differentiated."""
+        grad = torch.zeros_like(self.means_px) if self.means_px.grad is None else self.means_px.grad
+        return grad.reshape(-1, 2)
 
 
 def has_device() -> bool:
@@ -61,7 +61,7 @@ def require_device() -> None:
     if not has_device():
         raise BackendError("torch finds no CUDA device")
     shapes = {"means": (1, 3), "log_scales": (1, 3), "quats_wxyz": (1, 4), "opacity_logits": (1,)}
-    one = DeviceGaussians(**{n: torch.ones(*s, device=DEVICE).requires_grad_() for n, s in shapes.items()})
+    one = {name: torch.ones(*shape, device=DEVICE).requires_grad_() for name, shape in shapes.items()}
     camera = look_at(np.array([5.0, 5.0, 5.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), (16, 16))
     try:  # an import alone does not prove that there are kernels
         draw(one, torch.ones(1, 1, device=DEVICE), camera, INRIA).image.sum().backward()
@@ -87,10 +87,10 @@ def draw(
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
     view = camera.world_to_camera if view_matrix is None else view_matrix
     images, alphas, extra = rasterization(
-        means=gaussians.means,
-        quats=gaussians.quats_wxyz,
-        scales=gaussians.log_scales.exp(),
-        opacities=gaussians.opacity_logits.sigmoid(),
+        means=gaussians["means"],
+        quats=gaussians["quats_wxyz"],
+        scales=gaussians["log_scales"].exp(),
+        opacities=gaussians["opacity_logits"].sigmoid(),
         colors=values,
         viewmats=to_device(view[None]),
         Ks=torch.tensor([intrinsics], dtype=torch.float32, device=DEVICE),
@@ -107,8 +107,8 @@ def draw(
     means_px = extra["means2d"]
     if means_px.requires_grad:
         means_px.retain_grad()
-    visible = extra["radii"].reshape(len(gaussians.means), -1).amin(1) > 0  # (N,) or (N, 2), by version
-    return DifferentiableImage(images[0], alphas[0, ..., 0], means_px, visible)
+    visible = extra["radii"].reshape(len(gaussians["means"]), -1).amin(1) > 0  # (N,) or (N, 2), by version
+    return DifferentiableImage(images[0], alphas[0, ..., 0], visible, means_px)
 
 
 def to_device(array: Array) -> Tensor:
@@ -130,8 +130,8 @@ class GsplatView(LiftingView):
         self._depths = (means @ camera.rotation[2]).astype(np.float32)
         self._turn = np.eye(4)
         self._turn[:3, :3] = camera.rotation
-        arrays: tuple[Any, ...] = (means, kept.log_scales, kept.quats_wxyz, kept.opacity_logits)
-        self._gaussians = DeviceGaussians(*map(to_device, arrays))
+        arrays = {**vars(kept), "means": means}
+        self._gaussians = {name: to_device(arrays[name]) for name in RAW}
 
     def _draw(self, values: Tensor) -> tuple[Tensor, Tensor]:
         drawn = draw(self._gaussians, values, self.camera, self._settings, view_matrix=self._turn)

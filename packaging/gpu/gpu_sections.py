@@ -266,7 +266,7 @@ def _on_device(case: Case, channels: tuple[int, ...]) -> str:
     kept = device_gaussians(case.gaussians)
     for count in channels:
         values = torch.rand(len(case.gaussians), count, device=gsplat.DEVICE).requires_grad_()
-        leaves = [kept.means, kept.log_scales, kept.quats_wxyz, kept.opacity_logits, values]
+        leaves = [*kept.values(), values]
 
         def forward(values: torch.Tensor = values) -> torch.Tensor:
             with torch.no_grad():
@@ -285,10 +285,7 @@ def _on_device(case: Case, channels: tuple[int, ...]) -> str:
 
 def device_gaussians(gaussians: object) -> gsplat.DeviceGaussians:
     """Return Gaussians on the device, each part a leaf that requires its gradient."""
-    names = ("means", "log_scales", "quats_wxyz", "opacity_logits")
-    return gsplat.DeviceGaussians(
-        **{name: gsplat.to_device(getattr(gaussians, name)).requires_grad_() for name in names}
-    )
+    return {name: gsplat.to_device(getattr(gaussians, name)).requires_grad_() for name in gsplat.RAW}
 
 
 # gsplat's gradients beside the CPU kernels', against differences of the reference; W^T as the adjoint of W.
@@ -330,7 +327,7 @@ def gradients(case: Case, values: Array, image: Array) -> dict[str, Array]:
     x = gsplat.to_device(values).requires_grad_()
     drawn = gsplat.draw(kept, x, case.camera, INRIA)
     (drawn.image * gsplat.to_device(image)).sum().backward()
-    leaves = {**vars(kept), "values": x, "means_px": drawn.means_px}
+    leaves = {**kept, "values": x, "means_px": drawn.means_px}
     return {name: leaf.grad.reshape(len(values), -1).cpu().numpy() for name, leaf in leaves.items()}
 
 

@@ -5,7 +5,7 @@
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -19,33 +19,18 @@ from langsplat_core.errors import BackendError
 from langsplat_core.raster import gsplat
 from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
+from langsplat_core.raster.gsplat import DifferentiableImage
 from langsplat_core.scene import Camera, Gaussians, near_plane
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.losses import fit_exposure, patch_means, ssim_map, with_exposure
 
-PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
+PARAMETERS = (*gsplat.RAW, "sh_dc", "sh_rest")
 
 
 def parameters_of(gaussians: Gaussians, device: torch.device) -> dict[str, Tensor]:
     """Return the raw `PARAMETERS` of Gaussians as tensors; sh is split in degree 0 and the rest."""
-    names = PARAMETERS[:4]
-    arrays = [*(getattr(gaussians, name) for name in names), gaussians.sh[:, :1], gaussians.sh[:, 1:]]
+    arrays = [*(getattr(gaussians, name) for name in gsplat.RAW), gaussians.sh[:, :1], gaussians.sh[:, 1:]]
     return {name: torch.tensor(array, device=device) for name, array in zip(PARAMETERS, arrays, strict=True)}
-
-
-@dataclass(frozen=True, eq=False)
-class Rendered:
-    """One image, still attached to the parameters it came from."""
-
-    image: Tensor  # (H, W, 3) blended colours on black, >= 0, not clamped above
-    alpha: Tensor  # (H, W) in [0, 1]
-    visible: Tensor  # (N,) bool: the Gaussian's extent meets the image
-    means_px: Tensor  # its `grad`, after `backward`, is the loss gradient by the projected means, 1/px
-
-    def means_px_grad(self) -> Tensor:
-        """Return the (N, 2) gradient; zeros when nothing was differentiated."""
-        grad = torch.zeros_like(self.means_px) if self.means_px.grad is None else self.means_px.grad
-        return grad.reshape(-1, 2)
 
 
 class DifferentiableRenderer(Protocol):
@@ -53,7 +38,7 @@ class DifferentiableRenderer(Protocol):
 
     device: torch.device  # where parameters and images live
 
-    def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
+    def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> DifferentiableImage:
         """Draw the raw `parameters` with harmonics up to `sh_degree`."""
 
 
@@ -107,17 +92,17 @@ class CpuRenderer:
         self.device = torch.device("cpu")
         self._settings, self._rasterizer = settings, CpuRasterizer()
 
-    def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
+    def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> DifferentiableImage:
         means = parameters["means"]
         probe = torch.zeros(len(means), 2, requires_grad=means.requires_grad)
         image, alpha, visible = _CpuImage.apply(
             lambda gaussians: self._rasterizer.view(gaussians, camera, self._settings),
             camera.position,
-            *(parameters[name] for name in PARAMETERS[:4]),
+            *(parameters[name] for name in gsplat.RAW),
             _coefficients(parameters, sh_degree),
             probe,
         )
-        return Rendered(image, alpha, visible, probe)
+        return DifferentiableImage(image, alpha, visible, probe)
 
 
 class CudaRenderer:
@@ -131,11 +116,9 @@ class CudaRenderer:
         except BackendError as error:
             raise BackendError(f"backend cuda: {error}; use --backend cpu") from error
 
-    def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
-        gaussians = gsplat.DeviceGaussians(**{name: parameters[name] for name in PARAMETERS[:4]})
+    def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> DifferentiableImage:
         values = _coefficients(parameters, sh_degree)
-        drawn = gsplat.draw(gaussians, values, camera, self._settings, sh_degree)
-        return Rendered(drawn.image, drawn.alpha, drawn.visible, drawn.means_px)
+        return gsplat.draw(parameters, values, camera, self._settings, sh_degree)
 
 
 def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor], camera: Camera) -> Array:
