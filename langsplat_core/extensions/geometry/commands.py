@@ -27,7 +27,6 @@ from langsplat_core.extensions.geometry.registration import TRUSTED, Registratio
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
-from langsplat_core.io.shapes import check_suffix
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.describe import Describer
@@ -74,9 +73,9 @@ class WriteMesh:
 
     @optional_imports()
     def run(self) -> None:
-        from langsplat_core.extensions.geometry.mesh import SUFFIXES, close_holes, fuse, write_mesh
+        from langsplat_core.extensions.geometry.mesh import check_suffix, close_holes, fuse, write_mesh
 
-        check_suffix(self.out, SUFFIXES)
+        check_suffix(self.out)
         check_keeps(self.out, self.scene)
         scene = searchable(self.scene) if self.phrase else load_scene(self.scene)
         unit = unit_of(scene.metres_per_unit, scene.origin)

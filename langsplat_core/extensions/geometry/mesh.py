@@ -16,8 +16,8 @@ from langsplat_core.arrays import Array, linear_light, rotation_matrices, unit
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.geometry.planes import cloud, turned_origin
 from langsplat_core.io.gltf import GltfWriter
-from langsplat_core.io.ply import write_table
-from langsplat_core.io.shapes import check_suffix, coloured_columns
+from langsplat_core.io.ply import CHANNELS, POSITION, write_table
+from langsplat_core.io.quantised import to_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import splat_colours, view_of
@@ -202,14 +202,26 @@ def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
 # Files that other programs open.
 
 
+def check_suffix(path: Path | str) -> Path:
+    """Return `path`; InputError unless it ends in one of `SUFFIXES`."""
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path}: this is written as {' or '.join(SUFFIXES)}; choose such a name")
+    return path
+
+
 def write_mesh(path: Path | str, mesh: Mesh, scene: Scene) -> None:
     """Write a mesh of a scene, in the world, as .ply or .glb, atomically. InputError for another suffix.
 
     A .glb is y up, in metres where the scale is known.
     """
-    path = check_suffix(path, SUFFIXES)
+    path = check_suffix(path)
     if path.suffix.lower() == ".ply":
-        write_table(path, coloured_columns(scene, mesh.vertices, mesh.colour), mesh.triangles)
+        far = scene.origin.any()  # places are then float64
+        places = scene.in_world(mesh.vertices) if far else mesh.vertices.astype(np.float32)
+        columns = dict(zip(POSITION, places.T, strict=True))
+        columns |= dict(zip(CHANNELS, to_bytes(255 * mesh.colour).T, strict=True))
+        write_table(path, columns, mesh.triangles)
         return
     # Colours are light as it was photographed, so the material is unlit, and linear.
     file = GltfWriter("KHR_materials_unlit")

@@ -12,17 +12,9 @@ from scipy.sparse import csr_matrix
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig, check_settings
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import (
-    CANONICAL_PHRASES,
-    NO_NODE,
-    AutoencoderCodec,
-    CodebookCodec,
-    Codec,
-    LanguageField,
-    LinearCodec,
-    Tree,
-)
-from langsplat_core.scene.codec import KINDS, Layers, folded, principal_colours
+from langsplat_core.scene import CANONICAL_PHRASES, NO_NODE, LanguageField, Tree
+from langsplat_core.scene import codec as codecs
+from langsplat_core.scene.codec import AutoencoderCodec, CodebookCodec, Codec
 from langsplat_core.scene.surface import Surface
 from langsplat_core.semantics.encoders import PhraseEncoder
 from langsplat_core.semantics.relevancy import Scale, everyday_phrases, everyday_vectors, relevancy_of
@@ -92,7 +84,7 @@ def fit_codec(
     D) vectors that are not kept, but help a kind that interpolates between what it has seen.
     """
     check_settings(config, "--codec.")
-    if further is not None and (KINDS[config.kind].blends or len(vectors) == 0):
+    if further is not None and (codecs.KINDS[config.kind].blends or len(vectors) == 0):
         vectors = np.concatenate([further, vectors])
     if config.kind == "codebook":
         return fit_codebook(vectors, config, vocabulary, progress)
@@ -102,7 +94,7 @@ def fit_codec(
     # 512, M may be a million. float64 keeps its squared condition usable.
     wide = np.asarray(vectors, np.float64)
     _, axes = np.linalg.eigh(wide.T @ wide)
-    return LinearCodec(np.ascontiguousarray(axes[:, ::-1][:, : config.latent_dim].T, np.float32))
+    return codecs.LinearCodec(np.ascontiguousarray(axes[:, ::-1][:, : config.latent_dim].T, np.float32))
 
 
 # The paper's codec: an autoencoder of one scene's CLIP vectors (LangSplat section 3.2, layers of its code).
@@ -166,9 +158,9 @@ def _settle_statistics(encoder: Any, data: Any) -> None:
                 encoder(chunk)
 
 
-def folded_layers(network: Any) -> Layers:
+def folded_layers(network: Any) -> codecs.Layers:
     """Return (out, in) weights and biases of a torch `Sequential`, batch normalisations folded in."""
-    return folded({name: t.double().numpy() for name, t in m.state_dict().items()} for m in network)
+    return codecs.folded({name: t.double().numpy() for name, t in m.state_dict().items()} for m in network)
 
 
 # A scene's own codebook: as many codewords as its language features need, and not more.
@@ -212,7 +204,7 @@ def fit_codebook(
 def codebook_of(vectors: Array, usage: Array) -> CodebookCodec:
     """Return the codebook of (K, D) unit vectors, rounded to float16, that occur (K,) `usage` times."""
     codewords = rounded(vectors)
-    return CodebookCodec(codewords, rounded(principal_colours(codewords, usage)))
+    return CodebookCodec(codewords, rounded(codecs.principal_colours(codewords, usage)))
 
 
 def _smallest(

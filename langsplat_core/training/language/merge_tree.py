@@ -30,12 +30,12 @@ from scipy.spatial import cKDTree
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.io.shapes import base_colours
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingView
 from langsplat_core.raster.reference import Footprints, project
 from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.scene.surface import Surface, divide, surface_areas
+from langsplat_core.scene.transform import C0
 from langsplat_core.semantics.masks import within
 from langsplat_core.training.language.lift import MaskWeights
 
@@ -126,8 +126,9 @@ def find_tree(
         return MergeTree(everywhere, np.zeros((0, 2), np.int32), np.zeros(0))
     disagreement = link_disagreement(surface, mask_weights, progress)
     concavity = link_concavity(surface, eyes)
-    colours = base_colours(gaussians)[surface.rows].astype(np.float64).clip(0.02, 1)  # black has none
-    colours /= colours.sum(1, keepdims=True)  # chromaticity
+    colours = 0.5 + C0 * gaussians.sh[surface.rows, 0].astype(np.float64)
+    colours = np.nan_to_num(colours).clip(0.02, 1)  # black has no chromaticity
+    colours /= colours.sum(1, keepdims=True)
     a, b = surface.ends
     steps = disagreement + STEP_BENT * concavity + COLOUR * np.linalg.norm(colours[a] - colours[b], axis=1)
     of = divide(surface, steps, np.argsort(steps, kind="stable").astype(np.int32), SCALE, SMALLEST)
