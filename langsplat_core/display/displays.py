@@ -169,9 +169,7 @@ def heat_ranges(
     return _ranges(answers, ends)
 
 
-def member_ranges(
-    answers: Answers, scale: tuple[float, float] | None = None, everywhere: bool = False
-) -> Ranges:
+def member_ranges(answers: Answers, *_: object) -> Ranges:
     """Range of members for each slot, which are 0 or 1; a weak match is half as opaque."""
     return _ranges(answers, lambda answer: (0.0, 1.0))
 

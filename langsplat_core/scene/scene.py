@@ -75,10 +75,7 @@ class Camera:
         check_array("world_to_camera", matrix, (4, 4))
         if not np.isfinite(matrix).all():
             raise ValueError("world_to_camera: every entry must be finite")
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"camera size must be at least 1x1, got {self.width}x{self.height}")
-        if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
-            raise ValueError("camera: fx and fy must be positive and all intrinsics finite")
+        _ = self.intrinsics  # which are checked as they are made
         object.__setattr__(self, "world_to_camera", matrix)
 
     @property

@@ -88,22 +88,23 @@ class KernelCamera(NamedTuple):
 
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
     """Return camera and settings as kernels take them."""
-    left, top, right, bottom = tangent_limits(camera, settings)
+    limits = dict(zip(("left", "top", "right", "bottom"), tangent_limits(camera, settings), strict=True))
     added = dilation(camera, settings)
     # Half width = reach sqrt((A A^T)_xx + dilation), A = J R S: so at most
     # reach (|J_x| |R| size + sqrt(dilation)).
     reach = np.sqrt(-2 * np.log(min(settings.alpha_min, 1.0)))
-    wide, high = (0.0, 0.0) if camera.orthographic else (max(left, right), max(top, bottom))
+    wide, high = (
+        (0.0, 0.0)
+        if camera.orthographic
+        else (max(limits["left"], limits["right"]), max(limits["top"], limits["bottom"]))
+    )
     most = 1.001 * reach * np.linalg.norm(camera.rotation, 2)  # 1.001: room for rounding
     plane = {name: float(value) for name, value in vars(camera.intrinsics).items()}
     return KernelCamera(
         rotation=np.ascontiguousarray(camera.rotation),
         translation=np.ascontiguousarray(camera.world_to_camera[:3, 3]),
         **plane,
-        left=float(left),
-        right=float(right),
-        top=float(top),
-        bottom=float(bottom),
+        **{side: float(limit) for side, limit in limits.items()},
         near=float(settings.near),
         far=float(farthest(settings)),
         dilation=float(added),

@@ -381,26 +381,19 @@ class GlView(View):
         values = np.asarray(values)
         channels = check_array("values", values, (len(self.gaussians), "C"))["C"]
         image = np.zeros((self.camera.height, self.camera.width, channels), np.float32)
-        alpha = np.zeros(image.shape[:2], np.float32)
-        step = 3 * MAX_TARGETS
-        for start in range(0, max(channels, 1), step):
-            stop = max(min(start + step, channels), start + 1)  # a pass for alpha even without channels
-            parts = [values[:, i : min(i + 3, stop)] for i in range(start, stop, 3)]
-            targets = self._splat_parts(parts)
-            alpha = targets[0][..., 3]
-            for i, target in zip(range(start, stop, 3), targets, strict=True):
-                image[..., i : i + 3] = target[..., : min(3, channels - i)]
+        scene, alpha = self.rasterizer.scene(self.gaussians), np.zeros(image.shape[:2], np.float32)
+        firsts = range(0, max(channels, 1), 3)  # of textures; one for alpha even without channels
+        for some in (firsts[at : at + MAX_TARGETS] for at in range(0, len(firsts), MAX_TARGETS)):
+            sources = [scene.upload(values[:, first : first + 3]) for first in some]
+            try:
+                for first, texture in zip(some, self.rasterizer.draw(self, sources), strict=True):
+                    target = self._read(texture)
+                    alpha = target[..., 3]
+                    image[..., first : first + 3] = target[..., : min(3, channels - first)]
+            finally:
+                for source in sources:
+                    source.release()
         return image, alpha
-
-    def _splat_parts(self, parts: list[Array]) -> list[Array]:
-        """Up to four (N, <= 3) values -> as many (H, W, 4) float32 images."""
-        scene = self.rasterizer.scene(self.gaussians)
-        sources = [scene.upload(part) for part in parts]
-        try:
-            return [self._read(texture) for texture in self.rasterizer.draw(self, sources)]
-        finally:
-            for source in sources:
-                source.release()
 
     def _read(self, texture: moderngl.Texture) -> Array:
         flat = np.frombuffer(texture.read(), texture.dtype)
