@@ -17,7 +17,7 @@ from scipy.spatial.distance import pdist
 
 from langsplat_core.arrays import Array, check_array, near_power
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets.photos import WORKERS, Developed, Photo, View, developer, place
+from langsplat_core.datasets.photos import WORKERS, Developed, Photo, View, counted, developer, place
 from langsplat_core.datasets.workspace import Matches
 from langsplat_core.errors import InputError, report_loss
 from langsplat_core.io.hostile import PictureError
@@ -107,14 +107,14 @@ class Capture:
         """
         if not self.photos or longer_side >= max(max(self.images[index].shape) for index in indices):
             return self.shrunk(indices, longer_side)
-        view_of = developer(longer_side, self.cut_out)
+        layers_of = developer(longer_side)
 
         def view(index: int) -> View:
             try:
-                lens, image, mask = view_of(self.photos[index])
+                lens, image, mask, alpha = layers_of(self.photos[index])
             except PictureError as error:
                 raise InputError(f"{error}; it was there when this run began") from None
-            camera = self.cameras[index]
+            camera, mask = self.cameras[index], counted(mask, alpha, self.cut_out)
             return replace(lens, world_to_camera=camera.world_to_camera, name=camera.name), image, mask
 
         with ThreadPoolExecutor(WORKERS) as pool:

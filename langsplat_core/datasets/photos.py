@@ -298,22 +298,11 @@ View = tuple[Camera, Array, Array | None]
 OPAQUE, SOLID = 250, 5  # of 255: from where a pixel is the thing alone, and from where it is a part of it
 
 
-def developer(max_side: int, cut_out: bool) -> Callable[[Photo], View]:
-    """Return the function that makes views, at most `max_side` px long, of photographs; PictureError.
+def counted(mask: Array | None, alpha: Array | None, cut_out: bool) -> Array | None:
+    """Return the (H, W) bool pixels that count by a mask and by transparency; None: all.
 
     cut_out: pixels count that show anything of the thing; else those that show nothing but it.
     """
-    developed = _developer(max_side)
-
-    def view(photo: Photo) -> View:
-        camera, pixels, mask, alpha = developed(photo, lambda _: None)
-        return camera, pixels, _counted(mask, alpha, cut_out)
-
-    return view
-
-
-def _counted(mask: Array | None, alpha: Array | None, cut_out: bool) -> Array | None:
-    """Return the (H, W) bool pixels that count by a mask and by transparency; None: all."""
     if alpha is None:
         return mask
     solid = np.asarray(alpha >= (SOLID if cut_out else OPAQUE))
@@ -323,8 +312,11 @@ def _counted(mask: Array | None, alpha: Array | None, cut_out: bool) -> Array | 
 Layers = tuple[Camera, Array, Array | None, Array | None]  # a view, and its (H, W) uint8 alpha
 
 
-def _developer(max_side: int) -> Callable[[Photo, Tell], Layers]:
-    """Return the function that makes the layers of a photograph, and tells what was guessed."""
+def developer(max_side: int) -> Callable[..., Layers]:
+    """Return the function that makes the layers, at most `max_side` px long, of photographs; PictureError.
+
+    Its second argument, a `Tell`, is told what was guessed.
+    """
 
     # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
     @lru_cache(maxsize=4)
@@ -332,7 +324,7 @@ def _developer(max_side: int) -> Callable[[Photo, Tell], Layers]:
         camera = pinhole_for(intrinsics, max_side)
         return camera, None if intrinsics.distortion is None else source_positions(intrinsics, camera)
 
-    def developed(photo: Photo, tell: Tell) -> Layers:
+    def developed(photo: Photo, tell: Tell = lambda _: None) -> Layers:
         image, intrinsics = _read_for(photo, tell)
         camera, positions = plan(intrinsics)
         camera = replace(camera, world_to_camera=photo.world_to_camera)
@@ -390,7 +382,7 @@ def develop(photos: Sequence[Photo], config: DatasetConfig, progress: Progress) 
     order = sorted(range(len(photos)), key=names.__getitem__)
     told: list[tuple[str, str]] = []  # what was guessed, and of which photograph
 
-    developed = _developer(config.max_side)
+    developed = developer(config.max_side)
 
     def view(index: int) -> Layers | str:
         photo = photos[index]
@@ -398,7 +390,7 @@ def develop(photos: Sequence[Photo], config: DatasetConfig, progress: Progress) 
             camera, image, mask, alpha = developed(photo, lambda what: told.append((what, photo.label)))
         except hostile.PictureError as error:
             return f"{photo.label} ({error.reason})"
-        if (counted := _counted(mask, alpha, True)) is not None and not counted.any():
+        if (shown := counted(mask, alpha, True)) is not None and not shown.any():
             return f"{photo.label} (its mask leaves nothing of it)"
         return replace(camera, name=names[index]), image, mask, alpha
 
@@ -425,7 +417,7 @@ def develop(photos: Sequence[Photo], config: DatasetConfig, progress: Progress) 
         remedy = "a mask is called masks/NAME.jpg.png or masks/NAME.png after its photograph"
         report_loss("%d masks are of no photograph: %s; %s", len(stray), shortened(stray), remedy)
     cut_out = _cut_out(masks, alphas, config)
-    masks = tuple(_counted(mask, alpha, cut_out) for mask, alpha in zip(masks, alphas, strict=True))
+    masks = tuple(counted(mask, alpha, cut_out) for mask, alpha in zip(masks, alphas, strict=True))
     masks = masks if any(mask is not None for mask in masks) else ()
     return Developed(cameras, images, files, masks, cut_out)
 
