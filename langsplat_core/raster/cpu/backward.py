@@ -17,18 +17,9 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel
+from langsplat_core.raster.cpu import lanes as ln
 from langsplat_core.raster.cpu import projection as cp
 from langsplat_core.raster.cpu import tiles as tiling
-from langsplat_core.raster.cpu.lanes import (
-    lanes,
-    largest,
-    load,
-    prefetch,
-    reciprocal,
-    store,
-    store_totals,
-    where_greater,
-)
 from langsplat_core.raster.cpu.tiles import PIXELS, TILE, Tiles
 
 # Columns of the partial sums (two are unused); the gradient by the values follows them.
@@ -61,15 +52,15 @@ def _record(tile: int, tiles: Tiles, state: Array, spans: Array, tape: Array) ->
         low, high = tiling.rows_to_blend(tiles.rows[s], top, bottom)
         g = tiling.enter(tiles, s, min(s + tiling.AHEAD, last - 1))
         step, peak, w, v, w_step, v_step = tiling.begin_rows(g, x, y + low)
-        start, most = used, lanes(np.float32(0))
+        start, most = used, ln.lanes(np.float32(0))
         for row in range(low, high):
             added, before = tiling.blend_row(state, row * TILE, step + w, peak - v * v, tiles.cutoffs)
             w, v = w + w_step, v + v_step
-            store(tape, used, added)
-            store(tape, used + TILE, before)
-            most = where_greater(added, most, added, most)
+            ln.store(tape, used, added)
+            ln.store(tape, used + TILE, before)
+            most = ln.where_greater(added, most, added, most)
             used += _ENTRY
-        if largest(most) > 0:
+        if ln.largest(most) > 0:
             spans[s - first, 0], spans[s - first, 1] = low, high
         else:
             used = start
@@ -118,26 +109,26 @@ def backward(
             g = tiling.enter(tiles, s, max(s - tiling.AHEAD, start))
             x = values[tiles.ranks[s]]
             step, _, offset, v, w_step, v_step = tiling.begin_rows(g, left, top + low)
-            q0 = qw = qv = qww = qwv = qvv = none = lanes(np.float32(0))
+            q0 = qw = qv = qww = qwv = qvv = none = ln.lanes(np.float32(0))
             for row in range(low, high):
                 w = step + offset
                 at = used + (row - low) * _ENTRY
-                alpha, before = load(tape, at), load(tape, at + TILE)
+                alpha, before = ln.load(tape, at), ln.load(tape, at + TILE)
                 weight = alpha * before
-                store(weights, (row - low) * TILE, weight)
-                slope = load(plane, row * TILE)
+                ln.store(weights, (row - low) * TILE, weight)
+                slope = ln.load(plane, row * TILE)
                 for line in range(channels):
-                    slope = slope + load(planes, (row * lines + line) * TILE) * x[line]
-                hidden = load(behind, row * TILE)
-                store(behind, row * TILE, hidden + weight * slope)
-                q = weight * slope - hidden * alpha * reciprocal(1.0 - alpha)
-                q = where_greater(tiles.cutoffs.alpha_max, alpha, q, 0.0)
+                    slope = slope + ln.load(planes, (row * lines + line) * TILE) * x[line]
+                hidden = ln.load(behind, row * TILE)
+                ln.store(behind, row * TILE, hidden + weight * slope)
+                q = weight * slope - hidden * alpha * ln.reciprocal(1.0 - alpha)
+                q = ln.where_greater(tiles.cutoffs.alpha_max, alpha, q, 0.0)
                 moved, lifted = q * w, q * v
                 q0, qw, qv = q0 + q, qw + moved, qv + lifted
                 qww, qwv, qvv = qww + moved * w, qwv + moved * v, qvv + lifted * v
                 offset, v = offset + w_step, v + v_step
-            store_totals(partial, s * columns, q0, qw, qv, qww)
-            store_totals(partial, s * columns + QWV, qwv, qvv, none, none)
+            ln.store_totals(partial, s * columns, q0, qw, qv, qww)
+            ln.store_totals(partial, s * columns + QWV, qwv, qvv, none, none)
             tiling.correlate(planes, lines, weights, low, high, partial, s, MOMENTS)
 
 
@@ -168,16 +159,16 @@ def _fetch(i: int, last: int, tiles: Tiles, sums: Sums) -> None:
     """Ask for the memory of rows after `i`, in steps: each needs what the one before brought."""
     rank = sums.rank_of[min(i + 3 * tiling.AHEAD, last - 1)]
     if rank >= 0:
-        prefetch(tiles.firsts, np.int64(rank))
-        prefetch(tiles.geometry, np.int64(rank) * cp.COLUMNS)
+        ln.prefetch(tiles.firsts, np.int64(rank))
+        ln.prefetch(tiles.geometry, np.int64(rank) * cp.COLUMNS)
     rank = sums.rank_of[min(i + 2 * tiling.AHEAD, last - 1)]
     if rank >= 0:
-        prefetch(tiles.slots, tiles.firsts[rank])
+        ln.prefetch(tiles.slots, tiles.firsts[rank])
     rank = sums.rank_of[min(i + tiling.AHEAD, last - 1)]
     if rank >= 0:
         for n in range(tiles.firsts[rank], min(tiles.firsts[rank + 1], tiles.firsts[rank] + 4)):
             if sums.reached[tiles.slots[n]]:
-                prefetch(sums.partial, np.int64(tiles.slots[n]) * sums.partial.shape[1])
+                ln.prefetch(sums.partial, np.int64(tiles.slots[n]) * sums.partial.shape[1])
 
 
 @helper

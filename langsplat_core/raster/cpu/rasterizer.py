@@ -19,17 +19,10 @@ from langsplat_core.compiled import Workers, helper, kernel, plain, shared_worke
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import InputError
 from langsplat_core.raster.cpu import backward, projection
+from langsplat_core.raster.cpu import lanes as ln
 from langsplat_core.raster.cpu import tiles as tiling
 from langsplat_core.raster.cpu.backward import GaussianGradients
-from langsplat_core.raster.cpu.lanes import (
-    Lanes,
-    lanes,
-    load,
-    prefetch,
-    store,
-    where_at_least,
-    where_greater,
-)
+from langsplat_core.raster.cpu.lanes import Lanes
 from langsplat_core.raster.cpu.tiles import PIXELS, TILE, Tiles
 from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, LiftingView, mean_depth
 from langsplat_core.scene import Camera, Gaussians
@@ -39,8 +32,8 @@ from langsplat_core.scene import Camera, Gaussians
 def _fetch_values(work: Any, s: int, later: int) -> Array:
     ranks, values, _ = work
     lines = values.shape[1]
-    prefetch(values, np.int64(ranks[later]) * lines)
-    prefetch(values, np.int64(ranks[later]) * lines + lines - 1)
+    ln.prefetch(values, np.int64(ranks[later]) * lines)
+    ln.prefetch(values, np.int64(ranks[later]) * lines + lines - 1)
     return values[ranks[s]]
 
 
@@ -67,7 +60,7 @@ def splat_tiles(first: int, last: int, tiles: Tiles, values: Array, image: Array
 
 @helper
 def _store_weight(work: Any, mine: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
-    store(work[0], (row - low) * TILE, weight)
+    ln.store(work[0], (row - low) * TILE, weight)
 
 
 @helper
@@ -97,7 +90,7 @@ def sum_partials(first: int, last: int, tiles: Tiles, order: Array, partial: Arr
     for rank in range(first, last):
         sums[:] = 0
         for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
-            prefetch(partial, np.int64(tiles.slots[min(n + 2 * tiling.AHEAD, end)]) * partial.shape[1])
+            ln.prefetch(partial, np.int64(tiles.slots[min(n + 2 * tiling.AHEAD, end)]) * partial.shape[1])
             for channel in range(sums.shape[0]):
                 sums[channel] += partial[tiles.slots[n], channel]
         for channel in range(out.shape[1]):
@@ -113,8 +106,8 @@ def _fetch_depth(work: Any, s: int, later: int) -> Any:
 @helper
 def _note_half(work: Any, depth: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
     found, at, half = work[2], row * TILE, np.float32(0.5)
-    passed = where_greater(before, half, lanes(depth), load(found, at))
-    store(found, at, where_at_least(half, before - weight, passed, load(found, at)))
+    passed = ln.where_greater(before, half, ln.lanes(depth), ln.load(found, at))
+    ln.store(found, at, ln.where_at_least(half, before - weight, passed, ln.load(found, at)))
 
 
 @kernel
@@ -245,7 +238,7 @@ def _fetch_place(work: Any, s: int, later: int) -> Any:
 @helper
 def _add_to_plane(work: Any, plane: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
     at = plane * PIXELS + row * TILE
-    store(work[1], at, load(work[1], at) + weight)
+    ln.store(work[1], at, ln.load(work[1], at) + weight)
 
 
 @kernel
