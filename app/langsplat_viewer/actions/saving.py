@@ -109,8 +109,7 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
 def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the camera, in perspective, to a new file that `--camera` reads; its path, None if that failed."""
     state = viewer.state
-    if state.view is None:
-        viewer.has_scene("save a view of it")
+    if not viewer.has_scene("save a view of it") or state.view is None:
         return None
     path = _new_file(viewer, folder, ".json", "-view")
     camera = replace(state.view, orthographic=False).camera(*state.size).moved(state.origin)
@@ -342,7 +341,7 @@ def run_export(viewer: Viewer, form: ExportForm, out: Path) -> None:
                     progress(f"{form.title}: {stage}", fraction)
                     time.sleep(0.1)
             finally:
-                process.end()
+                process.end(patience=3.0)  # less than a window that closes waits for it
         return out, _said(process, out)
 
     def then() -> None:
@@ -397,23 +396,18 @@ def save_as(viewer: Viewer) -> None:
     """Have a dialog ask for the file that the project is saved to from now on."""
     if viewer.has_scene("save the project"):
         new = _new_file(viewer, folder_of(viewer), PROJECTS)
-        choice = FileChoice("Save the project", _save_to, "save", (PROJECTS,), new)
-        ask_for(viewer, choice)
+        ask_for(viewer, FileChoice("Save the project", save_project, "save", (PROJECTS,), new))
 
 
-def _save_to(viewer: Viewer, path: Path) -> None:
-    save_project(viewer, to=path)
-
-
-def save_project(viewer: Viewer, folder: Path = Path(), to: Path | None = None) -> Path | None:
-    """Save the project, as `to` or to the file that it came from or to a new one in `folder`.
+def save_project(viewer: Viewer, to: Path = Path()) -> Path | None:
+    """Save the project as `to`, or where that is a folder to the file that it came from or a new one there.
 
     Return where it is, None where that failed.
     """
     state = viewer.state
     if not viewer.has_scene("save the project") or not (state.scene and state.path and state.view):
         return None
-    path = to or state.project or _new_file(viewer, folder, PROJECTS)
+    path = to if to.name.endswith(PROJECTS) else state.project or _new_file(viewer, to, PROJECTS)
     read = state.project_read if path == state.project else None
     project = Project(
         scene=os.path.abspath(state.path),
