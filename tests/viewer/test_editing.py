@@ -349,7 +349,7 @@ def test_export_size_is_said_before_it_is_written(viewer, tmp_path, suffix):
     [("web page", "a.html", "opens in any browser"), ("scene", "a.spz", "240 Gaussians")],
 )
 def test_edited_scene_is_exported(pruned, tmp_path, title, name, what):
-    saving.run_export(pruned, form_of(pruned, title, suffix=Path(name).suffix), tmp_path / name)
+    saving.run_export(pruned, tmp_path / name, form_of(pruned, title, suffix=Path(name).suffix))
     recorded(pruned)
     said = pruned.state.messages[-1]
     assert said.file == tmp_path / name
@@ -364,7 +364,7 @@ FAILS = "import sys; sys.exit('langsplat: no cameras; mend that')"
 def test_cancelled_export_ends_its_command(opened, tmp_path, monkeypatch):
     monkeypatch.setattr(saving, "program", lambda: [sys.executable, "-c", SLOW])
     began = time.monotonic()
-    saving.run_export(opened, form_of(opened, "mesh"), tmp_path / "a.glb")
+    saving.run_export(opened, tmp_path / "a.glb", form_of(opened, "mesh"))
     opened.recorder.cancel()
     recorded(opened)
     assert time.monotonic() - began < 30
@@ -373,23 +373,23 @@ def test_cancelled_export_ends_its_command(opened, tmp_path, monkeypatch):
 
 def test_failed_export_of_a_command_says_why(opened, tmp_path, monkeypatch):
     monkeypatch.setattr(saving, "program", lambda: [sys.executable, "-c", FAILS])
-    saving.run_export(opened, form_of(opened, "mesh"), tmp_path / "a.glb")
+    saving.run_export(opened, tmp_path / "a.glb", form_of(opened, "mesh"))
     recorded(opened)
     assert errors(opened) == ["no cameras; mend that"]
-    saving.run_export(opened, form_of(opened, "scene"), opened.state.path)
+    saving.run_export(opened, opened.state.path, form_of(opened, "scene"))
     recorded(opened)
     assert "would replace the original scene" in errors(opened)[-1]
 
 
 def test_exported_selection_has_its_field(pruned, tmp_path):
     take(pruned, blob("mug"))
-    saving.run_export(pruned, form_of(pruned, "scene", only_selected=True), tmp_path / "mug.ply")
+    saving.run_export(pruned, tmp_path / "mug.ply", form_of(pruned, "scene", only_selected=True))
     recorded(pruned)
     written, means = load_scene(tmp_path / "mug.ply"), SCENES["blobs.ply"].gaussians.means
     np.testing.assert_array_equal(written.gaussians.means, means[blob("mug")])
     assert (len(written.language), len(written.cameras)) == (120, 3)
     assert pruned.state.is_unsaved  # the scene is not
-    saving.run_export(pruned, form_of(pruned, "scene"), tmp_path / "all.ply")
+    saving.run_export(pruned, tmp_path / "all.ply", form_of(pruned, "scene"))
     recorded(pruned)
     assert not pruned.state.is_unsaved
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import wait
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -304,16 +305,13 @@ def choose_export(viewer: Viewer) -> None:
     form, viewer.state.export_form = viewer.state.export_form, None
     if form is None:
         return
-
-    def then(viewer: Viewer, out: Path) -> None:
-        run_export(viewer, form, out)
-
+    then = partial(run_export, form=form)
     new = _new_file(viewer, folder_of(viewer), form.suffix, f"-{form.title.split()[0]}")
     choice = FileChoice(f"Export: {form.title}", then, "save", (form.suffix,), new)
     ask_for(viewer, choice if form.suffix else replace(choice, kind="folder", start=new.parent))
 
 
-def run_export(viewer: Viewer, form: ExportForm, out: Path) -> None:
+def run_export(viewer: Viewer, out: Path, form: ExportForm) -> None:
     """Have the recorder's thread run the command, on the scene's file or, if it was edited, a copy."""
     state, row, path, session = viewer.state, EXPORTS[form.title], viewer.state.path, viewer.state.session
     assert state.scene is not None
