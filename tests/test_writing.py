@@ -34,7 +34,6 @@ from langsplat_viewer.output import Film, save_png, write_film
 from langsplat_viewer.projects import (
     Bookmark,
     Project,
-    Shelf,
     load_preferences,
     save_preferences,
     write_flight,
@@ -173,11 +172,6 @@ def flight(folder: Path) -> None:
     write_flight(folder / "f.path.json", some_flight())
 
 
-def bookmarks(folder: Path) -> None:
-    pose = some_flight().keyframes[0].pose
-    Shelf(folder).write(Path("s.ply"), (Bookmark("door", pose, 1.0),))
-
-
 def project(folder: Path) -> None:
     view = Bookmark("view", some_flight().keyframes[0].pose, 1.0)
     content = Project(str(folder / "s.ply"), len(GAUSSIANS), view, Session())
@@ -213,14 +207,13 @@ WRITERS: dict[str, Write] = {
     "film .mp4": film("film.mp4"),
     "pictures of a film": film("film"),
     "camera path": flight,
-    "bookmarks": bookmarks,
     "project": project,
     "preferences": lambda folder: save_preferences(folder, Preferences()),
 }
 
 
 # What is there counts as done, or must make sense.
-ONLY_NEW = {"stage", "stage's array", "bookmarks", "project", "pictures of a film"}
+ONLY_NEW = {"stage", "stage's array", "project", "pictures of a film"}
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -303,20 +296,6 @@ def test_two_windows_keep_what_each_changed(tmp_path: Path) -> None:
     for new in "ab":
         save_preferences(tmp_path, Preferences(recent=(new, "old")), Preferences(recent=("old",)))
     assert load_preferences(tmp_path).recent == ("b", "a", "old")
-
-
-def test_bookmarks_kept_at_once_are_all_there(tmp_path: Path) -> None:
-    pose = some_flight().keyframes[0].pose
-    names = [Path(f"{number}.ply") for number in range(40)]
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda name: Shelf(tmp_path).write(name, (Bookmark("door", pose, 1.0),)), names))
-    assert all(Shelf(tmp_path).read(name) for name in names)
-    door, window, stair = (Bookmark(name, pose, 1.0) for name in ("door", "window", "stair"))
-    Shelf(tmp_path).write(names[0], (door, window), (door,))
-    Shelf(tmp_path).write(names[0], (stair,), (door,))
-    assert [mark.name for mark in Shelf(tmp_path).read(names[0])] == ["stair", "window"]
-    kept = Shelf(tmp_path).write(names[1], (window, stair), (window,))  # which a project had, and no shelf
-    assert [mark.name for mark in kept] == ["window", "stair", "door"]
 
 
 @pytest.mark.parametrize("size", [3, 300_000])

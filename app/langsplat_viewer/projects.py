@@ -13,7 +13,7 @@ import os
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -237,69 +237,28 @@ def write_flight(path: Path | str, flight: Flight) -> None:
     _write(Path(path), {PATH_MARK: PATH_VERSION, "keyframes": keyframes})
 
 
-# Bookmarks, kept per scene in the folder of the preferences: {"version": 1, "scenes": {path: [{"name",
-# "distance" to what the view turns around, and a pose}]}}
+# Bookmarks that earlier versions kept of each scene in the folder of the preferences, and not in its project:
+# {"version": 1, "scenes": {path: [{"name", "distance" to what the view turns around, and a pose}]}}
 
 BOOKMARKS = "bookmarks.json"
-MOST_SCENES = 200  # those that were marked last
 
 
-@dataclass(frozen=True)
-class Shelf:
-    """All bookmarks of a user."""
+def read_bookmarks(folder: Path | None, scene: Path) -> tuple[Bookmark, ...]:
+    """Read what an earlier version kept of a scene. InputError where the file makes no sense."""
+    path = None if folder is None else folder / BOOKMARKS
+    if path is None or not path.exists():
+        return ()
 
-    folder: Path | None = None  # of the preferences; None: nothing is read and nothing is written
+    def decode(top: Any) -> tuple[Bookmark, ...]:
+        if top["version"] != 1:
+            raise ValueError("of another version")
+        entries = map(_nested, top["scenes"].get(str(scene.absolute()), [])[:MOST_BOOKMARKS])
+        bookmarks: tuple[Bookmark, ...] = _converted(list(entries), tuple[Bookmark, ...])
+        for bookmark in bookmarks:
+            _check_pose(bookmark.pose)
+        return tuple(replace(bookmark, name=_line(bookmark.name)) for bookmark in bookmarks)
 
-    def read(self, scene: Path) -> tuple[Bookmark, ...]:
-        """Read the bookmarks of a scene. InputError where the file makes no sense."""
-        return self._read(scene)[1]
-
-    def write(
-        self, scene: Path, bookmarks: tuple[Bookmark, ...], before: tuple[Bookmark, ...] = ()
-    ) -> tuple[Bookmark, ...]:
-        """Keep the bookmarks of a scene beside those of others; return those that are kept.
-
-        before: as they were, also where they came from a project; what another window added or changed since
-        then stays. InputError where the file that is there makes no sense, or they are too many: it stays as
-        it is. OSError where it cannot be written.
-        """
-        if self.folder is None:
-            return bookmarks
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with locked(self.folder):
-            scenes, there = self._read(scene)
-            scenes.pop(str(scene.absolute()), None)
-            old, own, other = (_by_key("bookmarks", plain(part)) for part in (before, bookmarks, there))
-            old = {name: entry for name, entry in old.items() if name in other}  # what is not kept yet is new
-            kept = list(_both(old, own, other, 1, []).values())
-            if len(kept) > MOST_BOOKMARKS:
-                raise InputError(f"with another window's there are more than {MOST_BOOKMARKS}: delete one")
-            if kept:
-                scenes[str(scene.absolute())] = [_flat(dict(entry)) for entry in kept]
-            last = dict(list(scenes.items())[-MOST_SCENES:])
-            _write(self.folder / BOOKMARKS, {"version": 1, "scenes": last})
-        merged: tuple[Bookmark, ...] = _converted(kept, tuple[Bookmark, ...])
-        return merged
-
-    def _read(self, scene: Path) -> tuple[dict[str, list[Any]], tuple[Bookmark, ...]]:
-        """Return the entries of all scenes, and the bookmarks of one."""
-        path = None if self.folder is None else self.folder / BOOKMARKS
-        if path is None or not path.exists():
-            return {}, ()
-
-        def decode(top: Any) -> tuple[dict[str, list[Any]], tuple[Bookmark, ...]]:
-            if top["version"] != 1:
-                raise ValueError("of another version")
-            scenes = _converted(top["scenes"], dict[str, list[Any]])
-            own = [_nested(entry) for entry in scenes.get(str(scene.absolute()), [])[:MOST_BOOKMARKS]]
-            bookmarks: tuple[Bookmark, ...] = _converted(own, tuple[Bookmark, ...])
-            for bookmark in bookmarks:
-                _check_pose(bookmark.pose)
-            return scenes, tuple(
-                replace(bookmark, name=printable_line(bookmark.name)) for bookmark in bookmarks
-            )
-
-        return _read(path, "bookmarks of this version, mend or delete the file", decode)
+    return _read(path, "bookmarks of this version, mend or delete the file", decode)
 
 
 # Projects: a scene and its session.

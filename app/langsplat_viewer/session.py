@@ -271,7 +271,7 @@ class Session:
     def undone(self, now: "Session") -> "Session":
         """Return this earlier session with what is never undone as it is `now`."""
         ruler = now.ruler if now.moves == self.moves else replace(now.ruler, points=())
-        return replace(self, bookmarks=now.bookmarks, ruler=ruler)
+        return replace(self, ruler=ruler)
 
     def of_next_scene(self, bookmarks: tuple[Bookmark, ...]) -> "Session":
         """Return the session that another scene begins with: settings of the window stay."""
@@ -285,16 +285,17 @@ class Session:
         """
         kept: dict[str, Any] = {name: getattr(now, name) for name in OF_WINDOW}
         kept |= {"picture": replace(now.picture, display=self.picture.display)}
-        kept |= {"latent_level": self.latent_level, "bookmarks": now.bookmarks}
+        kept |= {"latent_level": self.latent_level}
         return replace(self, **kept, marks=Marked(), moves=())
 
 
 # What led from a session to the next, for undo to name it.
 
 CHANGES = {  # fields of a session -> words
-    "moves": "transform", "things": "name", "notes": "note", "keyframes": "keyframe", "picture": "display",
-    "latent_level": "display", "split": "comparison", "splats": "splats", "clip": "near and far cut",
-    "overlays": "overlay", "level": "level of the search", "adds": "new answers", "queries": "answers shown",
+    "moves": "transform", "things": "name", "notes": "note", "bookmarks": "bookmark", "keyframes": "keyframe",
+    "picture": "display", "latent_level": "display", "split": "comparison", "splats": "splats",
+    "clip": "near and far cut", "overlays": "overlay", "level": "level of the search", "adds": "new answers",
+    "queries": "answers shown",
 }  # fmt: skip
 MARKINGS = {"deleted": ("delete", "restore"), "hidden": ("hide", "show"), "selected": ("select", "deselect")}
 

@@ -267,9 +267,9 @@ class SceneState:
 
     @property
     def has_unsaved_notes(self) -> bool:
-        """True where no project has the notes and names that there are."""
-        session, saved = self.session, self.saved
-        return (session.things, session.notes) != (saved.things, saved.notes)
+        """True where no project has the names, notes and bookmarks that there are."""
+        now, saved = ((one.things, one.notes, one.bookmarks) for one in (self.session, self.saved))
+        return now != saved
 
     @property
     def is_changed(self) -> bool:

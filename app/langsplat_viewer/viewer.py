@@ -20,7 +20,6 @@ from langsplat_core.semantics.encoders import DEMO
 from langsplat_core.semantics.weights import local_path
 from langsplat_viewer.disk import Stamps, Watch
 from langsplat_viewer.jobs import Job, Worker, one_line
-from langsplat_viewer.projects import Shelf
 from langsplat_viewer.rendering.request import RenderRequest
 from langsplat_viewer.session import Point, Session
 from langsplat_viewer.state import SceneState, TrainingForm, ViewerState
@@ -185,7 +184,7 @@ class Viewer:
     recorder: Worker = field(default_factory=Worker)  # films: minutes, while one looks and searches on
     watch: Watch = field(default_factory=Watch)  # over the files of the scene shown
     visits: dict[Path, SceneState] = field(default_factory=dict)  # of scenes that were left, see `visit`
-    shelf: Shelf = field(default_factory=Shelf)
+    folder: Path | None = None  # of the preferences; None: nothing is remembered
     history: History = field(default_factory=History)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     describer: Describer | None = None  # of the same scene, once it was needed

@@ -166,7 +166,7 @@ class Window:
 
         `path`: what is opened; None: the start page.
         """
-        self.viewer = Viewer(services, shelf=projects.Shelf(folder))
+        self.viewer = Viewer(services, folder=folder)
         self.failure: LangSplatError | None = None  # why the window could not work
         self._path, self._options, self._size = path, options, options.wanted_size
         self._make_renderer, self._budget = make_renderer, budget

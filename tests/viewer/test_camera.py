@@ -10,11 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.scene import Camera, Intrinsics, Scene
-from langsplat_viewer.actions import settings, viewpoint
+from langsplat_viewer.actions import editing, settings, viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.camera.controls import OrbitCamera, from_side, spanning
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of
-from langsplat_viewer.projects import BOOKMARKS, Shelf
+from langsplat_viewer.projects import BOOKMARKS
 from langsplat_viewer.rendering.renderer import renderer_for
 from langsplat_viewer.rendering.request import Clip, depth_range, image_formation, plain_request, why_nothing
 from langsplat_viewer.state import GLIDE_SECONDS, QueryAnswer
@@ -358,34 +358,28 @@ def names(viewer) -> list[str]:
     return [bookmark.name for bookmark in viewer.state.session.bookmarks]
 
 
-def test_a_bookmark_leads_back_and_is_there_the_next_time(opened, tmp_path):
-    opened.shelf = Shelf(tmp_path / "settings")
+def test_a_bookmark_leads_back_and_is_undone(opened):
     viewpoint.move(opened, lambda view: controls.orbit(view, 0.4, 0.1))
     marked = opened.state.view
     viewpoint.add_bookmark(opened, "  the  mug ")
-    open_scene(opened, "plain.ply")
-    assert names(opened) == []
+    assert opened.state.is_changed
     viewpoint.add_bookmark(opened)
-    open_scene(opened, "blobs.ply")
-    assert names(opened) == ["the mug"]
+    assert names(opened) == ["the mug", "view 2"]
+    viewpoint.delete_bookmark(opened, opened.state.session.bookmarks[0])
+    assert names(opened) == ["view 2"]
+    editing.undo(opened)
     go(viewpoint.go_to_bookmark, opened, opened.state.session.bookmarks[0])
     assert_same(opened.state.view, marked)
-    viewpoint.delete_bookmark(opened, opened.state.session.bookmarks[0])
-    open_scene(opened, "blobs.ply")
-    assert names(opened) == []
     open_scene(opened, "plain.ply")
-    assert names(opened) == ["view 1"]
+    assert names(opened) == []
 
 
-def test_bookmarks_that_make_no_sense_are_said_and_kept(opened, tmp_path):
+def test_bookmarks_of_an_earlier_version_that_make_no_sense_are_said(opened, tmp_path):
     (tmp_path / BOOKMARKS).write_text('{"version": 2, "scenes": {}}')
-    opened.shelf = Shelf(tmp_path)
+    opened.folder = tmp_path
     open_scene(opened, "blobs.ply")
     assert names(opened) == []
     assert BOOKMARKS in errors(opened)[0]
-    viewpoint.add_bookmark(opened, "here")
-    assert "not kept" in errors(opened)[-1]
-    assert "here" not in (tmp_path / BOOKMARKS).read_text()
 
 
 def view_with_up(up) -> controls.OrbitCamera:

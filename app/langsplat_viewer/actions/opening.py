@@ -178,7 +178,8 @@ def return_to(viewer: Viewer, visit: SceneState) -> None:
     if visit.camera_index is not None and visit.camera_index < len(state.scene.cameras):
         state.camera_index = visit.camera_index
     session, saved = visit.session.moved(offset).found_again(now=state.session), visit.saved.moved(offset)
-    state.saved = replace(state.session, things=saved.things, notes=saved.notes)
+    kept = {name: getattr(saved, name) for name in ("things", "notes", "bookmarks")}
+    state.saved = replace(state.session, **kept)
     state.project, state.project_read = visit.project, visit.project_read
     take_session(viewer, session if visit.count == state.count else replace(session, things=Things()))
 

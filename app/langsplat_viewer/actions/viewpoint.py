@@ -14,12 +14,12 @@ from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera
+from langsplat_viewer import projects
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera import controls, flight
 from langsplat_viewer.camera.controls import Extent, OrbitCamera, Side
 from langsplat_viewer.camera.flight import Keyframe, Motion
 from langsplat_viewer.camera.overlays import FRUSTUM_DEPTH, frusta
-from langsplat_viewer.jobs import one_line
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight
 from langsplat_viewer.rendering.request import Split, image_formation
 from langsplat_viewer.session import LONGEST_NAME, MOST_BOOKMARKS, Bookmark, Query
@@ -451,7 +451,7 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
     if len(others) >= MOST_BOOKMARKS:
         viewer.say_error(f"a scene has at most {MOST_BOOKMARKS} bookmarks: delete one")
         return
-    _keep(viewer, (*others, added))
+    viewer.change(bookmarks=(*others, added))
     state.say(f"bookmark '{added.name}'")
 
 
@@ -470,27 +470,14 @@ def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
 
 def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
     """Take a bookmark off the list."""
-    _keep(viewer, tuple(other for other in viewer.state.session.bookmarks if other is not bookmark))
+    kept = tuple(other for other in viewer.state.session.bookmarks if other is not bookmark)
+    viewer.change(bookmarks=kept)
 
 
 def read_bookmarks(viewer: Viewer, path: Path, origin: Array) -> tuple[Bookmark, ...]:
-    """Read the bookmarks of a scene file with an `origin` (3,); where they make no sense, say so."""
+    """Read what an earlier version kept of a scene with an `origin` (3,); where it makes no sense, say so."""
     try:
-        return tuple(bookmark.moved(-origin) for bookmark in viewer.shelf.read(path))
+        return tuple(bookmark.moved(-origin) for bookmark in projects.read_bookmarks(viewer.folder, path))
     except InputError as error:
         viewer.say_error(str(error))
         return ()
-
-
-def _keep(viewer: Viewer, bookmarks: tuple[Bookmark, ...]) -> None:
-    state, before = viewer.state, viewer.state.session.bookmarks
-    viewer.put(bookmarks=bookmarks)
-    if state.path is None:
-        return
-    now, then = (tuple(mark.moved(state.origin) for mark in part) for part in (bookmarks, before))
-    try:
-        kept = viewer.shelf.write(state.path, now, then)
-        if len(kept) > len(bookmarks):  # another window's, too
-            viewer.put(bookmarks=tuple(mark.moved(-state.origin) for mark in kept))
-    except (OSError, InputError) as error:
-        viewer.say_error(f"bookmarks not kept: {one_line(error)}")
