@@ -177,7 +177,7 @@ def _orthographic(ctx: Any, window: Window) -> None:
 
 def _film(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    settings.open_panel(viewer, "Record")
+    settings.open_panel(viewer, "Timeline")
     for _ in range(4):
         viewpoint.step_camera(viewer, 2)
         _settled(ctx, window)

@@ -69,11 +69,7 @@ def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
     """Return the docks of a window `width` units wide, and the windows in them, for hello_imgui to draw."""
     docking = hello_imgui.DockingParams()
     docking.layout_name = INSPECTOR  # what was kept of other layouts is not taken for it
-    share = min(COLUMN * viewer.state.preferences.ui_scale / width, MOST_SHARE)
-    docking.docking_splits = [
-        hello_imgui.DockingSplit(ui.MAIN_DOCK, INSPECTOR, imgui.Dir.right, share),
-        hello_imgui.DockingSplit(ui.MAIN_DOCK, FOOT, imgui.Dir.down, FOOT_SHARE),
-    ]
+    docking.docking_splits = _splits(viewer.state.preferences.ui_scale, width)
     inspector = Panel(INSPECTOR, draw_inspector, dock=INSPECTOR)
     windows = (inspector, *(panel for panel in all_panels() if panel.dock == FOOT))
     docking.dockable_windows = [_window(viewer, panel) for panel in windows]
@@ -85,6 +81,14 @@ def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
     return docking
 
 
+def _splits(scale: float, width: float) -> list[hello_imgui.DockingSplit]:
+    share = min(COLUMN * scale / width, MOST_SHARE)
+    return [
+        hello_imgui.DockingSplit(ui.MAIN_DOCK, INSPECTOR, imgui.Dir.right, share),
+        hello_imgui.DockingSplit(ui.MAIN_DOCK, FOOT, imgui.Dir.down, FOOT_SHARE),
+    ]
+
+
 def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
     window = hello_imgui.DockableWindow(panel.title, panel.dock, lambda: panel.draw(viewer), False)
     window.remember_is_visible = False  # the preferences do
@@ -94,10 +98,11 @@ def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
 
 def draw_inspector(viewer: Viewer) -> None:
     """Draw the sections, each below its header; the one that is wanted is scrolled to."""
+    are_open = opened(viewer.state)
     for panel in all_panels():
         if panel.dock != INSPECTOR:
             continue
-        was_open = panel.title in opened(viewer.state)
+        was_open = panel.title in are_open
         imgui.set_next_item_open(was_open)
         if viewer.state.wanted_panel == panel.title:
             settings.take(viewer.state, "wanted_panel")
@@ -126,7 +131,8 @@ class Docks:
         params, state = hello_imgui.get_runner_params(), viewer.state
         docking, scale = params.docking_params, state.preferences.ui_scale
         if self._scale not in (0.0, scale):
-            _widen(COLUMN * scale)
+            docking.docking_splits = _splits(scale, imgui.get_main_viewport().size.x)
+            docking.layout_reset = True
         self._scale = scale
         if settings.take(state, "resets_panels"):
             settings.prefer(viewer, panels=None)
@@ -150,19 +156,6 @@ class Docks:
                 docking.focus_dockable_window(wanted if is_window else INSPECTOR)
             if not is_section:  # which is scrolled to when it is drawn
                 settings.take(state, "wanted_panel")
-
-
-def _widen(width: float) -> None:
-    """Make the column beside the scene `width` units wide, as long as it lies there."""
-    docking = hello_imgui.get_runner_params().docking_params
-    root = docking.dock_space_id_from_name(ui.MAIN_DOCK)
-    node = imgui.internal.dock_builder_get_node(docking.dock_space_id_from_name(INSPECTOR) or 0)
-    while node is not None and node.parent_node is not None and node.parent_node.id_ != root:
-        node = node.parent_node
-    above = None if node is None else node.parent_node
-    if node is not None and above is not None and above.split_axis == imgui.internal.Axis.x:
-        width = min(width, MOST_SHARE * imgui.get_main_viewport().size.x)
-        imgui.internal.dock_builder_set_node_size(node.id_, ImVec2(width, node.size.y))
 
 
 def draw_titles(viewer: Viewer) -> None:

@@ -212,7 +212,7 @@ FIRST_STEPS = (
     ("Relevancy", "From 0 to 1: how much nearer a place is to the phrase than to everyday words; "
      "0.5 is neither. What has less than the threshold is no part of the answer."),
     ("Subpart, part, whole", "How finely things are divided: the knob, the lid, the teapot."),
-    ("Displays, tools", "The strip at the left edge. The panel Outline lists what the scene holds."),
+    ("Displays, tools", "The strip at the left edge. The section Outline lists what the scene holds."),
     ("Everything else", "Ctrl + Shift + P finds every command by its words. Without a mouse: Ctrl + Tab goes "
      "to the next panel, Tab and arrows travel in it."),
 )  # fmt: skip

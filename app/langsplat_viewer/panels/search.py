@@ -22,7 +22,7 @@ from langsplat_viewer.viewer import Viewer
 TITLE = "Search"
 HINT = "what to look for"
 HINT_EXAMPLES = 2
-OFFER_LINES = 2  # more are scrolled to
+OFFER_LINES = 2  # that are seen
 FOLD = f"{icons_fontawesome_6.ICON_FA_CHEVRON_UP}##fold"
 
 
@@ -58,7 +58,9 @@ def _box(viewer: Viewer) -> None:
     imgui.push_style_var(imgui.StyleVar_.frame_padding, hello_imgui.em_to_vec2(0.65, 0.15))
     imgui.push_style_var(imgui.StyleVar_.item_spacing, hello_imgui.em_to_vec2(0.4, 0.4))
     height = OFFER_LINES * imgui.get_frame_height_with_spacing()  # with or without offers
-    if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.nav_flattened):
+    height -= imgui.get_style().item_spacing.y
+    hidden = imgui.WindowFlags_.no_scrollbar
+    if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.nav_flattened, hidden):
         is_pointed_at = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item)
         title, phrases = queries.offered(viewer, drafts.get(label, ""), is_pointed_at)
         if phrases:
@@ -149,8 +151,9 @@ def _answers(viewer: Viewer) -> None:
 def _line(viewer: Viewer, query: Query) -> None:
     """Colour, phrase, verdict and a button to take it off; the phrase gets what the others leave."""
     spacing, side = imgui.get_style().item_spacing.x, imgui.get_frame_height()
-    verdict_width = ui.width_of("found, by chance 0.00 %")
-    left, right = imgui.get_cursor_pos_x(), imgui.get_content_region_avail().x
+    result, left = viewer.state.result(query), imgui.get_cursor_pos_x()
+    right = imgui.get_content_region_avail().x
+    verdict_width = min(ui.width_of(result.said if result else "unknown"), 0.5 * right)
     room = right - 2 * side - verdict_width - 3 * spacing
     _swatch(viewer, query, side)
     imgui.same_line()

@@ -408,11 +408,6 @@ class Picture:
         return self._texture
 
 
-def beside_boxed(label: str) -> None:
-    """`beside`, for a radio button or a check box."""
-    beside(label, imgui.get_frame_height())
-
-
 def leave_room(label: str, ems: float) -> None:
     """Make the next widget `ems` wide, or what is left of the row beside its label."""
     label_width = width_of(label) + imgui.get_style().item_inner_spacing.x
