@@ -4,6 +4,7 @@ import { readPage } from "./data.js";
 import { Language, PhraseError } from "./language.js";
 import { Controls, add, cornersOf, inner, project, unit } from "./camera.js";
 import { Painter } from "./draw.js";
+import { wholeOf } from "./space.js";
 
 // [page]
 const byId = (id) => document.getElementById(id);
@@ -458,19 +459,16 @@ class Page {
 
   // Corners of the boxes of an answer, the best first: one for each whole that answers or has parts that do.
   boxes(answer) {
-    if (!answer || answer.verdict.outcome === "not here") {
+    if (answer.verdict.outcome === "not here") {
       return [];
     }
-    const { sizes, parents } = this.language.regions;
+    const { sizes } = this.language.regions;
     const solid = answer.inside.filter((region) => sizes[region] >= this.meta.language.rule.smallest);
     const regions = solid.length ? solid : answer.inside;
     const byFit = regions.toSorted((a, b) => answer.regionFits[b] - answer.regionFits[a]);
     const things = new Map();
     for (const region of byFit) {
-      let whole = region;
-      while (parents[whole] >= 0) {
-        whole = parents[whole];
-      }
+      const whole = wholeOf(this.language.regions, region);
       things.set(whole, [...(things.get(whole) ?? []), region]);
     }
     const boxOf = (own) => (own.length > 1 ? this.around(own) : this.corners(own[0]));
