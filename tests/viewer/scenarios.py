@@ -456,7 +456,7 @@ def see_the_evidence(s: Any) -> None:
     scene = blob_scene()
     seen = ImageFeatures(np.zeros((3, 120, 160), np.int32), np.eye(1, 8, dtype=np.float32))
     as_trained(s.state.path, scene, [seen] * len(scene.cameras))
-    s.search("mug")
+    s.search("mug", stay=True)
     plain, area = s.shot("plain"), scene_area()
     s.ctx.item_click("//Search/Why?")
     s.wait(lambda: s.state.evidence is not None)
