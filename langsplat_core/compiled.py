@@ -93,9 +93,6 @@ class _KernelCache(FunctionCache):
         # Looked at before the index, whose types may be gone, is unpickled.
         self._cache_file._version = f"{numba.__version__} {digest}"  # noqa: SLF001
 
-    def is_filled(self) -> bool:
-        return bool(self._cache_file._load_index())  # noqa: SLF001
-
     def save_overload(self, *overload: Any) -> None:
         """Keep code; on a full disk the next process compiles it again. numba leaves no half files."""
         try:
@@ -107,7 +104,7 @@ class _KernelCache(FunctionCache):
 def is_compiled(kernel: Any) -> bool:
     """Return True where an earlier process has left machine code of `kernel` as its sources are now."""
     kept = kernel._cache  # noqa: SLF001
-    return isinstance(kept, _KernelCache) and kept.is_filled()
+    return isinstance(kept, _KernelCache) and bool(kept._cache_file._load_index())  # noqa: SLF001
 
 
 @cache

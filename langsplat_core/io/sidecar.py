@@ -76,19 +76,9 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import malformed, printable_line, quoted, report_losses, unread
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import FromFile, decode_json, open_for_reading
-from langsplat_core.scene import (
-    CANONICAL_PHRASES,
-    LEVELS,
-    NO_NODE,
-    NO_ORIGIN,
-    Calibration,
-    LanguageField,
-    PlattScaling,
-    TaughtWord,
-    Tree,
-    codec_from_tensors,
-)
-from langsplat_core.scene.language import MOST_SHOWN, tree_of_wholes
+from langsplat_core.scene import LEVELS, NO_NODE, NO_ORIGIN, Calibration, LanguageField, TaughtWord, Tree
+from langsplat_core.scene.codec import codec_from_tensors
+from langsplat_core.scene.language import CANONICAL_PHRASES, MOST_SHOWN, PlattScaling, tree_of_wholes
 
 SUFFIX = ".langsplat.safetensors"
 CODEC = "codec."

@@ -29,19 +29,9 @@ from langsplat_core.pipeline.stages import (
 )
 from langsplat_core.progress import Progress
 from langsplat_core.raster import LiftingRasterizer, load_lifting_rasterizer
-from langsplat_core.scene import (
-    CANONICAL_PHRASES,
-    LEVELS,
-    Camera,
-    Codec,
-    Gaussians,
-    LanguageField,
-    Tree,
-    codec_from_tensors,
-    near_plane,
-)
-from langsplat_core.scene.codec import KINDS, CodebookCodec
-from langsplat_core.scene.language import phrase_key
+from langsplat_core.scene import LEVELS, Camera, Codec, Gaussians, LanguageField, Tree, near_plane
+from langsplat_core.scene.codec import KINDS, CodebookCodec, codec_from_tensors
+from langsplat_core.scene.language import CANONICAL_PHRASES, phrase_key
 from langsplat_core.scene.scene import NEAR_CAMERAS
 from langsplat_core.scene.surface import build_surface, build_tree, surface_areas
 from langsplat_core.semantics.encoders import Encoder, PhraseEncoder

@@ -8,8 +8,7 @@ of 0.005, and `gather` sums with atomics, so its last digits vary between runs.
 
 import subprocess
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from importlib.metadata import version
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -48,12 +47,6 @@ class DifferentiableImage:
 def has_device() -> bool:
     """Return True where torch finds the device that gsplat draws on."""
     return torch.cuda.is_available()
-
-
-def drawn_settings(settings: RasterSettings) -> RasterSettings:
-    """Return the settings that the installed gsplat draws with: its cap of alpha is its own."""
-    release = tuple(int(part) for part in version("gsplat").split(".")[:2])
-    return replace(settings, alpha_max=0.999 if release < (1, 6) else 0.99)
 
 
 def require_device() -> None:

@@ -58,7 +58,7 @@ from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.semantics.sam import grid_points, load_segmenter
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
-from tests.support.backends import reference_gradients
+from tests.support.backends import drawn_settings, reference_gradients
 from tests.support.scenes import find_mask_weights
 
 
@@ -244,7 +244,7 @@ def measure_raster(plan: Plan) -> Iterator[str]:
     """Time both backends on every scene, then what stays on the device."""
     need_cuda()
     backends = [load_rasterizer("cpu"), load_rasterizer("cuda")]
-    settings = {"cpu": INRIA, "cuda": gsplat.drawn_settings(INRIA)}
+    settings = {"cpu": INRIA, "cuda": drawn_settings(INRIA)}
     warm_up(backends, plan.channels)
     yield "# gsplat's rasterizer\n\n" + NOTES
     rates = Rates()
@@ -302,7 +302,7 @@ def measure_gradients(plan: Plan) -> Iterator[str]:
     rng = np.random.default_rng(0)
     values = rng.random((count, 3), np.float32)
     image = 2 * rng.random((case.camera.height, case.camera.width, 3), np.float32) - 1
-    settings = gsplat.drawn_settings(INRIA)
+    settings = drawn_settings(INRIA)
     band = ReferenceRasterizer().view(case.gaussians, case.camera, settings).cut_off_band(BAND)
     image[band] = 0
     no_alpha = np.zeros(band.shape)
@@ -403,7 +403,7 @@ def measure_lifting(plan: Plan) -> Iterator[str]:
         rasterizer = load_lifting_rasterizer(name)
         find_mask_weights(rasterizer, scene.gaussians, views[:1])
         start = time.perf_counter()
-        members = find_mask_weights(rasterizer, scene.gaussians, views, settings=gsplat.drawn_settings(INRIA))
+        members = find_mask_weights(rasterizer, scene.gaussians, views, settings=drawn_settings(INRIA))
         rows.append((name, time.perf_counter() - start, sum(len(pairs) for pairs in members.pairs)))
         found[name] = members.pairs
     yield table(("backend", "seconds", "pairs of Gaussian and mask"), rows)

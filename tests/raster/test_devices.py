@@ -31,7 +31,7 @@ from langsplat_core.training.radiance.differentiable import (
 from langsplat_core.training.radiance.state import PARAMETERS, start
 from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support import gsplat_twin as twin
-from tests.support.backends import gl_state
+from tests.support.backends import drawn_settings, gl_state
 from tests.support.scenes import (
     find_mask_weights,
     make_views,
@@ -232,7 +232,7 @@ def test_images_of_cuda_equal_the_reference(settings, channels, orthographic):
     camera = without_perspective(camera) if orthographic else camera
     values = np.random.default_rng(0).random((60, channels))
     view = load_rasterizer("cuda").view(gaussians, camera, settings)
-    reference = ReferenceRasterizer().view(gaussians, camera, gsplat.drawn_settings(settings))
+    reference = ReferenceRasterizer().view(gaussians, camera, drawn_settings(settings))
     clear = ~reference.cut_off_band(1e-3)
     assert clear.mean() > 0.9
     assert reference.splat(values)[1].max() > 0.5
@@ -257,7 +257,7 @@ def test_gather_is_the_adjoint_and_contributions_its_sums() -> None:
 @on_cuda
 def test_masks_lift_on_cuda_as_on_the_cpu() -> None:
     gaussians, views = random_gaussians(25, 3), make_views()
-    settings = gsplat.drawn_settings(INRIA)
+    settings = drawn_settings(INRIA)
     on = {name: load_lifting_rasterizer(name) for name in ("cpu", "cuda")}
     found = [find_mask_weights(rasterizer, gaussians, views, settings).pairs for rasterizer in on.values()]
     for cpu, cuda in zip(*found, strict=True):
@@ -283,7 +283,7 @@ def gradients(
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_of_cuda_equal_the_cpus(degree: int, orthographic: bool, antialiased: bool) -> None:
     """Those through the directions of view too; a picture in which nothing lies at a cut-off."""
-    settings = replace(gsplat.drawn_settings(INRIA), antialiased=antialiased)
+    settings = replace(drawn_settings(INRIA), antialiased=antialiased)
     camera = random_camera(5, 41, 30)
     camera = without_perspective(camera) if orthographic else camera
     reference = ReferenceRasterizer().view(random_gaussians(60, 5), camera, settings)

@@ -8,6 +8,7 @@ pixel or does not. Pixels where rounding may decide are the *band*: a counted al
 import ctypes
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from itertools import chain
 from typing import Any
 
@@ -19,7 +20,6 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.gsplat import drawn_settings
 from langsplat_core.raster.opengl.rasterizer import create_egl_context
 from langsplat_core.raster.reference import Footprints, ReferenceView, project
 from langsplat_core.scene import Camera, Gaussians
@@ -34,6 +34,12 @@ NAMES = (
     "cuda",
     pytest.param("cuda-twin", marks=pytest.mark.slow),
 )
+
+
+def drawn_settings(settings: RasterSettings) -> RasterSettings:
+    """Return the settings that the installed gsplat draws with: its cap of alpha is its own."""
+    release = tuple(int(part) for part in version("gsplat").split(".")[:2])
+    return replace(settings, alpha_max=0.999 if release < (1, 6) else 0.99)
 
 
 @dataclass(frozen=True)
