@@ -174,11 +174,11 @@ def save_edited(viewer: Viewer, folder: Path, then: Callable[[Viewer], None] = l
         return
     shown, marked = state.scene, state.session
     rows, stem = np.flatnonzero(state.marks.kept), state.path.stem if state.path else "scene"
-    scene = replace(shown, language=viewer.language).take(rows)
+    scene = replace(shown, language=viewer.language)
 
     def work(progress: Progress) -> Path:
         path = output.free_name(folder, f"{stem}-edited", ".ply", COMPANIONS)
-        save_scene(path, replace(scene, path=path))
+        save_scene(path, replace(scene.take(rows), path=path))
         return path
 
     def done(path: Path) -> None:
