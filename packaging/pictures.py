@@ -3,8 +3,10 @@
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +14,15 @@ from imgui_bundle import hello_imgui, imgui  # isort: skip  (before glfw)
 from imgui_bundle.immapp import testing  # isort: skip
 
 import numpy as np
+from PIL import Image
 
-from langsplat_core.config import CodecConfig
+from langsplat_core.config import CodecConfig, PictureConfig
 from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.training.language.codec_fit import train_autoencoder
 from langsplat_viewer.actions import editing, opening, outline, settings, viewpoint
 from langsplat_viewer.options import ViewerOptions, scene_path, services
+from langsplat_viewer.program import draw
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.window import Window
 
@@ -40,6 +44,12 @@ STILLS = {
     ],
 }
 PAGE, PAGE_VIEW, PAGE_PHRASE = "page.jpg", 20, "blue gift"
+HERO, LOOP = "hero.jpg", "page.webp"
+LOOKS: tuple[dict[str, Any], ...] = (
+    {"display": "rgb"},
+    {"display": "latent", "level": "whole"},
+    {"query": ("teddy bear",)},
+)
 QUERIES = ("teddy bear", "blue gift", "hamburger")
 
 
@@ -257,35 +267,120 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     whole.unlink()
 
 
-def page_picture(path: Path) -> None:
-    """Return a screenshot of the demo scene's page in a browser."""
+@contextmanager
+def open_page(size: dict[str, int]) -> Iterator[Any]:
+    """Open the demo scene's page in a browser."""
     with tempfile.TemporaryDirectory() as folder, open_browser() as browser:
         page = Path(folder) / "room.html"
         command = [sys.executable, "-m", "langsplat_core", "export", "--quiet", "--title", "A toy table"]
         subprocess.run([*command, str(scene_path(None)), str(page)], check=True)
-        size = {"width": 1280, "height": 720}
         with open_tab(browser, page, reduced_motion="reduce", viewport=size) as tab:
             tab.run(f"async () => (await langsplat).page.view({PAGE_VIEW})")
-            tab.page.fill("#phrase", PAGE_PHRASE)
-            tab.page.press("#phrase", "Enter")
-            tab.page.wait_for_timeout(5_000)  # until the order is found and the view rests
-            tab.page.screenshot(path=path, type="jpeg", quality=85)
+            yield tab
+
+
+def page_picture(path: Path) -> None:
+    """Write a screenshot of the demo scene's page in a browser."""
+    with open_page({"width": 1280, "height": 720}) as tab:
+        tab.page.fill("#phrase", PAGE_PHRASE)
+        tab.page.press("#phrase", "Enter")
+        tab.page.wait_for_timeout(5_000)  # until the order is found and the view rests
+        tab.page.screenshot(path=path, type="jpeg", quality=85)
+
+
+class Undimmed(ViewerOptions):
+    """Options that leave the colours around an answer as they are."""
+
+    @property
+    def picture(self) -> PictureConfig:
+        return replace(super().picture, dim=1.0)
+
+
+def hero_picture(path: Path) -> None:
+    """Write colours, the latent language field and an answer, seen by one camera, side by side."""
+    with tempfile.TemporaryDirectory() as folder:
+        out, images = Path(folder) / "look.png", []
+        for look in LOOKS:
+            options = Undimmed(**look, headless=True, out=out, size="640x540", camera=CAMERA)
+            draw(options, scene_path(None), services(""))
+            with opened(out) as picture:
+                images.append(np.pad(np.asarray(picture.convert("RGB")), ((0, 0), (0, 6), (0, 0))))
+    Image.fromarray(np.concatenate(images, 1)[:, :-6]).save(path, optimize=True, quality=90)
+
+
+# Of the page, image by image: what is done before it. Every image is of the finest drawing.
+
+REST = """async () => {
+  const { page } = await langsplat;
+  clearTimeout(page.rest);
+  Object.assign(page, { share: 1, moving: false });
+  while (!(await page.painter.sort(page.controls.camera(devicePixelRatio)))) {}
+  page.paint();
+}"""
+ORBIT = "async ([x, y]) => (await langsplat).page.controls.orbit(x, y)"
+SEARCH = "async (phrase) => (await langsplat).page.search(phrase)"
+VIEW = """async (where) => {
+  const { controls, shown } = (await langsplat).page;
+  where === "there" ? controls.face(shown[0]) : where && controls.go(controls.view, where);
+  const { rotation, position } = controls.view;
+  return [...position, ...rotation.slice(3, 9), controls.distance];
+}"""
+STEPS, TURNS, HELD = 9, 6, 5  # images of a flight, of a turn, of what is to be read
+PACE = 90  # ms an image
+
+
+def page_loop(path: Path) -> None:
+    """Write an animation of the demo scene's page: phrases are typed, and what is found is flown to."""
+    images: list[Image.Image] = []
+    with open_page({"width": 800, "height": 450}) as tab:
+
+        def take(count: int = 1) -> None:
+            tab.run(REST)
+            images.extend([Image.open(BytesIO(tab.page.screenshot())).convert("RGB")] * count)
+
+        def fly(start: list[float], end: list[float]) -> None:
+            for step in range(1, STEPS + 1):
+                share = step / STEPS
+                share *= share * (3 - 2 * share)
+                tab.run(VIEW, [a + share * (b - a) for a, b in zip(start, end, strict=True)])
+                take()
+
+        home = start = tab.run(VIEW)
+        take(HELD)
+        for phrase in ("teapot", "blue gift"):
+            for end in range(1, len(phrase) + 1):
+                tab.page.fill("#phrase", phrase[:end])
+                take()
+            tab.run(SEARCH, phrase)
+            take(HELD)
+            there = tab.run(VIEW, "there")
+            tab.run(VIEW, start)
+            fly(start, there)
+            for _ in range(TURNS):
+                tab.run(ORBIT, [-12, 0])
+                take()
+            start = tab.run(VIEW)
+            take(HELD)
+        tab.run(SEARCH, "")
+        fly(start, home)
+    images[0].save(path, save_all=True, append_images=images[1:], duration=PACE, loop=0, quality=60, method=6)
+
+
+OTHERS = {PAGE: page_picture, LOOP: page_loop, HERO: hero_picture}
 
 
 def main() -> None:
-    """Write every picture into `docs/pictures`."""
+    """Write every picture into `docs/pictures`, or those that are named."""
     OUT.mkdir(exist_ok=True)
-    if sys.argv[1:] in ([], [PAGE]):
-        page_picture(OUT / PAGE)
-    if sys.argv[1:] == [PAGE]:
-        return
-    for name, options in STILLS.items() if not sys.argv[1:] else ():
-        command = [sys.executable, "-m", "langsplat_viewer", "--headless", "--camera", CAMERA]
-        subprocess.run([*command, "--out", str(OUT / name), *options], check=True)
-    wanted = sys.argv[1:] or list(WINDOWS)  # one window a process: imgui's test engine runs once
-    if len(wanted) > 1:
+    wanted = sys.argv[1:] or [*OTHERS, *STILLS, *WINDOWS]
+    if len(wanted) > 1:  # one a process: imgui's test engine runs once
         for name in wanted:
             subprocess.run([sys.executable, __file__, name], check=True)
+    elif wanted[0] in OTHERS:
+        OTHERS[wanted[0]](OUT / wanted[0])
+    elif wanted[0] in STILLS:
+        command = [sys.executable, "-m", "langsplat_viewer", "--headless", "--camera", CAMERA]
+        subprocess.run([*command, "--out", str(OUT / wanted[0]), *STILLS[wanted[0]]], check=True)
     else:
         window_picture(OUT / wanted[0], *WINDOWS[wanted[0]])
 
