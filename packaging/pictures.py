@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from io import BytesIO
@@ -44,7 +44,7 @@ STILLS = {
     ],
 }
 PAGE, PAGE_VIEW, PAGE_PHRASE = "page.jpg", 20, "blue gift"
-HERO, LOOP = "hero.jpg", "page.webp"
+HERO, LOOP, REAL = "hero.jpg", "page.webp", "real.jpg"
 LOOKS: tuple[dict[str, Any], ...] = (
     {"display": "rgb"},
     {"display": "latent", "level": "whole"},
@@ -296,16 +296,21 @@ class Undimmed(ViewerOptions):
         return replace(super().picture, dim=1.0)
 
 
-def hero_picture(path: Path) -> None:
-    """Write colours, the latent language field and an answer, seen by one camera, side by side."""
+def looks_picture(path: Path, scene: Path, looks: Sequence[dict[str, Any]], size: str, camera: str) -> None:
+    """Write looks of a scene, seen by one camera, side by side."""
     with tempfile.TemporaryDirectory() as folder:
         out, images = Path(folder) / "look.png", []
-        for look in LOOKS:
-            options = Undimmed(**look, headless=True, out=out, size="640x540", camera=CAMERA)
-            draw(options, scene_path(None), services(""))
+        for look in looks:
+            options = Undimmed(**look, headless=True, out=out, size=size, camera=camera)
+            draw(options, scene, services(""))
             with opened(out) as picture:
                 images.append(np.pad(np.asarray(picture.convert("RGB")), ((0, 0), (0, 6), (0, 0))))
     Image.fromarray(np.concatenate(images, 1)[:, :-6]).save(path, optimize=True, quality=90)
+
+
+def hero_picture(path: Path) -> None:
+    """Write colours, the latent language field and an answer of the demo scene."""
+    looks_picture(path, scene_path(None), LOOKS, "640x540", CAMERA)
 
 
 # Of the page, image by image: what is done before it. Every image is of the finest drawing.
@@ -370,8 +375,11 @@ OTHERS = {PAGE: page_picture, LOOP: page_loop, HERO: hero_picture}
 
 
 def main() -> None:
-    """Write every picture into `docs/pictures`, or those that are named."""
+    """Write every picture into `docs/pictures`, or those that are named; `real.jpg SCENE` of that scene."""
     OUT.mkdir(exist_ok=True)
+    if sys.argv[1:2] == [REAL]:
+        looks_picture(OUT / REAL, Path(sys.argv[2]), LOOKS[:2], "640x426", "4")
+        return
     wanted = sys.argv[1:] or [*OTHERS, *STILLS, *WINDOWS]
     if len(wanted) > 1:  # one a process: imgui's test engine runs once
         for name in wanted:
