@@ -325,8 +325,8 @@ REST = """async () => {
 ORBIT = "async ([x, y]) => (await langsplat).page.controls.orbit(x, y)"
 SEARCH = "async (phrase) => (await langsplat).page.search(phrase)"
 VIEW = """async (where) => {
-  const { controls, shown } = (await langsplat).page;
-  where === "there" ? controls.face(shown[0]) : where && controls.go(controls.view, where);
+  const { controls } = (await langsplat).page;
+  where === "there" ? document.getElementById("face").click() : where && controls.go(controls.view, where);
   const { rotation, position } = controls.view;
   return [...position, ...rotation.slice(3, 9), controls.distance];
 }"""
