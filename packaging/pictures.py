@@ -341,7 +341,7 @@ def page_loop(path: Path) -> None:
 
         def take(count: int = 1) -> None:
             tab.run(REST)
-            images.extend([Image.open(BytesIO(tab.page.screenshot())).convert("RGB")] * count)
+            images.extend([Image.open(BytesIO(tab.page.screenshot(timeout=0))).convert("RGB")] * count)
 
         def fly(start: list[float], end: list[float]) -> None:
             for step in range(1, STEPS + 1):
