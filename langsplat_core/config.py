@@ -233,6 +233,8 @@ class RadianceConfig:
     rehearsed_views: CountOrZero = 24
     # each photograph has an exposure and white balance of its own; auto: where that explains enough
     exposure: Literal["auto", "on", "off"] = "auto"
+    # what moves in a photograph, such as people, does not count; auto: where it explains enough of the error
+    transients: Literal["auto", "on", "off"] = "auto"
     checkpoint_every: Count = 2_000  # steps of this run
     # camera z up to which nothing is drawn, world units; None: it follows from the cameras and what they see
     near: Positive | None = None
@@ -347,7 +349,7 @@ class TrainConfig:
 PAPER = TrainConfig(
     dataset=DatasetConfig(hold_out="every"),
     radiance=RadianceConfig(
-        coarse_fraction=0.0, few_views=0, rehearsed_views=0, exposure="off", near=INRIA.near
+        coarse_fraction=0.0, few_views=0, rehearsed_views=0, exposure="off", transients="off", near=INRIA.near
     ),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
     codec=CodecConfig("autoencoder", steps=10_000, batch=64, lr=7e-4),

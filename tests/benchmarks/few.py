@@ -1,6 +1,6 @@
-"""Few photographs: what depths, free space and exposures gain, held out.
+"""Few photographs: what depths, free space, exposures and masks of what moves gain, held out.
 
-Captures are given, or drawn: rooms and streets.
+Captures are given, or drawn: rooms and streets, empty or with people who stand elsewhere in every photograph.
 """
 
 import tempfile
@@ -15,9 +15,9 @@ import tyro
 from PIL import Image
 
 from assets.making.dataset import FIRST_ROOM, LIGHT, write_transforms
-from assets.making.kit import COLOURS, Kit, rotation_about
+from assets.making.kit import COLOURS, Kit, Piece, Thing, ball, cylinder, pillow, rotation_about
 from assets.making.objects import FURNITURE, TABLE_TOP, furniture
-from assets.making.render import Light, Renderer
+from assets.making.render import Light, RenderedView, Renderer
 from assets.making.world import ENLARGED, Placed, assemble, bounds, furnished
 from langsplat_core.arrays import Array, psnr
 from langsplat_core.config import (
@@ -30,7 +30,7 @@ from langsplat_core.config import (
     with_preset,
 )
 from langsplat_core.datasets import Capture, load_capture
-from langsplat_core.datasets.capture import split_views
+from langsplat_core.datasets.capture import split_views, surrounded_views
 from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
@@ -50,6 +50,9 @@ WIDTH = 400  # px; the height is three quarters
 ARC = 150.0  # degrees
 STEP = 0.5  # metres from one photograph of a walk to the next
 AHEAD = 8.0  # metres, what the walker looks at
+EMPTY = 0.2  # of the photographs of a peopled capture
+NEAREST = 0.8  # metres from a camera to a person
+SHARES = (0.02, 0.25)  # of a photograph's pixels, that people cover
 
 
 @dataclass(frozen=True)
@@ -59,19 +62,28 @@ class _Place:
     cameras: list[Camera]
     things: list[Placed]
     light: Light
+    floor: float  # metres, its height
+    reach: float  # metres from a camera within which people stand
 
 
-def draw_capture(folder: Path, kind: Kind, seed: int, progress: Progress) -> None:
-    """Write photographs with known cameras and no points, unless they lie in `folder`."""
+def draw_capture(
+    folder: Path, kind: Kind, seed: int, people: bool, test_every: int, progress: Progress
+) -> None:
+    """Write photographs with known cameras and no points, unless they lie in `folder`. people: one to three
+    in most of those that `surrounded_views` leaves to training."""
     if (folder / "transforms.json").exists():
         return
     place = _street(seed) if kind == "walk" else _room(seed)
     renderer = Renderer(assemble(place.things), place.light, samples=16, cell=0.01)
+    kit, held_out = Kit(np.random.default_rng((seed, 41))), surrounded_views(place.cameras, test_every)
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for number, camera in enumerate(place.cameras):
         progress("drawing photographs", number / VIEWS)
         fine = camera.resized(2 * camera.width, 2 * camera.height)
-        drawn = Image.fromarray(renderer.render(fine, oversample=1).image)
+        rendered, image = renderer.render(fine, oversample=1), None
+        while people and image is None and number not in held_out and kit.rng.random() > EMPTY:
+            image = _with_people(rendered, fine, place, kit)
+        drawn = Image.fromarray(rendered.image if image is None else image)
         size = (camera.width, camera.height)
         drawn.resize(size, Image.Resampling.BOX).save(folder / "images" / f"{camera.name}.png")
     write_transforms(place.cameras, ".png", folder / "transforms.json", points="")
@@ -87,7 +99,7 @@ def _room(seed: int) -> _Place:
         target = np.array([*rng.uniform(-0.15, 0.15, 2), 0.0])
         cameras.append(look_at(eye, target, np.array([0.0, 0, 1]), (WIDTH, WIDTH * 3 // 4), 50.0))
     things = furnished(FIRST_ROOM + seed, "clutter")
-    return _Place(_named(cameras), things, LIGHT)
+    return _Place(_named(cameras), things, LIGHT, -furniture.TABLE_HEIGHT, 4.0)
 
 
 def _street(seed: int) -> _Place:
@@ -98,7 +110,7 @@ def _street(seed: int) -> _Place:
         target = eye + np.array([AHEAD, 0, -0.8]) + rng.normal(0, (0, 0.25, 0.15))
         cameras.append(look_at(eye, target, np.array([0.0, 0, 1]), (WIDTH, WIDTH * 3 // 4), 50.0))
     things = furnished_street(seed, VIEWS * STEP + 2 * AHEAD)
-    return _Place(_named(cameras), things, replace(LIGHT, key=0.0, sky=2.0))
+    return _Place(_named(cameras), things, replace(LIGHT, key=0.0, sky=2.0), 0.0, 7.0)
 
 
 def furnished_street(seed: int, length: float) -> list[Placed]:
@@ -130,6 +142,33 @@ def _named(cameras: list[Camera]) -> list[Camera]:
     return [replace(camera, name=f"view_{number:03d}") for number, camera in enumerate(cameras)]
 
 
+def _with_people(rendered: RenderedView, camera: Camera, place: _Place, kit: Kit) -> Array | None:
+    """The (H, W, 3) image with people in it; None where they cover too much or too little of it."""
+    standing = []
+    for _ in range(int(kit.rng.integers(1, 4))):
+        column = kit.size(0, camera.width)
+        ray = camera.rotation.T @ np.array([(column - camera.cx) / camera.fx, 0, 1])
+        at = camera.position + kit.size(NEAREST, place.reach) * ray / np.linalg.norm(ray)
+        turn = rotation_about("z", kit.size(0, 360))
+        standing.append(Placed(person(kit), turn, np.array([at[0], at[1], place.floor])))
+    drawn = Renderer(assemble(standing), place.light, samples=8).render(camera, oversample=1)
+    before = drawn.depth < rendered.depth
+    fits = SHARES[0] < before.mean() < SHARES[1]
+    return np.where(before[..., None], drawn.image, rendered.image) if fits else None
+
+
+def person(kit: Kit) -> Thing:
+    """Somebody of 1.5 to 1.9 metres, in clothes of two colours, some of them striped or dotted."""
+    height, colour = kit.size(1.5, 1.9), kit.pick(*COLOURS)
+    coat = kit.pattern(colour, kit.other(colour, *COLOURS), kit.pick("cloth", "striped", "dotted"), 0.05)
+    leg = cylinder(0.075, 0.5 * height)
+    trousers, skin = kit.cloth(kit.pick(*COLOURS)), kit.paint("beige", substance="skin")
+    body = pillow(0.46, 0.28, 0.42 * height, 4.0).moved((0, 0, 0.45 * height))
+    head = ball(0.075 * height).moved((0, 0, 0.92 * height))
+    legs = [Piece("leg", "", leg.moved((x, 0, 0)), trousers, k) for k, x in enumerate((-0.1, 0.1))]
+    return Thing("person", colour, (*legs, Piece("body", "", body, coat), Piece("head", "", head, skin)))
+
+
 # The report.
 
 LARGE = 800  # px, of a window beside them: with dilation as at the photographs' size, and growing
@@ -140,9 +179,9 @@ HEAD = (
 )  # fmt: skip
 # What a training has, beside its preset.
 VARIANTS: dict[str, dict[str, object]] = {
-    "before": {"few_views": 0, "rehearsed_views": 0, "exposure": "off"},
-    "depths": {"rehearsed_views": 0, "exposure": "off"},
-    "depths, exposures": {"rehearsed_views": 0},
+    "before": {"few_views": 0, "rehearsed_views": 0, "exposure": "off", "transients": "off"},
+    "depths": {"rehearsed_views": 0, "exposure": "off", "transients": "off"},
+    "depths, exposures": {"rehearsed_views": 0, "transients": "off"},
     "all": {},
 }
 
@@ -150,7 +189,7 @@ VARIANTS: dict[str, dict[str, object]] = {
 @dataclass(frozen=True)
 class Few:
     """Held-out PSNR of captures: without what few photographs get, with depths, with exposures too, and
-    without steps that do not pay."""
+    without what moves and steps that do not pay."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Captures, as of `langsplat train`."""
@@ -158,6 +197,8 @@ class Few:
     """Seeds of drawn captures, beside the folders."""
     kind: Kind = "few"
     """Of drawn captures: on an arc around a table, or straight ahead along a street."""
+    people: bool = False
+    """Into the training photographs of drawn captures go people, each time elsewhere."""
     presets: tuple[TrainPreset, ...] = ("quick",)
     variants: tuple[str, ...] = tuple(VARIANTS)
     views: int = 0
@@ -174,9 +215,12 @@ class Few:
         rows: list[tuple[str, ...]] = []
         with tempfile.TemporaryDirectory() as scratch, TerminalProgress() as progress:
             work = self.work or Path(scratch)
-            drawn = [work / f"{self.kind}-{seed}" / "photographs" for seed in self.rooms]
+            drawn = [
+                work / f"{self.kind}-{seed}{'-people' if self.people else ''}" / "photographs"
+                for seed in self.rooms
+            ]
             for seed, folder in zip(self.rooms, drawn, strict=True):
-                draw_capture(folder, self.kind, seed, progress)
+                draw_capture(folder, self.kind, seed, self.people, self.test_every, progress)
             for folder in (*self.folders, *drawn):
                 name = folder.parent.name if folder in drawn else folder.name
                 rows += self._rows(folder, name, work / name, progress)

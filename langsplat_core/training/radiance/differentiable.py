@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from langsplat_core.arrays import ViewScore, psnr
+from langsplat_core.arrays import Array, ViewScore, near_power, psnr
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import BackendError
@@ -21,7 +21,8 @@ from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
 from langsplat_core.raster.gsplat import DifferentiableImage
 from langsplat_core.scene import Camera, Gaussians, near_plane
-from langsplat_core.training.radiance.losses import fit_exposure, ssim_map, with_exposure
+from langsplat_core.scene.transform import C0
+from langsplat_core.training.radiance.losses import fit_exposure, patch_means, ssim_map, with_exposure
 
 PARAMETERS = (*gsplat.RAW, "sh_dc", "sh_rest")
 
@@ -118,6 +119,19 @@ class CudaRenderer:
     def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> DifferentiableImage:
         values = _coefficients(parameters, sh_degree)
         return gsplat.draw(parameters, values, camera, self._settings, sh_degree)
+
+
+def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor], camera: Camera) -> Array:
+    """Return the (GRID, GRID) mean depths of what a camera sees of the `values`, NaN where little is."""
+    small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
+    z = camera.project(values["means"].detach().cpu().numpy())[1].clip(0).astype(np.float32)
+    length = near_power(max(float(np.median(z)), 1e-30))  # of a unit in which colours keep depths' digits
+    shade = np.repeat((z[:, None, None] / np.float32(length) - 0.5) / C0, 3, axis=2)
+    grey = torch.from_numpy(shade.astype(np.float32)).to(values["means"].device)
+    with torch.no_grad():
+        rendered = renderer.render({**values, "sh_dc": grey}, small, 0)
+    depth, alpha = patch_means(rendered.image)[..., 0], patch_means(rendered.alpha[..., None])[..., 0]
+    return np.where(alpha > 0.5, length * depth / np.maximum(alpha, 1e-6), np.nan)
 
 
 Backend = Literal["auto", "cpu", "cuda"]

@@ -23,7 +23,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.differentiable import PARAMETERS, parameters_of
-from langsplat_core.training.radiance.losses import no_exposures
+from langsplat_core.training.radiance.losses import Transients, no_exposures, no_transients
 
 # Fewer points are topped up to this number: features are found where there is detail, and what lies between
 # is covered from random ones better than by splitting what is elsewhere (docs/photographs.md) ...
@@ -104,6 +104,7 @@ class TrainingState:
     grad_sum: Tensor  # (N,) norms of the gradients by the projected means, NDC, summed over `seen` views
     seen: Tensor  # (N,) float32: in how many steps since the last round the Gaussian was visible
     exposures: Tensor  # (V, 4, 3) affine changes of colours, of the training views
+    transients: Transients  # of the training views; of none where nothing may move
     rng: np.random.Generator
     updates: dict[str, int]  # how often Adam has updated each parameter
     step: int = 0  # steps done
@@ -133,6 +134,7 @@ def start(gaussians: Gaussians, seed: int, device: torch.device) -> TrainingStat
         grad_sum=torch.zeros(len(gaussians), device=device),
         seen=torch.zeros(len(gaussians), device=device),
         exposures=no_exposures(0, device),
+        transients=no_transients(0),
         rng=np.random.default_rng(seed),
         updates=dict.fromkeys(PARAMETERS, 0),
     )
@@ -265,12 +267,13 @@ def add_opacity_decay(state: TrainingState, strength: float) -> None:
 
 # Checkpoints of radiance training: one safetensors file, written atomically, resumed exactly.
 #
-# Tensors: ``values.*``, ``first.*``, ``second.*`` for every parameter, ``grad_sum``, ``seen`` and
-# ``exposures``; everything else is JSON in the header. No pickle is involved, so a checkpoint from elsewhere
-# cannot run code.
+# Tensors: ``values.*``, ``first.*``, ``second.*`` for every parameter, ``grad_sum``, ``seen``, ``exposures``
+# and ``watched.*``; everything else is JSON in the header. No pickle is involved, so a checkpoint from
+# elsewhere cannot run code.
 
-KIND = "langsplat-radiance-checkpoint-4"
+KIND = "langsplat-radiance-checkpoint-3"
 ROWS, TENSORS = ("values", "first", "second"), ("grad_sum", "seen", "exposures")
+WATCHED = tuple(Transients.__dataclass_fields__)
 
 
 def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequence[int]) -> str:
@@ -289,6 +292,7 @@ def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequenc
 def save_checkpoint(path: Path, state: TrainingState, made_from: str) -> None:
     """Write `state`; `made_from` is the run's `fingerprint`."""
     tensors = {name: getattr(state, name) for name in TENSORS}
+    tensors |= {f"watched.{name}": torch.from_numpy(getattr(state.transients, name)) for name in WATCHED}
     tensors |= {f"{rows}.{name}": getattr(state, rows)[name].detach() for rows in ROWS for name in PARAMETERS}
     header = {name: getattr(state, name) for name in ("step", "updates", "queue")}
     header |= {"fingerprint": made_from, "rng": state.rng.bit_generator.state}
@@ -322,6 +326,7 @@ def load_checkpoint(path: Path, made_from: str, device: torch.device) -> Trainin
         return TrainingState(
             **rows,
             **{name: tensors[name] for name in TENSORS},
+            transients=Transients(*(tensors[f"watched.{name}"].cpu().numpy() for name in WATCHED)),
             rng=rng,
             updates={name: int(header["updates"][name]) for name in PARAMETERS},
             step=int(header["step"]),

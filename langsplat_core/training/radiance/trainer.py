@@ -156,6 +156,7 @@ def train_radiance(
     else:
         state = training.start(first, config.seed, renderer.device)
         state.exposures = losses.no_exposures(len(views), renderer.device)
+        state.transients = losses.no_transients(0 if config.transients == "off" else len(views))
 
     recent: list[float] = []  # since the last mean
     metrics: dict[str, float] = {}
@@ -237,9 +238,10 @@ class _Run:
         image = rendered.image
         if exposing and step >= exposing[0]:
             image = losses.with_exposure(image, state.exposures[index])
+        self.observe_transients(state, index, image, target, mask)
         loss = self.emptiness(rendered.alpha, mask)
-        if mask is not None and not self.views.cut_out:
-            # What is masked differs from nothing, and nothing flows back from it.
+        mask = self.counted(state, index, None if self.views.cut_out else mask, camera)
+        if mask is not None:  # what is masked differs from nothing, and nothing flows back from it
             image = torch.where(mask[..., None], image, image.detach())
             target = torch.where(mask[..., None], target, image.detach())
         loss = loss + losses.radiance_loss(image, target, config.lambda_dssim)
@@ -271,6 +273,7 @@ class _Run:
         pairs: list[tuple[Tensor, Tensor]] = []
         for index in range(len(self.views)):
             camera, target, mask = self.views.at(index, coarse=True)
+            mask = self.counted(state, index, mask, camera)
             with torch.no_grad():
                 degree = self.schedule.active_sh_degree(state.step)
                 image = self.renderer.render(state.values, camera, degree).image
@@ -282,6 +285,38 @@ class _Run:
         if gain >= 0.35 or self.config.exposure == "on":
             return exposures
         return losses.no_exposures(len(self.views), exposures.device)
+
+    @property
+    def transients_from(self) -> int:
+        """Step from which on transients do not count: a fifth of the run has to show what is."""
+        return max(round(self.config.steps / 5), 1)
+
+    def observe_transients(
+        self, state: TrainingState, index: int, image: Tensor, target: Tensor, mask: Tensor | None
+    ) -> None:
+        """Judge the patches of view `index`, of which this step renders `image`.
+
+        Transients that explain less than 24 % of the squared error are given up for the rest of the run.
+        """
+        judged = state.step == self.transients_from and self.config.transients == "auto"
+        if judged and state.transients.explained() < 0.24:
+            state.transients = losses.no_transients(0)
+        if len(state.transients.moving):
+            rendered = losses.patch_means(image)
+            if mask is not None:
+                rendered[losses.patch_means(mask[..., None].float())[..., 0] < 0.5] = np.nan
+            cameras = self.views.cameras
+            depths = differentiable.rendered_depths(self.renderer, state.values, cameras[index])
+            state.transients.observe(index, cameras, rendered, losses.patch_means(target), depths)
+
+    def counted(self, state: TrainingState, index: int, mask: Tensor | None, camera: Camera) -> Tensor | None:
+        """(H, W) bool pixels of view `index` that count, of those of its `mask`; None: all of them."""
+        moving = state.transients.moving
+        if not len(moving) or state.step < self.transients_from or not moving[index].any():
+            return mask
+        size = camera.height, camera.width
+        still = state.transients.still_pixels(index, size, self.renderer.device)
+        return still if mask is None else mask & still
 
 
 def _with_points(capture: Capture, depths: Sequence[DepthMap], config: RadianceConfig) -> Capture:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.torch import load_file
 
 from langsplat_core.arrays import psnr
 from langsplat_core.config import (
@@ -178,6 +179,21 @@ def test_training_finds_exposures_of_photographs() -> None:
     assert all(score.psnr_exposed is not None and score.psnr_exposed > score.psnr + 2 for score in apart)
     off, auto = (train_radiance(even, replace(config, exposure=kind), views) for kind in ("off", "auto"))  # type: ignore[arg-type]
     np.testing.assert_array_equal(off.sh, auto.sh)  # nothing to explain
+
+
+@pytest.mark.long
+def test_training_ignores_transients(tmp_path: Path) -> None:
+    config = RadianceConfig(steps=250, backend="cpu", sh_degree=0, max_gaussians=2_000)
+    images = [image.copy() for image in capture().images]
+    images[1][16:34, 18:30] = (250, 40, 250)
+    passed, views = replace(capture(), images=tuple(images)), [0, 1, 2, 3, 4]
+    trained = train_radiance(passed, config, views, tmp_path / "run")
+    moving = load_file(tmp_path / "run")["watched.moving"].numpy()  # (V, 32, 32) patches at the end
+    assert moving[1, 12:22, 13:19].mean() > 0.8  # of patches, within the 48 pixels
+    assert moving[[0, 2, 3, 4]].mean() < 0.02
+    off = train_radiance(passed, replace(config, transients="off"), views)
+    with_it, without = (evaluate_views(one, capture(), [1], "cpu")[0].psnr for one in (off, trained))
+    assert without > with_it + 3
 
 
 @pytest.mark.long
