@@ -236,7 +236,7 @@ def test_several_phrases_are_answered_side_by_side(browser: Any, thin: Path) -> 
         ):
             tab.run("async (line) => (await langsplat).page.search(line)", line)
             assert tab.run("async () => (await langsplat).page.answers.length") == count
-        tab.page.fill("#phrase", "teddy bera on the tabel")
+        tab.page.fill("#phrase", "teddy bera on the tabble")
         for _ in range(2):
             tab.page.press("#phrase", "Enter")
             tab.page.click("#verdict button")  # did you mean
