@@ -31,6 +31,7 @@ from tests.support.processes import open_browser, open_tab
 
 OUT = Path(__file__).parent.parent / "docs" / "pictures"
 CAMERA = "3"
+BESIDE_THE_SEARCH = "21"  # a camera that sees things where the search does not float
 FRAMES = 20_000  # that something is waited for
 PATIENCE = 600.0  # seconds that a picture may take
 Act = Callable[[Any, Window], None]
@@ -101,7 +102,7 @@ def _boxed(ctx: Any, window: Window) -> None:
 def _noted(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     settings.open_panel(viewer, "Notes")
-    for place, text in (((0.37, 0.36), "a gift of 1987"), ((0.62, 0.55), "eaten by the children")):
+    for place, text in (((0.26, 0.62), "a gift of 1987"), ((0.49, 0.14), "eaten by the children")):
         settings.pin_at(viewer, *place)
         settings.write_note(viewer, viewer.state.session.notes[-1], text)
 
@@ -241,7 +242,7 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
 
 def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     """Return a screenshot of the window with the demo scene and answered queries."""
-    options = ViewerOptions(query=queries, display="relevancy", size="1280x800", camera=CAMERA)
+    options = ViewerOptions(query=queries, display="relevancy", size="1280x800", camera=BESIDE_THE_SEARCH)
     window = Window(scene_path(None), options, services(""))
     window.idles = False
     whole = path.with_suffix(".whole.png")
@@ -268,13 +269,13 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
 
 
 @contextmanager
-def open_page(size: dict[str, int]) -> Iterator[Any]:
+def open_page(size: dict[str, int], **settings: Any) -> Iterator[Any]:
     """Open the demo scene's page in a browser."""
     with tempfile.TemporaryDirectory() as folder, open_browser() as browser:
         page = Path(folder) / "room.html"
         command = [sys.executable, "-m", "langsplat_core", "export", "--quiet", "--title", "A toy table"]
         subprocess.run([*command, str(scene_path(None)), str(page)], check=True)
-        with open_tab(browser, page, reduced_motion="reduce", viewport=size) as tab:
+        with open_tab(browser, page, reduced_motion="reduce", viewport=size, **settings) as tab:
             tab.run(f"async () => (await langsplat).page.view({PAGE_VIEW})")
             yield tab
 
@@ -330,18 +331,19 @@ VIEW = """async (where) => {
   const { rotation, position } = controls.view;
   return [...position, ...rotation.slice(3, 9), controls.distance];
 }"""
-STEPS, TURNS, HELD = 9, 6, 5  # images of a flight, of a turn, of what is to be read
+STEPS, TURNS, HELD = 9, 6, 12  # images of a flight, of a turn, of what is to be read
 PACE = 90  # ms an image
 
 
 def page_loop(path: Path) -> None:
     """Write an animation of the demo scene's page: phrases are typed, and what is found is flown to."""
     images: list[Image.Image] = []
-    with open_page({"width": 800, "height": 450}) as tab:
+    with open_page({"width": 800, "height": 450}, color_scheme="dark") as tab:
 
         def take(count: int = 1) -> None:
             tab.run(REST)
-            images.extend([Image.open(BytesIO(tab.page.screenshot(timeout=0))).convert("RGB")] * count)
+            with opened(BytesIO(tab.page.screenshot(timeout=0))) as picture:
+                images.extend([picture.convert("RGB")] * count)
 
         def fly(start: list[float], end: list[float]) -> None:
             for step in range(1, STEPS + 1):
