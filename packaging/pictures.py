@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -342,7 +341,7 @@ def page_loop(path: Path) -> None:
 
         def take(count: int = 1) -> None:
             tab.run(REST)
-            with opened(BytesIO(tab.page.screenshot(timeout=0))) as picture:
+            with opened(tab.page.screenshot(timeout=0)) as picture:
                 images.extend([picture.convert("RGB")] * count)
 
         def fly(start: list[float], end: list[float]) -> None:
