@@ -141,6 +141,7 @@ def _palette(ctx: Any, window: Window) -> None:
     settings.toggle_palette(window.viewer)
     ctx.yield_(2)
     window.viewer.state.drafts["##command"] = "sel"
+    ctx.yield_(5)
 
 
 def _light(ctx: Any, window: Window) -> None:
@@ -207,6 +208,8 @@ def _trained(ctx: Any, window: Window) -> None:
     assert process is not None
     while process.exit_code is None and len(process.progress.losses) < 120:
         ctx.yield_()
+    viewer.state.wanted_panel = "Train"
+    ctx.yield_(5)
 
 
 def _settled(ctx: Any, window: Window) -> None:
@@ -243,7 +246,7 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     """Return a screenshot of the window with the demo scene and answered queries."""
     options = ViewerOptions(query=queries, display="relevancy", size="1280x800", camera=BESIDE_THE_SEARCH)
     window = Window(scene_path(None), options, services(""))
-    window.idles = False
+    window.idles, window.toasts.seconds = False, 0.0
     whole = path.with_suffix(".whole.png")
 
     def wait_and_capture(ctx: Any) -> None:  # imgui's test context has no public type

@@ -196,7 +196,7 @@ def draw_over(
         select.draw_hint(viewer, free)
         select.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
-    toasts.draw(viewer, free)
+    toasts.draw(viewer, area)
     dialogs.draw_changed(viewer, free)
     dialogs.draw_unsaved(viewer)
     dialogs.draw_export(viewer)
