@@ -164,7 +164,7 @@ def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
     left, top, right, bottom = _inner_rectangle(intrinsics)
     wide, high = intrinsics.fx * (right - left), intrinsics.fy * (bottom - top)
     if not (wide >= 1 and high >= 1):
-        raise InputError(f"{intrinsics} leaves no picture once its distortion is removed; calibrate it again")
+        raise InputError(f"a lens of fx {intrinsics.fx:g} leaves no undistorted picture; calibrate it again")
     scale = min(1.0, max_side / max(wide, high))
     width, height = max(1, int(wide * scale)), max(1, int(high * scale))
     fx, fy = intrinsics.fx * scale, intrinsics.fy * scale
@@ -185,7 +185,7 @@ def _inner_rectangle(intrinsics: PhotoIntrinsics) -> tuple[float, float, float, 
     try:
         left, top, right, bottom = undistorted_points(intrinsics.distortion, distorted).reshape(4, -1, 2)
     except (ValueError, np.linalg.LinAlgError) as error:
-        raise InputError(f"{intrinsics}: {error}; calibrate it again") from None
+        raise InputError(f"a lens of fx {intrinsics.fx:g}: {error}; calibrate it again") from None
     most, least = (left[:, 0].max(), top[:, 1].max()), (right[:, 0].min(), bottom[:, 1].min())
     return float(most[0]), float(most[1]), float(least[0]), float(least[1])
 
