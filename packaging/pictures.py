@@ -139,8 +139,6 @@ def _side_by_side(ctx: Any, window: Window) -> None:
 
 def _palette(ctx: Any, window: Window) -> None:
     settings.toggle_palette(window.viewer)
-    ctx.yield_(2)
-    window.viewer.state.drafts["##command"] = "sel"
     ctx.yield_(5)
 
 

@@ -200,7 +200,7 @@ class QueryEngine:
         """Return the things among the members of an answer, best first, or only so many of them."""
         wholes, join = self.tree.voted_wholes, result.level == len(LEVELS) - 1
         members, even, gaussians = result.members, result.even, self.scene.gaussians
-        if join and wholes is not None:
+        if join and self.bars is not None:  # by peaks, relevancy is not even, and wants smoothing
             found = find_wholes(gaussians, members, even, wholes, at_most)
             if found is not None:
                 return found
