@@ -230,8 +230,11 @@ def check_keeps(out: Path, *sources: Path) -> None:
     """Raise InputError where writing `out`, or a companion of it, would replace a file of `sources`."""
     read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
     companions = _companions(out) if out.suffix.lower() in writable_suffixes() else ()
-    if any(path.resolve() in read for path in (out, *companions)):
-        raise InputError(f"{shown(out)}: would replace the original scene; choose another name")
+    for path in (out, *companions):
+        if path.resolve() in read and exists(path):
+            what = "" if path == out else f"its {shown(Path(path.name))} "
+            own = "the original scene" if path == out else "that of the original scene"
+            raise InputError(f"{shown(out)}: {what}would replace {own}; choose another name")
 
 
 def report_left_out(path: Path, scene: Scene, kind: str, loses: Sequence[str], keeper: str) -> None:

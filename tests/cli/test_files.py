@@ -3,6 +3,7 @@
 
 import json
 import os
+import re
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -75,11 +76,15 @@ def test_sources_are_not_replaced_by_another_name(tmp_path, capsys, monkeypatch)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     pairs = ("a", "a.ply"), ("a/meta.json", "a.ply"), ("link.ply", "b.ply"), ("b.ply", "link.ply")
     for words in (*pairs, ("a", "b.ply", "--rematch", "b.langsplat.safetensors")):
-        assert "would replace the original scene" in refusal(capsys, "convert", *words)
+        said = refusal(capsys, "convert", *words)
+        assert re.search(r"would replace (that of )?the original scene", said)
+        assert ("its a.langsplat.safetensors" in said) == (words[1] == "a.ply")  # which is what lies there
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     os.link("b.ply", "other name.ply")  # which is another file as soon as it is written
     assert run("convert", "b.ply", "other name.ply") == 0
     assert Path("b.ply").read_bytes() == before[tmp_path / "b.ply"]
+    Path("a.langsplat.safetensors").unlink()
+    assert run("convert", "a", "a.ply") == 0  # nothing beside the folder could be replaced
 
 
 # `langsplat transform`, `crop` and `clean`.

@@ -5,8 +5,10 @@ import io
 import json
 import os
 from collections.abc import AsyncIterator, Callable
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import wraps
+from inspect import cleandoc
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -15,14 +17,16 @@ import numpy as np
 import tyro
 from PIL import Image
 
+from langsplat_core import __version__
 from langsplat_core.arrays import Array, decimals_of
 from langsplat_core.cli.arguments import EncoderOption
 from langsplat_core.cli.describe import outline_lines, outline_of
 from langsplat_core.cli.query import Unit, camera_of, unit_of
-from langsplat_core.errors import InputError, LangSplatError, printable_line
+from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
 from langsplat_core.extensions.library.index import scenes_in
 from langsplat_core.interrupts import end, handled
-from langsplat_core.progress import silent
+from langsplat_core.io.scenes import format_of
+from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import count_things, run_phrase
 from langsplat_core.query.describe import Describer
@@ -49,6 +53,8 @@ NO_JSON, INVALID = -32700, -32600  # codes of JSON-RPC
 
 P = ParamSpec("P")
 T = TypeVar("T")
+PROGRESS = ContextVar("PROGRESS", default=silent)  # of the call that runs here
+NEWS = 0.02  # of a stage: what is less is no message
 
 
 @dataclass(frozen=True)
@@ -61,17 +67,21 @@ class Serve:
     """Speak the Model Context Protocol on standard input and output; started by the agent's program."""
     encoder: EncoderOption = ""
 
+    @optional_imports()
     def run(self) -> None:
         if not self.mcp:
             raise InputError("say how: --mcp is the Model Context Protocol, on standard input and output")
-        server = build_server(Door(scene_files(self.scene), self.encoder))
+        door = Door(scene_files(self.scene), self.encoder)
+        if len(door.scenes()) == 1:  # which is opened at the start: what is no scene ends here
+            door.engine()
+        server = build_server(door)
         with handled(lambda number, _: end("langsplat", number)):  # there is nothing to keep
             asyncio.run(_serve(server))
 
 
 def scene_files(place: Path) -> dict[str, Path]:
     """Searchable scenes by name: of a folder all of it, named by their path in it. InputError for none."""
-    if not place.is_dir():
+    if not place.is_dir() or format_of(place) is not None:
         return {place.name: place}
     found = {str(path.relative_to(place)): path for path in scenes_in(place)}
     if not found:
@@ -100,7 +110,7 @@ class Door:
         The verdict is 'found', 'weak match' or 'not here'; place is the middle of the best one, box its
         corners.
         """
-        engine = self._engine(scene)
+        engine = self.engine(scene)
         composed = run_phrase(engine, phrase, viewpoint=_first(engine.scene))
         answer, unit = composed.answer, _unit(engine.scene)
         there = answer.found or answer.verdict == "weak match"
@@ -118,7 +128,7 @@ class Door:
 
     def count(self, phrase: str, scene: str = "") -> dict[str, Any]:
         """How many there are of something, with the least and most there may be; 0 where it is not found."""
-        engine = self._engine(scene)
+        engine = self.engine(scene)
         answer = run_phrase(engine, phrase, viewpoint=_first(engine.scene)).answer
         number = count_things(engine, answer) if answer.found else None
         counts = (0, 0, 0) if number is None else (number.best, number.least, number.most)
@@ -126,7 +136,7 @@ class Door:
 
     def distance(self, first: str, second: str, scene: str = "") -> dict[str, Any]:
         """How far apart the nearest points of two things are, each named by a phrase."""
-        engine = self._engine(scene)
+        engine = self.engine(scene)
         frame, unit = upright(engine.scene.up()), _unit(engine.scene)
         bodies = []
         for phrase in (first, second):
@@ -140,33 +150,49 @@ class Door:
 
     def describe(self, scene: str = "") -> str:
         """Return what is in a scene: an outline of its things with their parts, sizes and counts."""
-        engine = self._engine(scene)
-        lines = outline_lines(outline_of(Describer(engine, None, silent)), _unit(engine.scene))
+        engine = self.engine(scene)
+        lines = outline_lines(outline_of(Describer(engine, None, PROGRESS.get())), _unit(engine.scene))
         return "\n".join([*lines, f"answers: {engine.basis.long}"])
 
-    def look(self, phrase: str = "", camera: int = 0, scene: str = "") -> Array:
-        """Return an (H, W, 3) uint8 image, towards the best of what a phrase finds if one is given.
+    def look(self, phrase: str = "", camera: int | None = None, scene: str = "") -> tuple[Array, str]:
+        """Return an (H, W, 3) uint8 image, and in words by which camera it is and where in it a thing lies.
 
-        Without a phrase, or without a find, it is what a camera of the scene sees.
+        The camera is that of the number given, else the one that shows most of what the phrase finds, else
+        the first.
         """
-        engine = self._engine(scene)
-        scene_of = engine.scene
-        if phrase:
-            view = towards(scene_of, self._found(engine, phrase))
+        engine = self.engine(scene)
+        shown, unit = engine.scene, _unit(engine.scene)
+        answer = self._found(engine, phrase) if phrase else None
+        if camera is not None:
+            view = camera_of(shown, camera)
+        elif answer is not None:
+            view = towards(shown, answer)
         else:
-            view = camera_of(scene_of, camera) if scene_of.cameras else scene_of.framing_camera(SIZE)
-        colours = render(scene_of, view.within(MOST_SIDE)).colours
-        return np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8)
+            view = _first(shown) or shown.framing_camera(SIZE)
+        PROGRESS.get()("drawing", 0.0)
+        number = [f"camera {row} " for row, one in enumerate(shown.cameras) if one is view]
+        view = view.within(MOST_SIDE)
+        said = f"by {''.join(number)}{view.name or 'a new camera'}, {view.width} x {view.height} pixels"
+        if answer is not None and answer.place is not None:
+            (pixel,), (depth,) = view.project(answer.place[None])
+            inside = depth > 0 and ((pixel >= 0) & (pixel < (view.width, view.height))).all()
+            at = f"pixel {pixel[0]:.0f} {pixel[1]:.0f}" if inside else "outside of this image"
+            said += f"; {phrase}: {answer.said}, place {unit.place(answer.place)} {unit.name}, {at}"
+        colours = render(shown, view).colours
+        return np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8), said
 
-    def _engine(self, name: str) -> QueryEngine:
+    def engine(self, name: str = "") -> QueryEngine:
+        """Return the engine of a scene, which is opened where it was not; InputError for none of them."""
         if not name and len(self._scenes) == 1:
             name = next(iter(self._scenes))
         if name not in self._scenes:
             known = ", ".join(list(self._scenes)[:5]) + (", ..." if len(self._scenes) > 5 else "")
             raise InputError(f"scene {name!r} is not among these {len(self._scenes)}: {known}")
         if name not in self._engines:
+            PROGRESS.get()("opening the scene", 0.0, name)
             scene = searchable(self._scenes[name])
             self._engines[name] = QueryEngine(scene, load_text_encoder, encoder_id=self._encoder_id)
+        PROGRESS.get()("asking", 0.0)
         return self._engines[name]
 
     def _found(self, engine: QueryEngine, phrase: str) -> QueryResult:
@@ -192,7 +218,7 @@ def _places(values: Array | None, unit: Unit) -> Any:
 
 
 def towards(scene: Scene, answer: QueryResult) -> Camera:
-    """Return the camera that shows most pixels of the best answer's box; a new one where there are none."""
+    """Return the camera that shows the best answer's box whole and large; a new one where there are none."""
     assert answer.box is not None
     low, high = answer.box
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
@@ -207,8 +233,9 @@ def towards(scene: Scene, answer: QueryResult) -> Camera:
         pixels, depths = camera.project(corners)
         if (depths <= 0).any():
             return 0.0
-        inside = np.clip(pixels, 0, (camera.width, camera.height))
-        return float(np.prod(inside.max(0) - inside.min(0)) / (camera.width * camera.height))
+        inside = np.ptp(np.clip(pixels, 0, (camera.width, camera.height)), axis=0).prod()
+        whole = max(np.ptp(pixels, axis=0).prod(), 1e-9)
+        return float(inside / (camera.width * camera.height) * inside / whole)
 
     return max(scene.cameras, key=seen)
 
@@ -267,21 +294,47 @@ async def _serve(server: "MCPServer[Any]") -> None:
         await core.run(incoming, outgoing, core.create_initialization_options())
 
 
+def _told(send: Callable[..., Any]) -> Progress:
+    """Return the progress of one call: the number of its stages so far, which must grow, and words."""
+    from anyio.from_thread import run
+
+    stages: dict[str, int] = {}
+    sent = [-1.0]
+
+    def show(report: Report) -> None:
+        done = stages.setdefault(report.stage, len(stages)) + report.fraction
+        if done >= sent[-1] + NEWS:
+            sent.append(done)
+            run(send, done, None, report.text)
+
+    return Progress(show)
+
+
 def build_server(door: Door) -> "MCPServer[Any]":
     """Return the door as tools of the protocol; what cannot be answered is a tool error of one line."""
     from mcp.server import MCPServer
+    from mcp.server.mcpserver import Context
     from mcp.server.mcpserver import Image as Picture
     from mcp.server.mcpserver.exceptions import ToolError
     from mcp_types import ToolAnnotations
+    from pydantic import ValidationError
 
     class Server(MCPServer[Any]):
-        async def call_tool(self, *args: Any, **kwargs: Any) -> Any:
+        async def call_tool(
+            self, name: str, arguments: dict[str, Any], context: Context[Any, Any] | None = None
+        ) -> Any:
+            if context is not None:
+                PROGRESS.set(_told(context.report_progress))
             try:
-                return await super().call_tool(*args, **kwargs)
+                given = {key: value for key, value in arguments.items() if value is not None}
+                return await super().call_tool(name, given, context)
             except ToolError as error:  # of wrong types the SDK says several lines
-                raise ToolError(printable_line(error, 300)) from None
+                wrong = error.__cause__.errors() if isinstance(error.__cause__, ValidationError) else ()
+                said = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in wrong)
+                said = said or str(error).removeprefix(f"Error executing tool {name}: ")
+                raise ToolError(printable_line(said, 300)) from None
 
-    server = Server("langsplat", instructions=INSTRUCTIONS, log_level="CRITICAL")
+    server = Server("langsplat", instructions=INSTRUCTIONS, version=__version__, log_level="CRITICAL")
     turn = Lock()
 
     def guarded(ask: Callable[P, T]) -> Callable[P, T]:
@@ -295,13 +348,13 @@ def build_server(door: Door) -> "MCPServer[Any]":
 
         return asked
 
-    def look(phrase: str = "", camera: int = 0, scene: str = "") -> Picture:
-        encoded = io.BytesIO()
-        Image.fromarray(door.look(phrase, camera, scene)).save(encoded, "PNG")
-        return Picture(data=encoded.getvalue(), format="png")
+    def look(phrase: str = "", camera: int | None = None, scene: str = "") -> list[Picture | str]:
+        encoded, (drawn, said) = io.BytesIO(), door.look(phrase, camera, scene)
+        Image.fromarray(drawn).save(encoded, "PNG")
+        return [Picture(data=encoded.getvalue(), format="png"), said]
 
-    look.__doc__ = (Door.look.__doc__ or "").replace("(H, W, 3) uint8 image", "An image")
+    look.__doc__ = (Door.look.__doc__ or "").replace("(H, W, 3) uint8 image", "image")
     hints = ToolAnnotations(read_only_hint=True, destructive_hint=False, open_world_hint=False)
     for ask in (door.scenes, door.find, door.count, door.distance, door.describe, look):
-        server.tool(annotations=hints)(guarded(ask))
+        server.tool(description=cleandoc(ask.__doc__ or ""), annotations=hints)(guarded(ask))
     return server

@@ -194,19 +194,25 @@ def to_lab(colours: Array) -> Array:
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
 
 
-# Basic colour terms at typical sRGB values.
+# The basic colours of assets/vocabulary, which phrases are asked with, at typical sRGB values.
 _TERMS = {
     "red": (190, 35, 40), "orange": (235, 130, 40), "yellow": (240, 215, 60), "green": (60, 150, 60),
     "turquoise": (50, 180, 180), "blue": (45, 85, 180), "purple": (120, 50, 140), "pink": (235, 150, 180),
-    "brown": (110, 70, 40), "beige": (215, 195, 160), "black": (20, 20, 20), "gray": (125, 125, 125),
+    "brown": (110, 70, 40), "beige": (215, 195, 160), "black": (20, 20, 20), "grey": (125, 125, 125),
     "white": (240, 240, 240),
 }  # fmt: skip
 
 
 def colour_term(lab: Array) -> str:
-    """Return the basic colour term nearest to a colour (3,) in CIE L*a*b*, lightness counted half."""
-    terms = to_lab(np.array(list(_TERMS.values())) / 255)
-    return list(_TERMS)[int((((terms - lab) * (0.5, 1, 1)) ** 2).sum(1).argmin())]
+    """Return the basic colour term nearest to a colour (3,) in CIE L*a*b*: in hue first, then in lightness.
+
+    Chroma is compressed, or whatever is shaded or pale would be grey; constants chosen on 63 named shades.
+    """
+    shades = np.concatenate([lab[None], to_lab(np.array(list(_TERMS.values())) / 255)])
+    chroma = np.linalg.norm(shades[:, 1:], axis=1)
+    hues = shades[:, 1:] * (60 * np.tanh(chroma / 15) / np.maximum(chroma, 1e-9))[:, None]
+    placed = np.concatenate([0.35 * shades[:, :1], hues], 1)
+    return list(_TERMS)[int(((placed[1:] - placed[0]) ** 2).sum(1).argmin())]
 
 
 # Pieces: the largest nodes that changed, those of one thing taken together.

@@ -382,7 +382,7 @@ def read_library(index: Path, folder: Path) -> Library:
                 pictures |= {scene.path: picture for scene, picture in zip(scenes, shown, strict=True)}
     except (SafetensorError, msgspec.MsgspecError, ValueError) as error:
         why = printable_line(error, 80)
-        raise FormatError(f"{index}: no index of scenes ({why}); made again by the next search") from None
+        raise FormatError(f"{index}: no index of scenes ({why}); it is made again") from None
     return Library(folder, tuple(groups), stated.unread, pictures)
 
 

@@ -5,6 +5,7 @@ import base64
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,12 +18,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from langsplat_core import __version__
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.agents.commands import MOST_SIDE, Door, scene_files
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from tests.support.fakes import PER_BLOB, named_scene
+from tests.support.processes import refusal
 
 SCENE = named_scene()
 
@@ -66,10 +69,16 @@ def test_find_answers_in_metres_and_says_what_is_absent(folder):
 
 def test_images_are_of_what_was_asked_for(folder):
     door = Door(scene_files(folder))
-    assert door.look(camera=1, scene="a.ply").shape[:2] == (SCENE.cameras[1].height, SCENE.cameras[1].width)
-    towards = door.look("mug", scene=os.path.join("blind", "b.ply"))
+    image, said = door.look(camera=1, scene="a.ply")
+    assert image.shape[:2] == (SCENE.cameras[1].height, SCENE.cameras[1].width)
+    towards, _ = door.look("mug", scene=os.path.join("blind", "b.ply"))
     assert max(towards.shape) <= MOST_SIDE
     assert towards.max() > 0
+    for number, camera in enumerate(SCENE.cameras):  # the one asked for, also with a phrase
+        _, said = door.look("mug", number, "a.ply")
+        (pixel,), _ = camera.project(np.array(door.find("mug", "a.ply")["place"])[None] / 2)
+        at = re.fullmatch(rf"by camera {number} {camera.name}, .*; mug: found, .* m, pixel (\d+) (\d+)", said)
+        np.testing.assert_allclose([float(at[1]), float(at[2])], pixel, atol=1)
     with pytest.raises(InputError, match="has cameras 0 to"):
         door.look(camera=99, scene="a.ply")
 
@@ -83,18 +92,27 @@ def test_a_client_asks_over_standard_input_and_output(folder):
     server = StdioServerParameters(command=sys.executable, args=words, env=dict(os.environ))
     before = {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
 
+    news: list[float] = []
+
+    async def note(done: float, _total: float | None, _said: str | None) -> None:
+        news.append(done)
+
     async def talk() -> tuple[list[str], list[object]]:
         async with Client(server, read_timeout_seconds=120) as client:
+            assert client.server_info.version == __version__
             tools = (await client.list_tools()).tools
             assert all(tool.annotations is not None and tool.annotations.read_only_hint for tool in tools)
             asked = [("find", {"phrase": "mug"}), ("look", {"phrase": "mug"}), ("find", {"phrase": "the"})]
-            return [tool.name for tool in tools], [await client.call_tool(*one) for one in asked]
+            answers = [await client.call_tool(*one, progress_callback=note) for one in asked]
+            return [tool.name for tool in tools], answers
 
     names, (found, seen, refused) = asyncio.run(talk())
     assert set(names) == {"scenes", "find", "count", "distance", "describe", "look"}
     assert json.loads(found.content[0].text)["verdict"] == "found"
     image = Image.open(io.BytesIO(base64.b64decode(seen.content[0].data)))
     assert image.size == (SCENE.cameras[0].width, SCENE.cameras[0].height)
+    assert seen.content[1].text.startswith("by camera ")
+    assert max(news) > 0
     assert refused.is_error
     assert "names nothing to look for" in refused.content[0].text
     assert before == {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
@@ -135,9 +153,18 @@ def call(number: int, tool: str, **arguments: object) -> dict[str, object]:
     return {"id": number, "method": "tools/call", "params": {"name": tool, "arguments": arguments}}
 
 
+@pytest.mark.parametrize("name", ["plain.ply", "nowhere.ply", "empty", "test.txt"])
+def test_what_is_no_scene_ends_the_server_at_its_start(folder, capsys, name):
+    pytest.importorskip("mcp")
+    (folder / "empty").mkdir(exist_ok=True)
+    (folder / "test.txt").touch()
+    assert name in refusal(capsys, "serve", "--mcp", folder / name)
+
+
 @pytest.mark.long
 def test_malformed_lines_and_wrong_types_are_answered_in_a_line(folder):
     wrong = [{"phrase": 5}, {"phrase": ["mug"]}, {}, {"phrase": "mug", "scene": 7}, {"phrase": None}]
+    given = {"phrase": "mug", "scene": None, "camera": None}  # null is absent
     with serving(folder) as server:
         for line in MALFORMED:
             server.stdin.write(line.encode() + b"\n")
@@ -147,7 +174,9 @@ def test_malformed_lines_and_wrong_types_are_answered_in_a_line(folder):
             send(server, call(number, "find", **arguments))
             result = json.loads(server.stdout.readline())["result"]
             assert result["isError"]
-            assert result["content"][0]["text"].isprintable()
+            assert re.fullmatch(r"(phrase|scene): [A-Z][ a-z]+", result["content"][0]["text"])
+        send(server, call(9, "look", **given))
+        assert not json.loads(server.stdout.readline())["result"]["isError"]
         server.stdin.close()
         assert server.wait(60) == 0
         assert server.stderr.read() == b""

@@ -372,8 +372,19 @@ def test_colours_are_those_of_cie():
     white, red = to_lab(np.array([[1.0, 1, 1], [1, 0, 0]]))
     np.testing.assert_allclose(white, (100, 0, 0), atol=0.1)
     np.testing.assert_allclose(red, (53.2, 80.1, 67.2), atol=0.2)  # of sRGB's red, D65
-    for colour, term in (((0.1, 0.3, 0.9), "blue"), ((0.95, 0.9, 0.3), "yellow")):
+    for colour, term in (
+        ((0.1, 0.3, 0.9), "blue"),
+        ((0.95, 0.9, 0.3), "yellow"),
+        ((0.45, 0.45, 0.47), "grey"),
+    ):
         assert colour_term(to_lab(np.array(colour))) == term
+
+
+def test_shaded_and_pale_colours_are_named_by_their_hue():
+    """Measured on a painted box in the bundled room: means of what is lit and what lies in shade."""
+    dark, muted = np.array([13.9, 35.1, -21.6]), np.array([31.8, 20.7, -16.6])
+    assert colour_term(dark) == colour_term(muted) == "purple"
+    assert colour_term(np.array([45.2, 13.7, 2.2])) == "pink"
 
 
 # `langsplat find` and `langsplat changes`.
