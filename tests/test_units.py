@@ -60,7 +60,7 @@ from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
 from langsplat_viewer.camera.controls import default_view, extent_of, fly, frame_all, from_camera
-from langsplat_viewer.camera.flight import Flight, Keyframe, Motion, pose_of, turntable
+from langsplat_viewer.camera.flight import Flight, Keyframe, pose_of, turntable
 from langsplat_viewer.camera.overlays import ground_grid
 from langsplat_viewer.options import ViewerOptions, services
 from langsplat_viewer.output import cameras_of
@@ -231,7 +231,7 @@ def window(case: Case) -> Found:
             Keyframe(2.0 * at, pose_of(from_camera(one, extent))) for at, one in enumerate(scene.cameras[:3])
         )
     )
-    paths: dict[str, Motion] = {"flight": flight, "turntable": turntable(view, 4.0)}
+    paths = {"flight": flight, "turntable": turntable(view, 4.0)}
     filmed = {name: cameras_of(motion, extent, 2.0, (64, 48)) for name, motion in paths.items()}
     drawn = {
         display: Image(render_image(plain_request(scene, camera, PictureConfig(display)), "cpu") / 255)

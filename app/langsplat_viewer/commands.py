@@ -295,6 +295,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
         Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True),
         Command("add a keyframe here", viewpoint.add_keyframe, ("K",), "Add keyframe"),
+        Command("make the path a turn around the view's centre", viewpoint.turn_around, (), "Turntable"),
         Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",)),
     ),
     "Window": (
@@ -362,6 +363,7 @@ SYNONYMS = {
     "export: mesh ...": "triangles surface glb geometry print",
     "export: map for a robot ...": "occupancy ros navigation voxels collider",
     "export: labels ...": "segmentation classes instances annotations",
+    "make the path a turn around the view's centre": "turntable orbit spin rotate 360 film",
     "save a film of the path": "video movie mp4 gif webp animation export record render",
     "quit": "exit close leave end",
     "search": "find query ask phrase text words language where",

@@ -23,7 +23,7 @@ from langsplat_core.io.files import atomic_path, check_output_file, check_output
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import Extent
-from langsplat_viewer.camera.flight import Motion, camera_of, frame_times
+from langsplat_viewer.camera.flight import Flight, camera_of, frame_times
 from langsplat_viewer.rendering.renderer import Backend, Renderer, open_renderer
 from langsplat_viewer.rendering.request import RenderRequest, why_nothing
 
@@ -205,11 +205,11 @@ class Shot:
     backend: Backend = "auto"
 
 
-def cameras_of(motion: Motion, extent: Extent, fps: float, size: tuple[int, int]) -> tuple[Camera, ...]:
+def cameras_of(flight: Flight, extent: Extent, fps: float, size: tuple[int, int]) -> tuple[Camera, ...]:
     """Return one camera of `size` pixels for each image of a film. InputError for more than `MOST_FRAMES`."""
-    if motion.seconds * fps > MOST_FRAMES:
-        raise InputError(f"a film of {motion.seconds * fps:.0f} pictures; at most {MOST_FRAMES}, lower --fps")
-    return tuple(camera_of(pose, extent, size) for pose in motion.poses(frame_times(motion, fps)))
+    if flight.seconds * fps > MOST_FRAMES:
+        raise InputError(f"a film of {flight.seconds * fps:.0f} pictures; at most {MOST_FRAMES}, lower --fps")
+    return tuple(camera_of(pose, extent, size) for pose in flight.poses(frame_times(flight, fps)))
 
 
 def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:

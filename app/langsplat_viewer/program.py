@@ -24,7 +24,7 @@ from langsplat_core.scene import LEVELS, NO_ORIGIN, Camera, Scene
 from langsplat_core.scene.language import split_phrases
 from langsplat_viewer import output
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera, spanning
-from langsplat_viewer.camera.flight import Motion, turntable
+from langsplat_viewer.camera.flight import turntable
 from langsplat_viewer.options import (
     ViewerOptions,
     check_display,
@@ -134,11 +134,10 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
         say_compiling(progress)
     if options.is_film:
         extent = extent_of(scene)
-        motion: Motion | None = None if flight is None else flight.moved(-scene.origin)
-        if options.turntable is not None:
-            motion = turntable(from_camera(camera, extent), options.turntable)
-        assert motion is not None
-        cameras = output.cameras_of(motion, extent, options.fps, request.size)
+        if flight is None:
+            assert options.turntable is not None
+            flight = turntable(from_camera(camera, extent), options.turntable).moved(scene.origin)
+        cameras = output.cameras_of(flight.moved(-scene.origin), extent, options.fps, request.size)
         lines = output.make_film(output.Shot(request, cameras, options.fps, options.backend), out, progress)
     else:
         progress("drawing", 0.8)

@@ -38,9 +38,6 @@ class Recording:
     at: float = 0.0  # seconds: where on the path the view is
     began: float | None = None  # when `at` was 0, seconds on the window's clock; None while nothing is played
     loops: bool = False
-    turns: bool = False  # once around in place of the keyframes
-    turn_seconds: float = 8.0
-    turn_from: OrbitCamera | None = None  # where the turn that is played began
     size: tuple[int, int] = (1280, 720)  # of films, and of images that are no screenshots, pixels
     fps: float = 30.0
     film_file: str = ""  # where the film goes; empty: a new name

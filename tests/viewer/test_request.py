@@ -99,7 +99,7 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
     saving.save_sized_picture(opened, tmp_path)
     recorded(opened)
     images["sized"] = image(next(tmp_path.glob("*-160x120*.png")))
-    viewpoint.set_turning(opened, True)
+    viewpoint.turn_around(opened)
     viewpoint.set_path_seconds(opened, 1.0)
     opened.state.record.fps = 2.0
     opened.state.record.film_file = "film"

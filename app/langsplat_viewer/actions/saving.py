@@ -28,7 +28,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer import output
 from langsplat_viewer.actions.editing import adopt
 from langsplat_viewer.actions.settings import ask_for, folder_of
-from langsplat_viewer.actions.viewpoint import bookmarked_view, path_motion
+from langsplat_viewer.actions.viewpoint import bookmarked_view, path_seconds
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import say_compiling
@@ -137,9 +137,9 @@ def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
 
 def save_film(viewer: Viewer, folder: Path = Path()) -> None:
     """Have a film made along the path, to the typed place or to a new name in `folder`."""
-    state, record, motion = viewer.state, viewer.state.record, path_motion(viewer)
-    if motion is None or state.extent is None:
-        viewer.say_error("a film needs a path: add a keyframe, or choose a turntable")
+    state, record, path = viewer.state, viewer.state.record, viewer.state.session.keyframes
+    if state.extent is None or path_seconds(viewer) <= 0:
+        viewer.say_error("a film needs a path: add two keyframes, or press Turntable")
         return
     typed, request = record.film_file.strip(), state.request(record.size)
     try:
@@ -148,7 +148,10 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
             new = _new_file(viewer, folder, output.VIDEO if output.has_video() else "", "-film")
         out = output.check_film(new, record.size)
         shot = output.Shot(
-            request, output.cameras_of(motion, state.extent, record.fps, record.size), record.fps, "cpu"
+            request,
+            output.cameras_of(flight_of(path), state.extent, record.fps, record.size),
+            record.fps,
+            "cpu",
         )
     except (InputError, OSError) as error:
         viewer.say_error(f"no film: {error}")

@@ -1,6 +1,5 @@
 """The viewpoint: camera moves, the camera path and its keyframes, the cursor, bookmarks."""
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from langsplat_viewer import projects
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera import controls, flight
 from langsplat_viewer.camera.controls import Extent, OrbitCamera, Side
-from langsplat_viewer.camera.flight import Keyframe, Motion
+from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.camera.overlays import FRUSTUM_DEPTH, frusta
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight
 from langsplat_viewer.rendering.request import Split, image_formation
@@ -46,14 +45,14 @@ def tick(viewer: Viewer, now: float) -> None:
 def move(viewer: Viewer, step: Callable[[OrbitCamera], OrbitCamera]) -> None:
     """Apply one of the functions of `controls` at once; it ends a glide."""
     if viewer.state.view is not None:
-        _leave_path(viewer)
+        viewer.state.record.began = None
         viewer.state.view, viewer.state.glide = step(viewer.state.view), None
 
 
 def glide_to(viewer: Viewer, end: OrbitCamera) -> None:
     """Send the camera to a view."""
     if viewer.state.view is not None:
-        _leave_path(viewer)
+        viewer.state.record.began = None
         viewer.state.glide = Glide(viewer.state.view, end, viewer.clock)
 
 
@@ -196,20 +195,8 @@ def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
 
 def path_seconds(viewer: Viewer) -> float:
     """Return how long the path takes, seconds; 0 without one."""
-    record, keyframes = viewer.state.record, viewer.state.session.keyframes
-    if record.turns:
-        return record.turn_seconds
+    keyframes = viewer.state.session.keyframes
     return keyframes[-1].seconds if keyframes else 0.0
-
-
-def path_motion(viewer: Viewer) -> Motion | None:
-    """Return the path that is filmed; None without one."""
-    state, record = viewer.state, viewer.state.record
-    if state.view is None or path_seconds(viewer) <= 0:
-        return None
-    if record.turns:
-        return flight.turntable(record.turn_from or state.view, record.turn_seconds)
-    return flight_of(state.session.keyframes)
 
 
 def toggle_playing(viewer: Viewer) -> None:
@@ -229,12 +216,7 @@ def toggle_playing(viewer: Viewer) -> None:
 
 def scrub(viewer: Viewer, seconds: float) -> None:
     """Show the path at a time, stopped."""
-    state, record = viewer.state, viewer.state.record
-    if state.view is None or not (record.turns or state.session.keyframes):
-        return
-    if record.turns and record.turn_from is None:
-        record.turn_from = state.view
-    record.began, state.glide = None, None
+    viewer.state.record.began = viewer.state.glide = None
     _show(viewer, min(max(seconds, 0.0), path_seconds(viewer)))
 
 
@@ -255,32 +237,23 @@ def _play(viewer: Viewer) -> None:
     _show(viewer, min(at, seconds))
 
 
-def _leave_path(viewer: Viewer) -> None:
-    """Have the view go elsewhere: nothing is played any more, and a turn begins anew from there."""
-    record = viewer.state.record
-    record.began = None
-    if record.turn_from is not None:
-        record.turn_from, record.at = None, 0.0
-
-
 def _show(viewer: Viewer, seconds: float) -> None:
-    state, record = viewer.state, viewer.state.record
-    record.at = seconds
-    if record.turns and record.turn_from is not None:
-        state.view = controls.orbit(record.turn_from, 2 * math.pi * seconds / record.turn_seconds, 0)
-    elif state.extent is not None and state.session.keyframes:
+    state = viewer.state
+    if state.extent is not None and state.session.keyframes:
+        state.record.at = seconds
         state.view = flight.view_of(flight.pose_at(flight_of(state.session.keyframes), seconds), state.extent)
 
 
 # Keyframes of the path.
 
 THUMBNAIL, MOST_THUMBNAILS = (144, 90), 64  # pixels
+TURN_SECONDS = 8.0  # of a turn where there was no path
 SLOW = 250.0  # milliseconds of an image of the window: where one takes longer there are no thumbnails
 
 
 def add_keyframe(viewer: Viewer) -> None:
     """Add the current view as a keyframe, some seconds after the last one."""
-    state, record = viewer.state, viewer.state.record
+    state = viewer.state
     if not viewer.has_scene("record a path in it") or state.view is None:
         return
     keyframes = state.session.keyframes
@@ -289,9 +262,16 @@ def add_keyframe(viewer: Viewer) -> None:
         viewer.say_error(f"a path has at most {MOST_KEYFRAMES} keyframes and {flight.LONGEST:.0f} seconds")
         return
     added = Keyframe(last, flight.pose_of(state.view))
-    record.turns = False
     _set_path(viewer, (*keyframes, added), added)
     state.say(f"keyframe {len(keyframes) + 1} at {added.seconds:.1f} s")
+
+
+def turn_around(viewer: Viewer) -> None:
+    """Have the path go once around what the view turns around, in place of the keyframes that were there."""
+    if viewer.has_scene("turn around in it") and viewer.state.view is not None:
+        seconds = path_seconds(viewer) or TURN_SECONDS
+        _set_path(viewer, flight.turntable(viewer.state.view, seconds).keyframes, None)
+        viewer.state.record.at = 0.0
 
 
 def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
@@ -346,14 +326,9 @@ def replace_keyframe(viewer: Viewer, key: Keyframe) -> None:
 
 
 def set_path_seconds(viewer: Viewer, seconds: float) -> None:
-    """Set how long the path, or the turn, takes."""
-    record, keyframes = viewer.state.record, viewer.state.session.keyframes
-    seconds = min(max(seconds, 0.1), flight.LONGEST)
-    if record.turns:
-        record.at *= seconds / record.turn_seconds
-        record.turn_seconds = seconds
-    elif path_seconds(viewer) > 0:
-        _set_path(viewer, flight.stretched(keyframes, max(seconds, len(keyframes) * flight.SAME_TIME)), None)
+    """Set how long the path takes."""
+    keyframes, seconds = viewer.state.session.keyframes, min(max(seconds, 0.1), flight.LONGEST)
+    _set_path(viewer, flight.stretched(keyframes, max(seconds, len(keyframes) * flight.SAME_TIME)), None)
 
 
 def clear_path(viewer: Viewer) -> None:
@@ -363,17 +338,10 @@ def clear_path(viewer: Viewer) -> None:
 
 
 def _set_path(viewer: Viewer, keyframes: tuple[Keyframe, ...], chosen: Keyframe | None) -> None:
-    _leave_path(viewer)
     viewer.change(keyframes=keyframes)
     record = viewer.state.record
-    record.chosen = chosen
+    record.began, record.chosen = None, chosen
     record.at = chosen.seconds if chosen is not None else min(record.at, path_seconds(viewer))
-
-
-def set_turning(viewer: Viewer, turns: bool) -> None:
-    """Have the path go once around what the view turns around, in place of the keyframes."""
-    _leave_path(viewer)
-    viewer.state.record.turns, viewer.state.record.at = turns, 0.0
 
 
 def load_path(viewer: Viewer, path: Path) -> None:
@@ -383,7 +351,6 @@ def load_path(viewer: Viewer, path: Path) -> None:
     except LangSplatError as error:
         viewer.say_error(str(error))
         return
-    viewer.state.record.turns = False
     _set_path(viewer, found.keyframes, None)
     viewer.state.record.at = 0.0
     open_panel(viewer, "Record")

@@ -16,13 +16,21 @@ from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
-from langsplat_viewer.camera.controls import Extent, OrbitCamera, from_camera, spanning, symmetric_intrinsics
+from langsplat_viewer.camera.controls import (
+    Extent,
+    OrbitCamera,
+    from_camera,
+    orbit,
+    spanning,
+    symmetric_intrinsics,
+)
 
 SAME = 1e-9  # a step as small as this, of the largest coordinate or in radians, is none
 FOV_LIMITS = (0.01, 179.0)  # degrees
 SPAN_LIMITS = (1e-9, 1e9)  # world units
 LONGEST = 36_000.0  # seconds of a path
 SAME_TIME = 1e-3  # seconds: two keyframes are not nearer
+TURN = 32  # steps of a turn: its path is within 1e-4 radii of a circle
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +76,6 @@ class Flight:
     """
 
     keyframes: tuple[Keyframe, ...]
-    closed: bool = False
 
     def __post_init__(self) -> None:
         if not self.keyframes:
@@ -84,9 +91,16 @@ class Flight:
     def seconds(self) -> float:
         return self.keyframes[-1].seconds
 
+    @property
+    def closed(self) -> bool:
+        """True where it ends as it began: repeated, it goes on smoothly."""
+        first, last = self.keyframes[0].pose, self.keyframes[-1].pose
+        pairs = (first.position, last.position), (first.rotation, last.rotation)
+        return len(self.keyframes) > 2 and all(np.array_equal(*pair) for pair in pairs)
+
     @cached_property
     def _curve(self) -> "_Curve":
-        return _Curve(self.keyframes)
+        return _Curve(self.keyframes, self.closed)
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
         """Return the poses at (T,) times; before the start and after the end it stands still."""
@@ -95,33 +109,13 @@ class Flight:
         return self._curve.poses(np.asarray(seconds, np.float64))
 
 
-@dataclass(frozen=True, eq=False)
-class Turntable:
-    """A motion once around a vertical axis, at an even pace; it ends where it began."""
-
-    start: Pose
-    centre: Array  # (3,) world units, on the axis
-    up: Array  # (3,) unit, along the axis
-    seconds: float  # of the whole turn, > 0
-    closed: bool = True
-
-    def poses(self, seconds: Array) -> tuple[Pose, ...]:
-        """Return the poses at (T,) times; before the start and after the end it stands still."""
-        angles = 2 * math.pi * np.clip(seconds, 0, self.seconds) / self.seconds
-        turns = Rotation.from_rotvec(angles[:, None] * self.up).as_matrix()
-        arm = self.start.position - self.centre
-        return tuple(
-            replace(self.start, position=self.centre + turn.T @ arm, rotation=self.start.rotation @ turn)
-            for turn in turns
-        )
-
-
-Motion = Flight | Turntable
-
-
-def turntable(view: OrbitCamera, seconds: float) -> Turntable:
-    """Return the turn around what `view` turns around, as a sideways drag does."""
-    return Turntable(pose_of(view), view.target, view.up, seconds)
+def turntable(view: OrbitCamera, seconds: float) -> Flight:
+    """Return the path once around what `view` turns around, evenly, as a sideways drag leads."""
+    first = Keyframe(0.0, pose_of(view))
+    turns = ((step * seconds / TURN, orbit(view, 2 * math.pi * step / TURN, 0)) for step in range(1, TURN))
+    return Flight(
+        (first, *(Keyframe(at, pose_of(turned)) for at, turned in turns), replace(first, seconds=seconds))
+    )
 
 
 def pose_of(view: OrbitCamera) -> Pose:
@@ -144,22 +138,20 @@ def camera_of(pose: Pose, extent: Extent, size: tuple[int, int]) -> Camera:
     return pose.camera(*size) if pose.span is None else view_of(pose, extent).camera(*size)
 
 
-def pose_at(motion: Motion, seconds: float) -> Pose:
+def pose_at(flight: Flight, seconds: float) -> Pose:
     """Return the pose at a time, seconds."""
-    return motion.poses(np.array([seconds]))[0]
+    return flight.poses(np.array([seconds]))[0]
 
 
-def frame_times(motion: Motion, fps: float) -> Array:
+def frame_times(flight: Flight, fps: float) -> Array:
     """Return the (T,) times at which a film of `fps` images a second is taken, seconds.
 
-    A motion that ends where it began leaves its last image out: it would be there twice when the film is
+    A path that ends where it began leaves its last image out: it would be there twice when the film is
     repeated.
     """
-    if motion.closed:
-        count = max(round(motion.seconds * fps), 1)
-    else:
-        count = math.floor(motion.seconds * fps + 1e-6) + 1
-    return np.arange(count) / fps
+    closed = flight.closed
+    count = round(flight.seconds * fps) if closed else math.floor(flight.seconds * fps + 1e-6) + 1
+    return np.arange(max(count, 1)) / fps
 
 
 def with_keyframe(keyframes: tuple[Keyframe, ...], added: Keyframe) -> tuple[Keyframe, ...]:
@@ -179,19 +171,19 @@ def stretched(keyframes: tuple[Keyframe, ...], seconds: float) -> tuple[Keyframe
 class _Curve:
     """The curve through two or more keyframes."""
 
-    def __init__(self, keyframes: tuple[Keyframe, ...]) -> None:
+    def __init__(self, keyframes: tuple[Keyframe, ...], closed: bool) -> None:
         # 12 MB of modules, for those who record a path.
         from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
         self._times = np.array([key.seconds for key in keyframes], np.float64)
         positions = np.array([key.pose.position for key in keyframes], np.float64)
         least = SAME * np.abs(positions).max()
-        slopes = tangents(self._times, np.diff(positions, axis=0), least)
+        slopes = tangents(self._times, np.diff(positions, axis=0), least, closed)
         self._positions = CubicHermiteSpline(self._times, positions, slopes)
         # Camera to world: a product from the right is then a turn as the camera feels it.
         self._rotations = Rotation.from_matrix(np.array([key.pose.rotation.T for key in keyframes]))
         steps = (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
-        rates = tangents(self._times, steps, SAME)
+        rates = tangents(self._times, steps, SAME, closed)
         thirds = np.diff(self._times)[:, None] / 3
         self._first, self._last = rates[:-1] * thirds, rates[1:] * thirds
         ends = Rotation.from_rotvec(-self._first), Rotation.from_rotvec(-self._last)
@@ -225,18 +217,19 @@ class _Curve:
         return tuple(Pose(*parts) for parts in found)
 
 
-def tangents(times: Array, steps: Array, least: float) -> Array:
+def tangents(times: Array, steps: Array, least: float, closed: bool = False) -> Array:
     """Return the (K, 3) velocities at K >= 2 keyframes of rising `times` (K,).
 
     The keyframes differ by `steps` (K - 1, 3). Velocities are those of the parabola through a keyframe and
-    its two neighbours, at the ends of the straight line to the one neighbour, and none beside a step shorter
-    than `least`.
+    its two neighbours, and none beside a step shorter than `least`. At the ends those of the straight line
+    to the one neighbour; the ends of a `closed` path are one keyframe.
     """
-    spans = np.diff(times)[:, None]
+    spans, rests = np.diff(times)[:, None], np.linalg.norm(steps, axis=1) <= least
+    if closed:
+        spans, steps = (np.concatenate([part[-1:], part, part[:1]]) for part in (spans, steps))
     slopes = steps / spans
     inner = (spans[:-1] * slopes[1:] + spans[1:] * slopes[:-1]) / (spans[:-1] + spans[1:])
-    found = np.concatenate([slopes[:1], inner, slopes[-1:]])
-    rests = np.linalg.norm(steps, axis=1) <= least
+    found = inner if closed else np.concatenate([slopes[:1], inner, slopes[-1:]])
     found[:-1][rests] = 0
     found[1:][rests] = 0
     return np.asarray(found)

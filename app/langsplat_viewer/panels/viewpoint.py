@@ -88,10 +88,7 @@ def draw_timeline(viewer: Viewer) -> None:
     """Draw the panel "Timeline": playing the path, and its keyframes as they will look."""
     imgui.begin_disabled(viewer.state.view is None)
     _play(viewer)
-    if viewer.state.record.turns:
-        ui.small_wrapped("Once around what the view turns around; F makes that the latest result", ui.muted())
-    else:
-        _keyframes(viewer)
+    _keyframes(viewer)
     imgui.end_disabled()
 
 
@@ -125,7 +122,7 @@ def _number(label: str, value: float, step: float) -> float | None:
 
 def _keyframes(viewer: Viewer) -> None:
     record, keyframes = viewer.state.record, viewer.state.session.keyframes
-    ui.verbs(viewer, "Add keyframe", "Save path")
+    ui.verbs(viewer, "Add keyframe", "Turntable", "Save path")
     if ui.next_button("Clear", enabled=bool(keyframes)):
         viewpoint.clear_path(viewer)
     _chosen(viewer, record.chosen)
@@ -188,11 +185,7 @@ def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
 
 
 def draw_record(viewer: Viewer) -> None:
-    """Draw the panel "Record": which path is filmed, how, and where to."""
-    record = viewer.state.record
-    turns = ui.choice({False: "Keyframes", True: "Turntable"}, record.turns)
-    if turns != record.turns:
-        viewpoint.set_turning(viewer, turns)
+    """Draw the panel "Record": films of the path, how, and where to."""
     imgui.begin_disabled(viewer.state.view is None)
     if ui.button("Open the timeline", "Keyframes, and playing the path"):
         settings.open_panel(viewer, "Timeline")
