@@ -14,7 +14,7 @@ from typing import Any
 
 import moderngl
 import numpy as np
-from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
+from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui, imgui_ctx
 from imgui_bundle import portable_file_dialogs as pfd
 
 from langsplat_core.errors import LangSplatError
@@ -65,32 +65,28 @@ class StartPage:
         imgui.set_next_window_pos(ImVec2(area.left, area.top))
         imgui.set_next_window_size(ImVec2(area.width, area.height))
         imgui.set_next_window_bg_alpha(1.0)
-        imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(max(area.width - width, 0) / 2, 0))
-        imgui.begin("start", None, (ui.OVER | ui.FIXED) & ~imgui.WindowFlags_.no_scrollbar)
-        imgui.pop_style_var()
+        with theme.styled(window_padding=ImVec2(max(area.width - width, 0) / 2, 0)):
+            imgui.begin("start", None, (ui.OVER | ui.FIXED) & ~imgui.WindowFlags_.no_scrollbar)
         imgui.dummy(ImVec2(0, 0.04 * area.height))
         imgui.push_font(imgui.get_font(), TITLE * theme.FONT_SIZE)
         imgui.text_unformatted("LangSplat viewer")
         imgui.pop_font()
         ui.small_wrapped("Look around in 3D Gaussian scenes, and search them with words.", ui.muted())
         imgui.dummy(ImVec2(0, hello_imgui.em_size(0.4)))
-        imgui.push_style_var(imgui.StyleVar_.frame_padding, hello_imgui.em_to_vec2(0.8, 0.45))
-        ui.verbs(viewer, "Open a scene ...", "Train from photographs ...", "First steps")
-        imgui.pop_style_var()
+        with theme.styled(frame_padding=hello_imgui.em_to_vec2(0.8, 0.45)):
+            ui.verbs(viewer, "Open a scene ...", "Train from photographs ...", "First steps")
         imgui.dummy(ImVec2(0, hello_imgui.em_size(0.8)))
         for number, (path, picture, image) in enumerate(self._cards):
             if number % columns:
                 imgui.same_line()
-            imgui.push_id(number)
-            if _card(path, None if image is None else picture.texture(image), card):
-                opening.open_file(viewer, path)
-            imgui.pop_id()
+            with imgui_ctx.push_id(str(number)):
+                if _card(path, None if image is None else picture.texture(image), card):
+                    opening.open_file(viewer, path)
         imgui.dummy(ImVec2(0, hello_imgui.em_size(0.4)))
         reading, text = viewer.state.opening, "Drop a scene, a project or a folder of photographs here"
         text = f"Opening {reading.name} ..." if reading else text
-        imgui.begin_disabled()  # it takes no click; files are taken all over the window
-        imgui.button(text, ImVec2(width, hello_imgui.em_size(DROP_EM)))
-        imgui.end_disabled()
+        with ui.disabled(True):  # files are taken all over the window
+            imgui.button(text, ImVec2(width, hello_imgui.em_size(DROP_EM)))
         imgui.end()
 
 
@@ -99,17 +95,16 @@ def _card(path: Path, texture: moderngl.Texture | None, width: float) -> bool:
     height, name, where = hello_imgui.em_size(PICTURE_EM), path.name, str(path.parent)
     if path == BUNDLED:
         name, where = "A room to try", "comes with the program"
-    imgui.begin_group()
-    if texture is None:
-        clicked = imgui.button(f"{icons_fontawesome_6.ICON_FA_CUBES}###card", ImVec2(width, height))
-    else:
-        edge = imgui.get_style().frame_padding
-        inside = ImVec2(width - 2 * edge.x, height - 2 * edge.y)
-        clicked = imgui.image_button("###card", imgui.ImTextureRef(texture.glo), inside)
-    ui.tip(str(path))
-    imgui.text_unformatted(ui.elided(name, width))
-    imgui.text_colored(ui.muted(), ui.elided(where, width))
-    imgui.end_group()
+    with imgui_ctx.begin_group():
+        if texture is None:
+            clicked = imgui.button(f"{icons_fontawesome_6.ICON_FA_CUBES}###card", ImVec2(width, height))
+        else:
+            edge = imgui.get_style().frame_padding
+            inside = ImVec2(width - 2 * edge.x, height - 2 * edge.y)
+            clicked = imgui.image_button("###card", imgui.ImTextureRef(texture.glo), inside)
+        ui.tip(str(path))
+        imgui.text_unformatted(ui.elided(name, width))
+        imgui.text_colored(ui.muted(), ui.elided(where, width))
     return bool(clicked)
 
 
@@ -136,27 +131,21 @@ class Toasts:
         if not self._shown and viewer.recorder.current is None:
             return
         foot = ImVec2(area.left + area.width / 2, area.top + area.height - hello_imgui.em_size(2))
-        imgui.set_next_window_pos(foot, imgui.Cond_.always, ImVec2(0.5, 1))
-        over = ui.OVER & ~imgui.WindowFlags_.no_bring_to_front_on_focus | ui.FIXED
-        imgui.begin("toasts", None, over | imgui.WindowFlags_.no_nav | imgui.WindowFlags_.always_auto_resize)
-        imgui.push_text_wrap_pos(min(hello_imgui.em_size(TOAST_EM), 0.8 * area.width))
-        for number, (message, _) in enumerate(self._shown):
-            imgui.push_id(number)
-            self._toast(viewer, message)
-            imgui.pop_id()
-        imgui.pop_text_wrap_pos()
-        imgui.dummy(ImVec2(hello_imgui.em_size(BAR_EM if viewer.recorder.current else 0), 0))
-        ui.recorder_bar(viewer)
-        if imgui.is_window_hovered():
-            self._shown = [(message, now) for message, _ in self._shown]
-            if imgui.is_mouse_clicked(0) and not imgui.is_any_item_hovered():
-                self._shown = []
-        imgui.end()
+        flags = ui.FLOATS & ~imgui.WindowFlags_.no_bring_to_front_on_focus | imgui.WindowFlags_.no_nav
+        with ui.floating("toasts", foot, ImVec2(0.5, 1), flags):
+            with imgui_ctx.push_text_wrap_pos(min(hello_imgui.em_size(TOAST_EM), 0.8 * area.width)):
+                for number, (message, _) in enumerate(self._shown):
+                    with imgui_ctx.push_id(str(number)):
+                        self._toast(viewer, message)
+            imgui.dummy(ImVec2(hello_imgui.em_size(BAR_EM if viewer.recorder.current else 0), 0))
+            ui.recorder_bar(viewer)
+            if imgui.is_window_hovered():
+                self._shown = [(message, now) for message, _ in self._shown]
+                if imgui.is_mouse_clicked(0) and not imgui.is_any_item_hovered():
+                    self._shown = []
 
     def _toast(self, viewer: Viewer, message: Message) -> None:
-        imgui.text_colored(
-            ui.bad() if message.is_error else imgui.get_style_color_vec4(imgui.Col_.text), message.text
-        )
+        imgui.text_colored(theme.colour("bad" if message.is_error else "ink"), message.text)
         if message.file is not None and imgui.small_button("Show in folder"):
             saving.show_in_folder(viewer, message.file)
         is_last = message.undoes is not None and [message.undoes] == viewer.history.past[-1:]
@@ -336,18 +325,15 @@ def draw_changed(viewer: Viewer, area: ui.Area) -> None:
     if not viewer.watch.changed or state.path is None or state.opening is not None:
         return
     top = ImVec2(area.left + area.width / 2, area.top + hello_imgui.em_size(3))  # below what a tool says
-    imgui.set_next_window_pos(top, imgui.Cond_.always, ImVec2(0.5, 0))
-    no_nav, resize = imgui.WindowFlags_.no_nav, imgui.WindowFlags_.always_auto_resize
-    imgui.begin("changed", None, ui.OVER | ui.FIXED | no_nav | resize)
-    imgui.align_text_to_frame_padding()
-    imgui.text_unformatted(f"{state.path.name} has changed on disk")
-    imgui.same_line()
-    if ui.button("Reload", "Read it again; camera, queries and view settings stay"):
-        opening.reload(viewer)
-    imgui.same_line()
-    if imgui.button("Not now"):
-        viewer.watch.dismiss()
-    imgui.end()
+    with ui.floating("changed", top, ImVec2(0.5, 0), ui.FLOATS | imgui.WindowFlags_.no_nav):
+        imgui.align_text_to_frame_padding()
+        imgui.text_unformatted(f"{state.path.name} has changed on disk")
+        imgui.same_line()
+        if ui.button("Reload", "Read it again; camera, queries and view settings stay"):
+            opening.reload(viewer)
+        imgui.same_line()
+        if imgui.button("Not now"):
+            viewer.watch.dismiss()
 
 
 # What is not saved.

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
+from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui, imgui_ctx
 
 from langsplat_core import registry
 from langsplat_viewer.actions import queries, settings
@@ -16,6 +16,7 @@ from langsplat_viewer.panels import (
     scene,
     search,
     select,
+    theme,
     ui,
     viewpoint,
 )
@@ -34,22 +35,23 @@ class Panel:
     title: str
     draw: Callable[[Viewer], None]
     is_open: bool = False  # until it is opened or closed
+    needs_scene: bool = False  # grey without one
     dock: str = INSPECTOR  # for a section; FOOT for a window; "" for what floats over the scene
 
 
 CORE_PANELS: tuple[Panel, ...] = (
     Panel(search.TITLE, search.draw, is_open=True, dock=""),
     Panel("Display", scene.draw_display, is_open=True),
-    Panel("Camera", viewpoint.draw_camera),
+    Panel("Camera", viewpoint.draw_camera, needs_scene=True),
     Panel("Outline", outline.draw),
-    Panel("Select", select.draw),
-    Panel("Transform", select.draw_transform),
-    Panel("Record", viewpoint.draw_record),
-    Panel("Bookmarks", viewpoint.draw_bookmarks),
-    Panel("Notes", overlays.draw_notes),
+    Panel("Select", select.draw, needs_scene=True),
+    Panel("Transform", select.draw_transform, needs_scene=True),
+    Panel("Record", viewpoint.draw_record, needs_scene=True),
+    Panel("Bookmarks", viewpoint.draw_bookmarks, needs_scene=True),
+    Panel("Notes", overlays.draw_notes, needs_scene=True),
     Panel("Scene", scene.draw_scene),
     Panel("Train", scene.draw_training),
-    Panel("Timeline", viewpoint.draw_timeline, dock=FOOT),
+    Panel("Timeline", viewpoint.draw_timeline, needs_scene=True, dock=FOOT),
     Panel("Messages", scene.draw_messages, dock=FOOT),
 )
 
@@ -89,8 +91,13 @@ def _splits(scale: float, width: float) -> list[hello_imgui.DockingSplit]:
     ]
 
 
+def _draw(viewer: Viewer, panel: Panel) -> None:
+    with ui.disabled(panel.needs_scene and viewer.state.view is None):
+        panel.draw(viewer)
+
+
 def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
-    window = hello_imgui.DockableWindow(panel.title, panel.dock, lambda: panel.draw(viewer), False)
+    window = hello_imgui.DockableWindow(panel.title, panel.dock, lambda: _draw(viewer, panel), False)
     window.remember_is_visible = False  # the preferences do
     window.window_size = ImVec2(360, 330)
     return window
@@ -107,16 +114,14 @@ def draw_inspector(viewer: Viewer) -> None:
         if viewer.state.wanted_panel == panel.title:
             settings.take(viewer.state, "wanted_panel")
             imgui.set_scroll_here_y(0.0)
-        imgui.push_style_var(imgui.StyleVar_.frame_border_size, 0.0)
-        is_open = imgui.collapsing_header(panel.title)
-        imgui.pop_style_var()
+        with theme.styled(frame_border_size=0.0):
+            is_open = imgui.collapsing_header(panel.title)
         if is_open != was_open:
             settings.turn_panel(viewer, panel.title, is_open=not was_open)
         if was_open:
-            imgui.push_id(panel.title)
-            panel.draw(viewer)
-            imgui.dummy(ImVec2(0, imgui.get_style().item_spacing.y))
-            imgui.pop_id()
+            with imgui_ctx.push_id(panel.title):
+                _draw(viewer, panel)
+                imgui.dummy(ImVec2(0, imgui.get_style().item_spacing.y))
 
 
 class Docks:
@@ -211,16 +216,16 @@ def _float_search(viewer: Viewer, area: ui.Area, left: float) -> ui.Area:
         return area
     margin = hello_imgui.em_size(MARGIN_EM)
     width = min(hello_imgui.em_size(CARD_EM), CARD_SHARE * area.width)
-    imgui.set_next_window_pos(ImVec2(area.left + left + margin, area.top + margin))
+    at = ImVec2(area.left + left + margin, area.top + margin)
     if search.TITLE not in opened(viewer.state):
-        with ui.floating("search button", padding=hello_imgui.em_to_vec2(0.3, 0.3)):
+        with ui.floating("search button", at, padding_em=0.3):
             if imgui.button(f"{icons_fontawesome_6.ICON_FA_MAGNIFYING_GLASS}##search"):
                 queries.focus_search(viewer)
             ui.tip(with_key("Search", queries.focus_search))
             width = imgui.get_window_width()
         return area.right_of(left + margin + width)
     imgui.set_next_window_size_constraints(ImVec2(width, 0), ImVec2(width, area.height - 2 * margin))
-    with ui.floating(search.TITLE):
+    with ui.floating(search.TITLE, at, padding_em=0.9):
         search.draw(viewer)
     return area.right_of(left + margin + width)
 

@@ -68,29 +68,26 @@ def draw_toolbar(viewer: Viewer, area: ui.Area) -> float:
     margin, gaps, count = 2 * gap, (len(GROUPS) - 1) * gap, sum(map(len, GROUPS))
     room = area.height - 2 * margin
     side = max(min(side, (room - gaps - 2 * edge) / count), LEAST * side)
-    imgui.set_next_window_pos(ImVec2(area.left + margin, area.top + margin))
+    at = ImVec2(area.left + margin, area.top + margin)
     wide, high = side + 2 * edge, count * side + gaps + 2 * edge
     imgui.set_next_window_size(ImVec2(wide, min(high, room)))
-    with ui.floating("toolbar", ui.OVER | ui.FIXED, ImVec2(edge, edge)):
-        imgui.push_style_var(imgui.StyleVar_.item_spacing, ImVec2(0, 0))
-        imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, 0))
-        imgui.push_style_var(imgui.StyleVar_.frame_border_size, 0.0)
-        for group in GROUPS:
-            if group is not GROUPS[0]:
-                imgui.dummy(ImVec2(side, gap))
-            for command in group:
-                _tool_button(viewer, command, side)
-        imgui.pop_style_var(3)
+    with ui.floating("toolbar", at, flags=ui.OVER | ui.FIXED, padding_em=EDGE_EM):
+        none = ImVec2(0, 0)
+        with theme.styled(item_spacing=none, frame_padding=none, frame_border_size=0.0):
+            for group in GROUPS:
+                if group is not GROUPS[0]:
+                    imgui.dummy(ImVec2(side, gap))
+                for command in group:
+                    _tool_button(viewer, command, side)
     return margin + wide
 
 
 def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
     lit = command.is_on is not None and command.is_on(viewer)
-    imgui.push_style_color(imgui.Col_.button, theme.colour("pressed") if lit else theme.CLEAR)
-    imgui.push_style_color(imgui.Col_.text, theme.colour("accent" if lit else "ink"))
-    if imgui.button(button_label(command), ImVec2(side, side)):
+    with theme.styled(button="pressed" if lit else theme.CLEAR, text="accent" if lit else "ink"):
+        clicked = imgui.button(button_label(command), ImVec2(side, side))
+    if clicked:
         command.act(viewer)
-    imgui.pop_style_color(2)
     keys = f" ({command.keys[0]})" if command.keys else ""
     ui.tip(command.does[0].upper() + command.does[1:] + keys)
 
@@ -127,9 +124,8 @@ def draw_status(viewer: Viewer) -> None:
     imgui.same_line(right)
     for title in FOOT:
         is_open = title in (viewer.state.preferences.panels or ())
-        imgui.push_style_color(imgui.Col_.text, theme.colour("accent" if is_open else "ink"))
-        clicked = imgui.button(f"{title}##status")
-        imgui.pop_style_color()
+        with theme.styled(text="accent" if is_open else "ink"):
+            clicked = imgui.button(f"{title}##status")
         if clicked:
             settings.turn_panel(viewer, title, is_open=not is_open)
         imgui.same_line()

@@ -2,15 +2,15 @@
 
 from typing import Any
 
-from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui, imgui_ctx
 from imgui_bundle import icons_fontawesome_6 as icons
 
 from langsplat_core.query.describe import OR
 from langsplat_core.query.inventory import Outline
 from langsplat_viewer.actions import outline
 from langsplat_viewer.actions.outline import Target
-from langsplat_viewer.panels import ui
-from langsplat_viewer.panels.overlays import begin_legend, clicked
+from langsplat_viewer.panels import theme, ui
+from langsplat_viewer.panels.overlays import clicked, legend
 from langsplat_viewer.viewer import Viewer
 
 LEGEND_ROWS, LEGEND_EM = 8, 9.0
@@ -35,44 +35,40 @@ def draw(viewer: Viewer) -> None:
 
 
 def _row(viewer: Viewer, row: Outline) -> None:
-    imgui.push_id(f"node {row.node}")
-    side, spacing = imgui.get_frame_height(), imgui.get_style().item_spacing.x
-    right = imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x
-    flags = imgui.TreeNodeFlags_.open_on_arrow | imgui.TreeNodeFlags_.allow_overlap
-    flags |= imgui.TreeNodeFlags_.span_avail_width | imgui.TreeNodeFlags_.no_tree_push_on_open
-    flags |= imgui.TreeNodeFlags_.leaf if not row.parts else 0
-    colour = outline.colour_of(viewer, row.node)
-    name, sure = outline.name_of(viewer, row), ""
-    named = row.node in viewer.state.session.things.names
-    if row.word and not named:
-        named = row.word.probability >= SURE
-        sure = f"{'' if named else '?'} {100 * row.word.probability:.0f} %"
-    taken = (1 if colour is None else 2) * (side + spacing)
-    room = imgui.get_content_region_avail().x - taken - imgui.get_tree_node_to_label_spacing()
-    label = ui.elided(name + sure, room)
-    imgui.align_text_to_frame_padding()
-    imgui.push_style_color(
-        imgui.Col_.text, imgui.get_style_color_vec4(imgui.Col_.text) if named else ui.muted()
-    )
-    opened = imgui.tree_node_ex(f"{label}###row", flags)
-    imgui.pop_style_color()
-    if _chosen("thing"):
-        outline.visit(viewer, row.node)
-    _about(row, name)
-    if imgui.begin_popup_context_item("thing"):
-        _things_menu(viewer, row.node)
-        imgui.end_popup()
-    left = room - ui.width_of(label) - 2 * spacing
-    texts = (f"{row.count:,}   {_sides(row)}", f"{row.count:,}")
-    said = next((text for text in texts if ui.width_of(text) < left), "")
-    if said:
-        imgui.same_line(right - taken - ui.width_of(said))
-        imgui.text_colored(ui.muted(), said)
-    if colour is not None:
-        imgui.same_line(right - 2 * side - spacing)
-        _swatch(colour, side)
-    _eye(viewer, row.node, right - side, side)
-    imgui.pop_id()
+    with imgui_ctx.push_id(f"node {row.node}"):
+        side, spacing = imgui.get_frame_height(), imgui.get_style().item_spacing.x
+        right = imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x
+        flags = imgui.TreeNodeFlags_.open_on_arrow | imgui.TreeNodeFlags_.allow_overlap
+        flags |= imgui.TreeNodeFlags_.span_avail_width | imgui.TreeNodeFlags_.no_tree_push_on_open
+        flags |= imgui.TreeNodeFlags_.leaf if not row.parts else 0
+        colour = outline.colour_of(viewer, row.node)
+        name, sure = outline.name_of(viewer, row), ""
+        named = row.node in viewer.state.session.things.names
+        if row.word and not named:
+            named = row.word.probability >= SURE
+            sure = f"{'' if named else '?'} {100 * row.word.probability:.0f} %"
+        taken = (1 if colour is None else 2) * (side + spacing)
+        room = imgui.get_content_region_avail().x - taken - imgui.get_tree_node_to_label_spacing()
+        label = ui.elided(name + sure, room)
+        imgui.align_text_to_frame_padding()
+        with theme.styled(text="ink" if named else "soft"):
+            opened = imgui.tree_node_ex(f"{label}###row", flags)
+        if _chosen("thing"):
+            outline.visit(viewer, row.node)
+        _about(row, name)
+        if imgui.begin_popup_context_item("thing"):
+            _things_menu(viewer, row.node)
+            imgui.end_popup()
+        left = room - ui.width_of(label) - 2 * spacing
+        texts = (f"{row.count:,}   {_sides(row)}", f"{row.count:,}")
+        said = next((text for text in texts if ui.width_of(text) < left), "")
+        if said:
+            imgui.same_line(right - taken - ui.width_of(said))
+            imgui.text_colored(ui.muted(), said)
+        if colour is not None:
+            imgui.same_line(right - 2 * side - spacing)
+            _swatch(colour, side)
+        _eye(viewer, row.node, right - side, side)
     if opened:
         imgui.indent()
         for part in row.parts:
@@ -107,12 +103,11 @@ def _eye(viewer: Viewer, node: int, left: float, side: float) -> None:
     """Draw the button that hides a node or shows it again."""
     hidden = bool(outline.hidden_nodes(viewer)[node])
     imgui.same_line(left)
-    text = ui.muted() if hidden else imgui.get_style_color_vec4(imgui.Col_.text)
-    imgui.push_style_color(imgui.Col_.text, ImVec4(text.x, text.y, text.z, 0.45 if hidden else 1.0))
-    icon = icons.ICON_FA_EYE_SLASH if hidden else icons.ICON_FA_EYE
-    if ui.small(f"{icon}###eye", side):
+    text, icon = theme.colour("soft"), icons.ICON_FA_EYE_SLASH if hidden else icons.ICON_FA_EYE
+    with theme.styled(text=ImVec4(text.x, text.y, text.z, 0.45) if hidden else "ink"):
+        clicked = ui.small(f"{icon}###eye", side)
+    if clicked:
         (outline.show if hidden else outline.hide)(viewer, node)
-    imgui.pop_style_color()
     ui.tip("Show it again" if hidden else "Hide it")
 
 
@@ -185,9 +180,8 @@ def draw_legend(viewer: Viewer, area: ui.Area) -> None:
             break
     if not seen:
         return
-    begin_legend("things in colours", area)
-    for name, colour in seen.items():
-        _swatch(colour, imgui.get_text_line_height())
-        imgui.same_line()
-        imgui.text_unformatted(ui.elided(name, hello_imgui.em_size(LEGEND_EM)))
-    imgui.end()
+    with legend("things in colours", area):
+        for name, colour in seen.items():
+            _swatch(colour, imgui.get_text_line_height())
+            imgui.same_line()
+            imgui.text_unformatted(ui.elided(name, hello_imgui.em_size(LEGEND_EM)))

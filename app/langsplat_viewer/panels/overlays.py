@@ -1,12 +1,13 @@
 """The images of the scene behind the panels, and the overlays on them with their panels."""
 
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any
 
 import moderngl
 import numpy as np
-from imgui_bundle import ImVec2, hello_imgui, imgui
+from imgui_bundle import ImVec2, hello_imgui, imgui, imgui_ctx
 
 from langsplat_core.arrays import Array, length_text
 from langsplat_core.config import ColourMap
@@ -19,7 +20,7 @@ from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import PlacedText, placed
 from langsplat_viewer.commands import with_key
-from langsplat_viewer.panels import ui
+from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.rendering.request import Split
 from langsplat_viewer.session import Note, Point, Ruler
 from langsplat_viewer.state import Hover
@@ -88,11 +89,10 @@ def draw_grip(viewer: Viewer, area: ui.Area) -> None:
     if not split.has_line or viewer.state.scene is None:
         return
     x = area.left + split.at * area.width
-    imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(0, 0))
-    imgui.push_style_var(imgui.StyleVar_.window_min_size, ImVec2(1, 1))
     imgui.set_next_window_pos(ImVec2(x - GRIP / 2, area.top))
     imgui.set_next_window_size(ImVec2(GRIP, area.height))
-    imgui.begin("split", None, UNMOVED)
+    with theme.styled(window_padding=ImVec2(0, 0), window_min_size=ImVec2(1, 1)):
+        imgui.begin("split", None, UNMOVED)
     imgui.invisible_button("line", ImVec2(GRIP, area.height))
     if imgui.is_item_hovered() or imgui.is_item_active():
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew)
@@ -104,7 +104,6 @@ def draw_grip(viewer: Viewer, area: ui.Area) -> None:
     elif imgui.is_item_active() and imgui.get_io().mouse_delta.x:
         settings.move_line(viewer, area.fraction(imgui.get_io().mouse_pos.x, 0)[0])
     imgui.end()
-    imgui.pop_style_var(2)
 
 
 # What an answer stands on.
@@ -352,7 +351,6 @@ def _notes(notes: Sequence[Note], pen: Pen) -> None:
 
 STEPS = 32  # of a colour bar
 BAR_EM, BAR_HEIGHT_EM = 11.0, 0.8
-QUIET = ui.OVER | imgui.WindowFlags_.no_inputs | imgui.WindowFlags_.always_auto_resize
 
 
 def draw_legends(viewer: Viewer, area: ui.Area) -> None:
@@ -376,36 +374,31 @@ def draw_legend(viewer: Viewer, area: ui.Area, name: str = "relevancy") -> None:
     is_hot = any(pane.row.drawing is Drawing.HEAT for pane in state.panes())
     if state.scene is None or not slots or not is_hot:
         return
-    begin_legend(name, area)
-    for slot in slots:
-        result = shown[slot]
-        if result is not None:
-            colours = bar_colours(STRENGTH[result.verdict], picture.colour_map if len(slots) == 1 else slot)
-            _bar(result, colours, picture.heat_scale or result.heat_range)
-    imgui.end()
+    with legend(name, area):
+        for slot in slots:
+            result = shown[slot]
+            if result is not None:
+                by = picture.colour_map if len(slots) == 1 else slot
+                colours = bar_colours(STRENGTH[result.verdict], by)
+                _bar(result, colours, picture.heat_scale or result.heat_range)
 
 
-def begin_legend(name: str, area: ui.Area) -> None:
-    """Begin a window in the lower right corner of the scene's area."""
-    margin = hello_imgui.em_size(0.7)
-    corner = ImVec2(area.left + area.width - margin, area.top + area.height - margin)
-    imgui.set_next_window_pos(corner, imgui.Cond_.always, ImVec2(1, 1))
-    imgui.set_next_window_bg_alpha(0.75)
-    imgui.begin(name, None, QUIET)
+def legend(name: str, area: ui.Area) -> AbstractContextManager[None]:
+    """Have what follows drawn in the lower right corner of the scene's area."""
+    corner = area.corners[1] - hello_imgui.em_to_vec2(0.7, 0.7)
+    return ui.floating(name, corner, ImVec2(1, 1), ui.QUIET)
 
 
 def say(text: str, area: ui.Area, name: str = "said over the scene", top: float | None = None) -> None:
     """Write a line over the scene, in the middle of its area or `top` window units below its upper edge."""
     x, y = area.left + area.width / 2, area.top + (area.height / 2 if top is None else top)
-    imgui.set_next_window_pos(ImVec2(x, y), imgui.Cond_.always, ImVec2(0.5, 0.5 if top is None else 0))
     widest = 0.9 if top is None else 0.95  # of the area's width
     imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(widest * area.width, area.height))
-    imgui.set_next_window_bg_alpha(0.75)
-    imgui.begin(name, None, QUIET)
-    imgui.push_text_wrap_pos((widest - 0.05) * area.width)
-    imgui.text_unformatted(text)
-    imgui.pop_text_wrap_pos()
-    imgui.end()
+    with (
+        ui.floating(name, ImVec2(x, y), ImVec2(0.5, 0.5 if top is None else 0), ui.QUIET),
+        imgui_ctx.push_text_wrap_pos((widest - 0.05) * area.width),
+    ):
+        imgui.text_unformatted(text)
 
 
 def bar_colours(strength: float, by: ColourMap | int) -> Array:
@@ -456,15 +449,14 @@ def draw_pointing(viewer: Viewer) -> None:
     hover = viewer.state.hover
     if hover is None or hover.found is None or not imgui.begin_tooltip():
         return
-    imgui.push_text_wrap_pos(hello_imgui.em_size(24))
-    sure = viewer.engine is not None and viewer.engine.basis.calibration is not None
-    for name, words in zip(LEVELS, hover.found.words, strict=True):
-        imgui.text_colored(ui.muted(), name)
-        imgui.same_line(hello_imgui.em_size(4.5))
-        imgui.text_unformatted(said(words, sure))
-    for line in pointed_figures(hover, viewer.state.origin):
-        imgui.text_colored(ui.muted(), line)
-    imgui.pop_text_wrap_pos()
+    with imgui_ctx.push_text_wrap_pos(hello_imgui.em_size(24)):
+        sure = viewer.engine is not None and viewer.engine.basis.calibration is not None
+        for name, words in zip(LEVELS, hover.found.words, strict=True):
+            imgui.text_colored(ui.muted(), name)
+            imgui.same_line(hello_imgui.em_size(4.5))
+            imgui.text_unformatted(said(words, sure))
+        for line in pointed_figures(hover, viewer.state.origin):
+            imgui.text_colored(ui.muted(), line)
     imgui.end_tooltip()
 
 
@@ -496,24 +488,21 @@ def _faded(colour: Iterable[float], alpha: float) -> int:
 def draw_notes(viewer: Viewer) -> None:
     """Draw the panel "Notes": texts pinned to places, kept in the project."""
     state, side = viewer.state, imgui.get_frame_height()
-    imgui.begin_disabled(state.scene is None)
     pin = with_key("Pin one to what is clicked", settings.toggle_pinning)
     if imgui.checkbox(pin, state.pins_notes)[0]:
         settings.toggle_pinning(viewer)
     ui.verbs(viewer, "Save project")
-    imgui.end_disabled()
     if not state.session.notes:
         ui.small_wrapped("notes are listed here", ui.muted())
     for number, note in enumerate(state.session.notes):
-        imgui.push_id(number)
-        imgui.set_next_item_width(-side - imgui.get_style().item_spacing.x)
-        if note is state.fresh_note:
-            imgui.set_keyboard_focus_here()
-            settings.put(state, fresh_note=None)
-        changed, text = imgui.input_text("##note", note.text)
-        if changed and not imgui.is_key_pressed(imgui.Key.escape):  # which would take back what was typed
-            settings.write_note(viewer, note, text)
-        imgui.same_line()
-        if ui.small("x", side):
-            settings.remove_note(viewer, note)
-        imgui.pop_id()
+        with imgui_ctx.push_id(str(number)):
+            imgui.set_next_item_width(-side - imgui.get_style().item_spacing.x)
+            if note is state.fresh_note:
+                imgui.set_keyboard_focus_here()
+                settings.put(state, fresh_note=None)
+            changed, text = imgui.input_text("##note", note.text)
+            if changed and not imgui.is_key_pressed(imgui.Key.escape):  # which would take back what was typed
+                settings.write_note(viewer, note, text)
+            imgui.same_line()
+            if ui.small("x", side):
+                settings.remove_note(viewer, note)

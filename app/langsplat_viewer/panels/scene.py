@@ -131,9 +131,8 @@ def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
     if len(buttons) > len(rows):
         ui.row(rows[0].label)
     shown = next((one for one in buttons if one is not None and is_shown(state, one)), None)
-    imgui.begin_disabled(not state.has_field and rows[0].needs_field)
-    chosen = ui.choice(buttons, shown)
-    imgui.end_disabled()
+    with ui.disabled(not state.has_field and rows[0].needs_field):
+        chosen = ui.choice(buttons, shown)
     if chosen is not None and chosen != shown:
         settings.set_display(viewer, chosen.display, chosen.latent_level)
 
@@ -151,14 +150,12 @@ def _compared(viewer: Viewer) -> None:
     if imgui.selectable("nothing", split.mode == "off")[0]:
         settings.set_split(viewer, "off")
     for button in BUTTONS:
-        imgui.begin_disabled(not state.has_field and DISPLAYS[button.display].needs_field)
-        if imgui.selectable(button.name, shown == button.name)[0]:
-            settings.compare_with(viewer, button.display, button.latent_level)
-        imgui.end_disabled()
-    imgui.begin_disabled(not state.has_field)
-    if imgui.selectable("three levels", split.mode == "levels")[0]:
-        settings.set_split(viewer, "levels")
-    imgui.end_disabled()
+        with ui.disabled(not state.has_field and DISPLAYS[button.display].needs_field):
+            if imgui.selectable(button.name, shown == button.name)[0]:
+                settings.compare_with(viewer, button.display, button.latent_level)
+    with ui.disabled(not state.has_field):
+        if imgui.selectable("three levels", split.mode == "levels")[0]:
+            settings.set_split(viewer, "levels")
     if imgui.selectable("another scene ...", split.mode == "scenes")[0]:
         opening.ask_for_beside(viewer)
     imgui.end_combo()

@@ -4,7 +4,7 @@ from functools import lru_cache
 from typing import get_args
 
 import numpy as np
-from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui, imgui_ctx
 
 from langsplat_core.arrays import Array, length_text
 from langsplat_core.config import LevelChoice
@@ -54,19 +54,16 @@ def _box(viewer: Viewer) -> None:
         settings.put(viewer.state, focus_input=True, awaits_keyboard=True)  # for the next phrase
         if drafts[label].strip():
             queries.ask(viewer, drafts.pop(label))
-    imgui.push_style_var(imgui.StyleVar_.frame_rounding, theme.PILL)
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, hello_imgui.em_to_vec2(0.65, 0.15))
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, hello_imgui.em_to_vec2(0.4, 0.4))
-    height = OFFER_LINES * imgui.get_frame_height_with_spacing()  # with or without offers
-    height -= imgui.get_style().item_spacing.y
-    hidden = imgui.WindowFlags_.no_scrollbar
-    if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.nav_flattened, hidden):
-        is_pointed_at = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item)
-        title, phrases = queries.offered(viewer, drafts.get(label, ""), is_pointed_at)
-        if phrases:
-            _offer_buttons(viewer, title, phrases)
-    imgui.end_child()
-    imgui.pop_style_var(3)
+    padding, spacing = hello_imgui.em_to_vec2(0.65, 0.15), hello_imgui.em_to_vec2(0.4, 0.4)
+    with theme.styled(frame_rounding=theme.PILL, frame_padding=padding, item_spacing=spacing):
+        height = OFFER_LINES * imgui.get_frame_height_with_spacing() - spacing.y  # with or without offers
+        hidden = imgui.WindowFlags_.no_scrollbar
+        if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.nav_flattened, hidden):
+            is_pointed_at = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item)
+            title, phrases = queries.offered(viewer, drafts.get(label, ""), is_pointed_at)
+            if phrases:
+                _offer_buttons(viewer, title, phrases)
+        imgui.end_child()
 
 
 def hint(viewer: Viewer) -> str:
@@ -138,9 +135,8 @@ def _answers(viewer: Viewer) -> None:
     """Draw the list, newest first, and below it the chosen query."""
     if viewer.state.session.queries and ui.begin_list("queries", MOST_ROWS):
         for query in reversed(viewer.state.session.queries):
-            imgui.push_id(query.phrase)
-            _line(viewer, query)
-            imgui.pop_id()
+            with imgui_ctx.push_id(query.phrase):
+                _line(viewer, query)
     if viewer.state.session.queries:
         imgui.end_child()
     chosen = viewer.state.session.query(viewer.state.session.chosen)
@@ -272,10 +268,9 @@ def draw(viewer: Viewer) -> None:
         if ui.button("Train a language field ...", "From the photographs of this scene; it stays as it is"):
             opening.train_language(viewer)
         return
-    imgui.begin_disabled(scene is None)
-    _box(viewer)
-    _level(viewer)
-    imgui.end_disabled()
+    with ui.disabled(scene is None):
+        _box(viewer)
+        _level(viewer)
     _answers(viewer)
     if viewer.engine is not None:
         basis = viewer.engine.basis

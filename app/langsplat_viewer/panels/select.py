@@ -15,7 +15,7 @@ from langsplat_core.scene.transform import Similarity, moving, scaling, similari
 from langsplat_viewer import marks
 from langsplat_viewer.actions import editing, settings
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
-from langsplat_viewer.panels import ui
+from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.panels.overlays import say
 from langsplat_viewer.session import Point
 from langsplat_viewer.state import Gizmo
@@ -29,7 +29,6 @@ OF_SELECTED = (
 
 def draw(viewer: Viewer) -> None:
     """Draw the panel "Select": counts, tools, the search, verbs, files."""
-    imgui.begin_disabled(viewer.state.scene is None)
     ui.small_wrapped(counts(viewer.state.marks), ui.muted())
     disabled = () if viewer.state.marks.selected.any() else OF_SELECTED
     _tools(viewer)
@@ -45,7 +44,6 @@ def draw(viewer: Viewer) -> None:
     ui.verbs(viewer, "Hide", "Isolate", "Show all", "Delete", disabled=disabled)
     imgui.separator()
     ui.verbs(viewer, "Export selection ...", "Export scene ...", disabled=disabled)
-    imgui.end_disabled()
 
 
 def counts(marks: Marks) -> str:
@@ -60,11 +58,10 @@ def _tools(viewer: Viewer) -> None:
         active = tools.tool == tool
         if place:
             ui.beside(tool)
-        colour = imgui.Col_.button_active if active else imgui.Col_.button
-        imgui.push_style_color(imgui.Col_.button, imgui.get_style_color_vec4(colour))
-        if imgui.button(f"{tool.capitalize()}##tool"):
+        with theme.styled(button="pressed" if active else "button"):
+            clicked = imgui.button(f"{tool.capitalize()}##tool")
+        if clicked:
             editing.use_tool(viewer, None if active else tool)
-        imgui.pop_style_color()
     mode = ui.choice({mode: mode.capitalize() for mode in MODES}, tools.mode)
     _, only = imgui.checkbox("Only what is visible", tools.only_visible)
     editing.set_tools(viewer, mode=mode, only_visible=only)
@@ -198,7 +195,6 @@ NEAR, FAR = 1e-3, 1e3  # depths that the gizmo's camera sees, of the distance to
 def draw_transform(viewer: Viewer) -> None:
     """Draw the panel "Transform": what is transformed, gizmo, numbers, box."""
     state = viewer.state
-    imgui.begin_disabled(state.scene is None)
     chosen = np.count_nonzero(state.marks.selected)
     what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
     ui.small_wrapped(what, ui.muted())
@@ -225,7 +221,6 @@ def draw_transform(viewer: Viewer) -> None:
     if imgui.is_item_hovered():
         outside = int((state.marks.kept & ~editing.in_crop_box(viewer)).sum())
         ui.tip(f"Delete the {outside:,} Gaussians outside the box; the file stays as it is")
-    imgui.end_disabled()
 
 
 def _three(label: str, values: Point, what: str) -> Point:

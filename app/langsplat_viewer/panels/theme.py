@@ -1,5 +1,7 @@
 """The theme: colours, spacing, radius and type, of one family with those of `langsplat_core/web/page.css`."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
@@ -121,3 +123,18 @@ def shown() -> Theme:
 def colour(name: str) -> ImVec4:
     """Return a colour of the theme that is shown, by its name there."""
     return ImVec4(*rgba(getattr(shown(), name)))
+
+
+@contextmanager
+def styled(**values: str | ImVec4 | ImVec2 | float) -> Iterator[None]:
+    """Draw what follows in another style: colours, here or by their names in the theme, and sizes."""
+    colours = 0
+    for name, value in values.items():
+        if isinstance(value, str | ImVec4):
+            imgui.push_style_color(imgui.Col_[name], colour(value) if isinstance(value, str) else value)
+            colours += 1
+        else:
+            imgui.push_style_var(imgui.StyleVar_[name], value)
+    yield
+    imgui.pop_style_color(colours)
+    imgui.pop_style_var(len(values) - colours)

@@ -11,7 +11,7 @@ from textwrap import fill
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import moderngl
-from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui, imgui_ctx
 from msgspec import Meta
 
 from langsplat_core.arrays import Array
@@ -30,6 +30,7 @@ OVER = (  # a window over the scene: it looks like a part of the image, and does
 )
 FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_docking
 FLOATS = (OVER | FIXED | imgui.WindowFlags_.always_auto_resize) & ~imgui.WindowFlags_.no_scrollbar
+QUIET = FLOATS | imgui.WindowFlags_.no_inputs
 
 
 @dataclass(frozen=True)
@@ -96,9 +97,8 @@ def muted() -> ImVec4:
 
 def small_wrapped(text: str, colour: ImVec4) -> None:
     """Text of any length, wrapped at the panel's edge."""
-    imgui.push_style_color(imgui.Col_.text, colour)
-    imgui.text_wrapped(text)
-    imgui.pop_style_color()
+    with theme.styled(text=colour):
+        imgui.text_wrapped(text)
 
 
 def tip(text: str) -> None:
@@ -118,9 +118,8 @@ def stoppable(label: str, fraction: float, tag: str = "", width: float = 0.0) ->
         imgui.text_wrapped(label)
         label = ""
     width = width or beside_button("Cancel")
-    imgui.push_style_color(imgui.Col_.plot_histogram, imgui.get_style_color_vec4(imgui.Col_.button_active))
-    imgui.progress_bar(fraction, ImVec2(width, 0), label)
-    imgui.pop_style_color()
+    with theme.styled(plot_histogram="pressed"):
+        imgui.progress_bar(fraction, ImVec2(width, 0), label)
     imgui.same_line()
     return bool(imgui.button(f"Cancel##{tag}" if tag else "Cancel"))
 
@@ -158,22 +157,17 @@ def beside(label: str, more: float = 0.0) -> None:
 
 def button(label: str, about: str = "", *, enabled: bool = True) -> bool:
     """Draw a button with a tip, that can be clicked where it is `enabled`; return whether it was."""
-    imgui.begin_disabled(not enabled)
-    clicked = bool(imgui.button(label))
-    imgui.end_disabled()
+    with disabled(not enabled):
+        clicked = bool(imgui.button(label))
     tip(about)
     return clicked
 
 
 def small(label: str, side: float) -> bool:
     """Draw a square button without a frame, for a letter or an icon; return whether it was clicked."""
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, imgui.get_style().frame_padding.y))
-    imgui.push_style_var(imgui.StyleVar_.frame_border_size, 0.0)
-    imgui.push_style_color(imgui.Col_.button, theme.CLEAR)
-    clicked = imgui.button(label, ImVec2(side, side))
-    imgui.pop_style_color()
-    imgui.pop_style_var(2)
-    return bool(clicked)
+    padding = ImVec2(0, imgui.get_style().frame_padding.y)
+    with theme.styled(frame_padding=padding, frame_border_size=0.0, button=theme.CLEAR):
+        return bool(imgui.button(label, ImVec2(side, side)))
 
 
 def next_button(label: str, about: str = "", *, enabled: bool = True) -> bool:
@@ -253,16 +247,28 @@ def draw_fields(holder: Any, panel: str) -> dict[str, Any]:
 
 
 @contextmanager
-def floating(name: str, flags: int = FLOATS, padding: ImVec2 | None = None) -> Iterator[None]:
-    """Draw what follows on glass over the scene, by default as large as it is."""
-    scale = imgui.get_style().font_scale_main
-    imgui.push_style_var(imgui.StyleVar_.window_rounding, theme.FLOATING * scale)
-    imgui.push_style_var(imgui.StyleVar_.window_border_size, 1.0)
-    imgui.push_style_var(imgui.StyleVar_.window_padding, padding or hello_imgui.em_to_vec2(0.9, 0.9))
-    imgui.push_style_color(imgui.Col_.window_bg, theme.colour("glass"))
-    imgui.begin(name, None, flags)
-    imgui.pop_style_color()
-    imgui.pop_style_var(3)
+def disabled(is_so: bool) -> Iterator[None]:
+    """Draw what follows grey, and take no click for it, where `is_so`."""
+    imgui.begin_disabled(is_so)
+    yield
+    imgui.end_disabled()
+
+
+@contextmanager
+def floating(
+    name: str, at: ImVec2, pivot: ImVec2 | None = None, flags: int = FLOATS, padding_em: float = 0.7
+) -> Iterator[None]:
+    """Draw what follows on glass over the scene, by default as large as it is.
+
+    `pivot`: the place in it, as fractions of its size, that lies `at`; by default the upper left corner.
+    """
+    imgui.set_next_window_pos(at, imgui.Cond_.always, pivot or ImVec2(0, 0))
+    padding = hello_imgui.em_to_vec2(padding_em, padding_em)
+    rounding = theme.FLOATING * imgui.get_style().font_scale_main
+    with theme.styled(
+        window_rounding=rounding, window_border_size=1.0, window_padding=padding, window_bg="glass"
+    ):
+        imgui.begin(name, None, flags)
     yield
     imgui.end()
 
@@ -297,25 +303,22 @@ def choice(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = N
     rounding = imgui.get_style().frame_rounding
     paint.add_rect_filled(start, end, imgui.get_color_u32(imgui.Col_.frame_bg), rounding)
     paint.add_rect(start, end, imgui.get_color_u32(imgui.Col_.border), rounding)
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, ImVec2(0, 0))
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, padding.y))
-    imgui.push_style_var(imgui.StyleVar_.frame_border_size, 0.0)
-    imgui.begin_group()
-    for row in rows:
-        more = (room - sum(widths[value] for value in row)) / len(row)
-        for place, value in enumerate(row):
-            if place:
-                imgui.same_line()
-            imgui.push_style_color(
-                imgui.Col_.button, theme.colour("pressed") if value == chosen else theme.CLEAR
-            )
-            imgui.push_style_color(imgui.Col_.text, theme.colour("ink" if value == chosen else "soft"))
-            clicked = imgui.button(choices[value], ImVec2(widths[value] + more, height))
-            imgui.pop_style_color(2)
-            tip(tips[value] if tips else "")
-            chosen = value if clicked else chosen
-    imgui.pop_style_var(3)
-    imgui.end_group()
+    spacing, padding = ImVec2(0, 0), ImVec2(0, padding.y)
+    with (
+        imgui_ctx.begin_group(),
+        theme.styled(item_spacing=spacing, frame_padding=padding, frame_border_size=0.0),
+    ):
+        for row in rows:
+            more = (room - sum(widths[value] for value in row)) / len(row)
+            for place, value in enumerate(row):
+                if place:
+                    imgui.same_line()
+                is_chosen = value == chosen
+                look = "pressed" if is_chosen else theme.CLEAR
+                with theme.styled(button=look, text="ink" if is_chosen else "soft"):
+                    clicked = imgui.button(choices[value], ImVec2(widths[value] + more, height))
+                tip(tips[value] if tips else "")
+                chosen = value if clicked else chosen
     return chosen
 
 
@@ -369,17 +372,15 @@ def listed(
         side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x
         room = right - side - imgui.get_style().item_spacing.x
         for number, row in enumerate(rows):
-            imgui.push_id(number)
-            imgui.align_text_to_frame_padding()
-            label = f"{elided(row.text, room)}##{name}"
-            clicked = number if imgui.selectable(label, row.chosen, size=ImVec2(room, 0))[0] else clicked
-            tip(row.about)
-            imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
-            imgui.begin_disabled(keeps_chosen and row.chosen)
-            gone = number if small("x", side) else gone
-            imgui.end_disabled()
-            tip("Take it off the list")
-            imgui.pop_id()
+            with imgui_ctx.push_id(str(number)):
+                imgui.align_text_to_frame_padding()
+                label = f"{elided(row.text, room)}##{name}"
+                clicked = number if imgui.selectable(label, row.chosen, size=ImVec2(room, 0))[0] else clicked
+                tip(row.about)
+                imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
+                with disabled(keeps_chosen and row.chosen):
+                    gone = number if small("x", side) else gone
+                tip("Take it off the list")
     imgui.end_child()
     return clicked, gone
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from imgui_bundle import ImVec2, hello_imgui, imgui
+from imgui_bundle import ImVec2, hello_imgui, imgui, imgui_ctx
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
@@ -23,7 +23,6 @@ CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut
 def draw_camera(viewer: Viewer) -> None:
     """Draw the panel "Camera"."""
     state = viewer.state
-    imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
         _training_cameras(viewer, state.scene.cameras)
     ui.verbs(viewer, "Reset", "Focus", "Frame all", "Horizon", "Align up axis")
@@ -33,7 +32,6 @@ def draw_camera(viewer: Viewer) -> None:
         _cuts(viewer, state.extent.radius)
     viewer.change("settings", **ui.draw_fields(state.session, "Camera"))
     settings.prefer(viewer, **ui.draw_fields(state.preferences, "Camera"))
-    imgui.end_disabled()
 
 
 def _projection(viewer: Viewer, view: OrbitCamera) -> None:
@@ -44,9 +42,8 @@ def _projection(viewer: Viewer, view: OrbitCamera) -> None:
         viewpoint.toggle_orthographic(viewer)
     ui.tip("No perspective: what is parallel looks parallel; the wheel changes the scale")
     before = view.intrinsics.fov_degrees
-    imgui.begin_disabled(orthographic)
-    fov = ui.slider("Field of view", before, FOV_RANGE, "%.0f deg")
-    imgui.end_disabled()
+    with ui.disabled(orthographic):
+        fov = ui.slider("Field of view", before, FOV_RANGE, "%.0f deg")
     if abs(fov - before) > 1e-3:
         viewpoint.move(viewer, lambda view: with_fov(view, fov))
 
@@ -86,30 +83,23 @@ MOST_EM = 8.0  # height of a thumbnail
 
 def draw_timeline(viewer: Viewer) -> None:
     """Draw the panel "Timeline": playing the path, and its keyframes as they will look."""
-    imgui.begin_disabled(viewer.state.view is None)
-    _play(viewer)
-    _keyframes(viewer)
-    imgui.end_disabled()
-
-
-def _play(viewer: Viewer) -> None:
     record, seconds = viewer.state.record, viewpoint.path_seconds(viewer)
-    imgui.begin_disabled(seconds <= 0)
-    label = "Stop##path" if record.began is not None else "Play##path"
-    if ui.button(label, with_key("Play", viewpoint.toggle_playing)):
-        viewpoint.toggle_playing(viewer)
-    imgui.same_line()
-    imgui.set_next_item_width(-hello_imgui.em_size(NUMBER_EM + 2 * LOOP_EM))
-    changed, at = imgui.slider_float("##at", record.at, 0.0, max(seconds, 1e-3), "%.2f s")
-    if changed:
-        viewpoint.scrub(viewer, at)
-    imgui.same_line()
-    wanted = _number("Duration", seconds, 1.0)
-    if wanted is not None:
-        viewpoint.set_path_seconds(viewer, wanted)
-    imgui.end_disabled()
+    with ui.disabled(seconds <= 0):
+        label = "Stop##path" if record.began is not None else "Play##path"
+        if ui.button(label, with_key("Play", viewpoint.toggle_playing)):
+            viewpoint.toggle_playing(viewer)
+        imgui.same_line()
+        imgui.set_next_item_width(-hello_imgui.em_size(NUMBER_EM + 2 * LOOP_EM))
+        changed, at = imgui.slider_float("##at", record.at, 0.0, max(seconds, 1e-3), "%.2f s")
+        if changed:
+            viewpoint.scrub(viewer, at)
+        imgui.same_line()
+        wanted = _number("Duration", seconds, 1.0)
+        if wanted is not None:
+            viewpoint.set_path_seconds(viewer, wanted)
     imgui.same_line()
     settings.put(record, loops=imgui.checkbox("Loop", record.loops)[1])
+    _keyframes(viewer)
 
 
 def _number(label: str, value: float, step: float) -> float | None:
@@ -134,9 +124,8 @@ def _keyframes(viewer: Viewer) -> None:
         images = viewpoint.thumbnails(viewer)
         drawn = viewer.state.record.thumbnails[0]
         for number, key in enumerate(keyframes):
-            imgui.push_id(number)
-            _card(viewer, number, key, drawn.index(key) if key in drawn else None, images)
-            imgui.pop_id()
+            with imgui_ctx.push_id(str(number)):
+                _card(viewer, number, key, drawn.index(key) if key in drawn else None, images)
             imgui.same_line()
     imgui.end_child()
 
@@ -149,20 +138,16 @@ def _card(viewer: Viewer, number: int, key: Keyframe, place: int | None, images:
     room = imgui.get_content_region_avail().y - imgui.get_text_line_height_with_spacing()
     height, count = min(hello_imgui.em_size(MOST_EM), max(room - 8, 16)), len(images) // THUMBNAIL[1]
     size = ImVec2(height * THUMBNAIL[0] / THUMBNAIL[1], height)
-    imgui.begin_group()
-    border = theme.colour("accent" if key is viewer.state.record.chosen else "line")
-    imgui.push_style_color(imgui.Col_.border, border)
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, hello_imgui.em_to_vec2(0.15, 0.15))
-    if place is not None:
-        ends = ImVec2(0, place / count), ImVec2(1, (place + 1) / count)
-        texture = imgui.ImTextureRef(_strip.texture(images).glo)
-        clicked = imgui.image_button("##keyframe", texture, size, *ends)
-    else:
-        clicked = imgui.button(f"{number + 1}##keyframe", size)
-    imgui.pop_style_var()
-    imgui.pop_style_color()
-    imgui.text_colored(ui.muted(), f"{number + 1}   {key.seconds:.2f} s")
-    imgui.end_group()
+    border = "accent" if key is viewer.state.record.chosen else "line"
+    with imgui_ctx.begin_group():
+        with theme.styled(border=border, frame_padding=hello_imgui.em_to_vec2(0.15, 0.15)):
+            if place is not None:
+                ends = ImVec2(0, place / count), ImVec2(1, (place + 1) / count)
+                texture = imgui.ImTextureRef(_strip.texture(images).glo)
+                clicked = imgui.image_button("##keyframe", texture, size, *ends)
+            else:
+                clicked = imgui.button(f"{number + 1}##keyframe", size)
+        imgui.text_colored(ui.muted(), f"{number + 1}   {key.seconds:.2f} s")
     if clicked:
         viewpoint.choose_keyframe(viewer, key)
 
@@ -186,14 +171,8 @@ def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
 
 def draw_record(viewer: Viewer) -> None:
     """Draw the panel "Record": films of the path, how, and where to."""
-    imgui.begin_disabled(viewer.state.view is None)
     if ui.button("Open the timeline", "Keyframes, and playing the path"):
         settings.open_panel(viewer, "Timeline")
-    _films(viewer)
-    imgui.end_disabled()
-
-
-def _films(viewer: Viewer) -> None:
     record = viewer.state.record
     imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM))
     changed, size = imgui.input_int2("Size", list(record.size))
@@ -221,13 +200,10 @@ def _films(viewer: Viewer) -> None:
 
 def draw_bookmarks(viewer: Viewer) -> None:
     """Draw the panel "Bookmarks": a box for a name, and the list."""
-    state = viewer.state
-    imgui.begin_disabled(state.view is None)
     name = ui.kept_box(viewer, "##bookmark", "name of this view", "Keep")
     if name is not None:
         viewpoint.add_bookmark(viewer, name)
-    imgui.end_disabled()
-    bookmarks, words = state.session.bookmarks, "views that you keep are listed here"
+    bookmarks, words = viewer.state.session.bookmarks, "views that you keep are listed here"
     rows = [ui.Row(bookmark.name) for bookmark in bookmarks]
     clicked, gone = ui.listed("bookmarks", rows, with_key(words, viewpoint.add_bookmark))
     if clicked is not None:
