@@ -163,6 +163,7 @@ DISPLAY_ICONS: dict[Display, str] = {
     "tree": "SITEMAP",
     "depth": "MOUNTAIN",
 }
+OTHER_THEME = {"dark": "light", "light": "dark"}
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list of commands alone
@@ -307,7 +308,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         ),
         Command(
             "light theme, or dark again",
-            settings.toggle_theme,
+            lambda v: settings.prefer(v, theme=OTHER_THEME[v.state.preferences.theme]),
             is_on=lambda viewer: viewer.state.preferences.theme == "light",
         ),
         Command("larger text", lambda v: settings.scale_text(v, 0.25), apart=True),

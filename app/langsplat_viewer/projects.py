@@ -113,54 +113,6 @@ def _write(path: Path, content: object) -> None:
         temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
-# Two windows that write one file: what each of them made since it read the file is kept.
-
-KEYS = {"queries": "phrase", "bookmarks": "name"}  # that tell the entries of a list
-# What is merged of a session, with the number of levels of names that are merged one by one; all else is
-# settings, and as the window that writes has them.
-MADE = {"queries": 1, "bookmarks": 1, "notes": 1, "marks": 1, "things": 2, "moves": 0, "keyframes": 0}
-
-
-def _both(old: Any, own: Any, other: Any, levels: int, clashes: list[object]) -> Any:
-    """Return two changes of `old` as one, all of them JSON; `own`, and a clash, where one value has two."""
-    if own == other or other == old:
-        return own
-    if own == old:
-        return other
-    if levels == 0:
-        clashes.append(own)
-        return own
-    old, own, other = old or {}, own or {}, other or {}
-    names = dict.fromkeys((*own, *other))
-    found = {n: _both(old.get(n), own.get(n), other.get(n), levels - 1, clashes) for n in names}
-    return {name: value for name, value in found.items() if value is not None}
-
-
-def _by_key(name: str, value: Any) -> Any:
-    """Return the value of a session's field as JSON, where `MADE` names one level of a list as a dict."""
-    if not isinstance(value, list) or MADE[name] == 0:
-        return value
-    return {entry[KEYS[name]] if name in KEYS else json.dumps(entry): entry for entry in value}
-
-
-def _merged(before: Session, own: Session, other: Session, count: int) -> tuple[Session, bool]:
-    """Return `own` with what is new in `other`, both changed from `before`, and whether that is all of it."""
-    clashes: list[object] = []
-    states = [plain(session) for session in (before, own, other)]
-    merged = dict(states[1])
-    for name, levels in MADE.items():
-        old, new, others = (_by_key(name, state[name]) for state in states)
-        made = _both(old, new, others, levels, clashes if name != "queries" else [])  # a cut or a colour
-        merged[name] = list(made.values()) if isinstance(states[1][name], list) and levels else made
-    for query in merged["queries"]:
-        if own.query(query["phrase"]) is None:
-            query.pop("slot", None)  # its colour is taken by another
-    try:
-        return checked(_converted(merged, Session, count)), not clashes
-    except NONSENSE:  # more of something than a session holds
-        return own, False
-
-
 # Poses, in paths and bookmarks flat beside what else an entry has:
 #
 # {"position": [x, y, z],      in the world; in projects relative to their origin
@@ -291,48 +243,30 @@ class Project(msgspec.Struct, omit_defaults=True):
     left_out: tuple[str, ...] = ()  # of a project of an earlier version, a line each
 
 
-def write_project(
-    path: Path, project: Project, apart: Callable[[], Path], before: Project | None = None
-) -> tuple[Project, Path | None]:
-    """Write a project, whole or not at all; return what the file holds now, and where another's is kept.
+def digest_of(path: Path) -> str:
+    """Return what tells the contents of files apart; "" where there is none."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
 
-    before: what it held when it was last read or written here. What another window has made since then is
-    taken over. Of what both changed `project` counts, and the other's file is kept under the name that
-    `apart` gives, asked while no other window writes.
+
+def write_project(
+    path: Path, project: Project, apart: Callable[[], Path], known: str = ""
+) -> tuple[str, Path | None]:
+    """Write a project, whole or not at all; return its `digest_of`, and where what was there is kept.
+
+    known: the digest as it was last read or written here. What another window has written since then is kept
+    under the name that `apart` gives, asked while no other window writes; else nothing is kept, None.
     """
     project = msgspec.structs.replace(project, session=checked(project.session))
     folder, scene = Path(os.path.abspath(path)).parent, Path(project.scene)
     named = scene.relative_to(folder).as_posix() if scene.is_relative_to(folder) else str(scene)
     kept = None
     with locked(folder):
-        if path.exists():
-            other, whole = _of_same_scene(path, project), False
-            if other is not None:
-                start = Session() if before is None else _about(project.origin, before)
-                session, whole = _merged(
-                    start, project.session, _about(project.origin, other), project.gaussians
-                )
-                project = msgspec.structs.replace(project, session=session)
-            if not whole:
-                kept = apart()
-                with atomic_path(kept) as temporary:
-                    temporary.write_bytes(path.read_bytes())
+        if digest_of(path) not in ("", known):
+            kept = apart()
+            with atomic_path(kept) as temporary:
+                temporary.write_bytes(path.read_bytes())
         _write(path, {"format": FORMAT, "version": VERSION, **plain(project), "scene": named})
-        return read_project(path), kept
-
-
-def _of_same_scene(path: Path, project: Project) -> Project | None:
-    """Return the project in a file, None where that is none of the same scene."""
-    with suppress(InputError):
-        other = read_project(path)
-        if (other.scene, other.gaussians) == (project.scene, project.gaussians):
-            return other
-    return None
-
-
-def _about(origin: Point, project: Project) -> Session:
-    """Return a project's session with its places relative to `origin`."""
-    return project.session.moved(np.subtract(project.origin, origin))
+        return digest_of(path), kept
 
 
 def read_project(path: Path) -> Project:
@@ -392,7 +326,7 @@ def _line(text: str) -> str:
 
 
 def _rigid(move: Move) -> Move:
-    """Return a move whose matrix is a similarity: itself where it is one, so that files can be compared."""
+    """Return a move whose matrix is a similarity; itself where it is one, as it was written."""
     matrix = move.to.matrix
     exact = similarity(matrix)
     alike = np.allclose(exact.matrix, matrix, 1e-12, 1e-12 * move.to.scale)

@@ -21,7 +21,6 @@ from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, unmarked
-from langsplat_viewer.projects import Project
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes
 from langsplat_viewer.session import Move, Note, Point, Preferences, Query, Session
 
@@ -212,7 +211,7 @@ class SceneState:
     session: Session = field(default_factory=Session)
     saved: Session = field(default_factory=Session)  # as a project or an exported scene last had it
     project: Path | None = None  # the file that it is saved to again
-    project_read: Project | None = None  # what that held when it was last read or written here
+    project_digest: str = ""  # of what that held when it was last read or written here
     count: int = 0  # Gaussians
     origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) of the scene
 
@@ -247,7 +246,7 @@ class SceneState:
 
     def visit(self) -> "SceneState":
         """Return what is kept of a scene that is left, to be found again: no large arrays."""
-        files = ("saved", "project", "project_read", "count", "origin")
+        files = ("saved", "project", "project_digest", "count", "origin")
         names = ("session", *files, "view", "opening_camera", "camera_index")
         return SceneState(**{name: getattr(self, name) for name in names})
 

@@ -244,7 +244,7 @@ class Window:
         self.viewer.watch.start()
         imgui.get_io().config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
         imgui.get_io().config_flags |= imgui.ConfigFlags_.nav_enable_keyboard
-        glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
+        glfw.set_drop_callback(glfw_window_hello_imgui(), lambda _, paths: self.drop(paths))  # type: ignore[arg-type,misc]
         settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
         if self._path is None:
             settings.put(self.viewer.state, show_start=True, show_help=False)
@@ -302,9 +302,6 @@ class Window:
 
     def drop(self, paths: list[str]) -> None:
         opening.open_dropped(self.viewer, [Path(path) for path in paths])
-
-    def _dropped(self, window: object, paths: list[str]) -> None:
-        self.drop(paths)
 
     def _gui(self) -> None:
         viewer = self.viewer

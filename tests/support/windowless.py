@@ -161,7 +161,7 @@ def errors(viewer: Viewer) -> list[str]:
 
 CHANGES = {  # of what is seen, after a search
     "display": lambda v: settings.set_display(v, "depth"),
-    "hidden query": lambda v: queries.hide(v, v.state.session.queries[0].phrase),
+    "hidden query": lambda v: queries.show(v, v.state.session.queries[0].phrase, shown=False),
     "splats": lambda v: v.change(splats=Splats(0.5)),
     "near cut": lambda v: settings.set_clip(v, Clip(1.0)),
     "marks": editing.select_all,

@@ -361,7 +361,7 @@ def compare_two_scenes(s: Any) -> None:
     assert np.abs(both - rgb)[100:450, middle + 8 :].max() > 60
     settings.set_display(viewer, "relevancy")
     assert (s.shot("asked") == alone)[100:450, 450 : middle - 8].all()
-    settings.set_split(viewer, "off")
+    settings.compare(viewer, "off")
     assert (s.shot("alone again") == alone)[100:450, 450:].all()
     assert viewer.beside is None
 
@@ -382,7 +382,7 @@ def say_what_is_not_here(s: Any) -> None:
     middle = int(area.top + area.height / 2)
     said = s.shot("beside")[middle - 8 : middle + 8, int(0.6 * area.width) : int(0.9 * area.width)]
     assert (said.min(-1) > 200).sum() > 50  # words
-    settings.set_split(viewer, "off")
+    settings.compare(viewer, "off")
     s.drop("mugs.ply")
     s.shows("mugs.ply")
     plain = s.shot("plain")

@@ -365,7 +365,7 @@ def test_a_bookmark_leads_back_and_is_undone(opened):
     assert opened.state.is_changed
     viewpoint.add_bookmark(opened)
     assert names(opened) == ["the mug", "view 2"]
-    viewpoint.delete_bookmark(opened, opened.state.session.bookmarks[0])
+    settings.take_off(opened, "bookmarks", opened.state.session.bookmarks[0])
     assert names(opened) == ["view 2"]
     editing.undo(opened)
     go(viewpoint.go_to_bookmark, opened, opened.state.session.bookmarks[0])

@@ -115,7 +115,7 @@ def test_canvas_draws_several_panes_and_no_line(gl, opened):
     drawn, original = [], renderer.draw
     renderer.draw = lambda request, targets: (drawn.append(request), original(request, targets))
     for display in DISPLAYS:
-        settings.compare_with(opened, display)
+        settings.compare(opened, "wipe", display)
         rest(canvas, state, 1.0)
         assert [texture.size for texture in canvas.textures] == [(60, 40)] * 2
     drawn.clear()
@@ -123,7 +123,7 @@ def test_canvas_draws_several_panes_and_no_line(gl, opened):
     rest(canvas, state, 2.0)
     assert drawn == []
     both = canvas.capture(state.request())
-    settings.set_split(opened, "off")
+    settings.compare(opened, "off")
     np.testing.assert_array_equal(canvas.capture(state.request())[:, :12], both[:, :12])
     settings.toggle_levels(opened)
     rest(canvas, state, 3.0)
@@ -143,7 +143,7 @@ def test_point_at_finds_the_surface_in_every_column(gl, opened):
     places = [canvas.point_at((column + 0.5) / 3, 0.5) for column in range(3)]
     assert all(place is not None for place in places)
     np.testing.assert_allclose(places[1:], [places[0]] * 2)
-    settings.set_split(opened, "off")
+    settings.compare(opened, "off")
     rest(canvas, opened.state, 2.0)
     np.testing.assert_allclose(canvas.point_at(0.5, 0.5), places[0], atol=0.1)
 

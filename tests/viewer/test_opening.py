@@ -114,7 +114,7 @@ def test_scene_returns_with_its_camera_and_queries(three):
     assert (three.state.scene, three.state.scenes) == (SCENES["blobs.ply"], (BLOBS, PLAIN, BARE))
     assert settings.take(three.state, "wanted_panel") == "Scene"
     ask(three, "mug", "book")
-    queries.hide(three, "mug")
+    queries.show(three, "mug", shown=False)
     queries.set_cut(three, "book", 0.7)
     go(viewpoint.go_to_camera, three, 2)
     settings.set_clip(three, Clip(1.0, 9.0))
@@ -249,7 +249,7 @@ def test_watch_reports_companions_but_no_missing_scene(shown):
 def test_reload_keeps_camera_queries_and_settings(shown):
     ask(shown, "mug", "book")
     queries.set_cut(shown, "mug", 0.6)
-    queries.hide(shown, "book")
+    queries.show(shown, "book", shown=False)
     shown.put(chosen="mug")
     viewpoint.go_to_camera(shown, 1)
     viewpoint.tick(shown, shown.clock + 10)
@@ -362,7 +362,7 @@ def test_second_scene_follows_view_and_queries(two):
         (77, 55),
     )
     assert other.view is two.state.view
-    queries.hide(two, "mug")
+    queries.show(two, "mug", shown=False)
     queries.remove(two, "book")
     meet(two)
     assert [(query.phrase, query.slot) for query in other.session.queries] == [("mug", None)]
@@ -380,7 +380,7 @@ def test_second_scene_without_field_shows_colours_or_says_why(two):
 
 
 def test_second_scene_closes_with_the_split(two):
-    settings.set_split(two, "off")
+    settings.compare(two, "off")
     opening.follow_beside(two)
     assert two.beside is None
     editing.undo(two)

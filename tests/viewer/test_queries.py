@@ -106,7 +106,7 @@ def test_examples_are_offered_while_nothing_is_typed(viewer):
 
 def test_fourth_query_takes_the_colour_of_the_oldest(opened):
     ask(opened, "mug", "book")
-    queries.hide(opened, "mug")
+    queries.show(opened, "mug", shown=False)
     (pane,) = opened.state.panes()
     columns = heats(Subject(360, answers=pane.answers))
     assert columns.shape == (360, 2)

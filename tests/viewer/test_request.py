@@ -176,10 +176,10 @@ def test_kept_layers_give_the_image_of_a_new_renderer(gl, asked, name, backend):
 def test_the_second_pane_is_what_the_display_would_show_alone(opened):
     ask(opened, "plant")
     settings.set_display(opened, "rgb")
-    settings.compare_with(opened, "relevancy")
+    settings.compare(opened, "wipe", "relevancy")
     first, second = opened.state.panes()
     assert (first.picture.display, second.picture.display) == ("rgb", "relevancy")
-    settings.set_split(opened, "off")
+    settings.compare(opened, "off")
     settings.set_display(opened, "relevancy")
     assert opened.state.panes() == (second,)
 
@@ -206,7 +206,7 @@ def test_three_levels_of_latents_or_of_answers(opened):
 def test_without_a_field_levels_and_latents_are_refused(viewer):
     viewer.state.scene = Scene(random_gaussians(5))
     settings.toggle_levels(viewer)
-    settings.compare_with(viewer, "latent", 1)
+    settings.compare(viewer, "wipe", "latent", 1)
     assert viewer.state.session.split.mode == "off"
     assert len(errors(viewer)) == 1  # the same line is not said twice
     (wipe,) = (command for command in COMMANDS if "V" in command.keys)

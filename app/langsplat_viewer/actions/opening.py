@@ -21,13 +21,13 @@ from langsplat_viewer import disk
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.editing import adopt
 from langsplat_viewer.actions.saving import COMPANIONS, leave
-from langsplat_viewer.actions.settings import ask_for, open_panel
+from langsplat_viewer.actions.settings import ask_for, compare, open_panel
 from langsplat_viewer.camera.controls import Extent, extent_of
 from langsplat_viewer.disk import Stamps, stamps
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import unmarked
 from langsplat_viewer.output import free_name
-from langsplat_viewer.projects import PATHS, PROJECTS, Project, read_project
+from langsplat_viewer.projects import PATHS, PROJECTS, Project, digest_of, read_project
 from langsplat_viewer.rendering.request import Split, why_undrawable
 from langsplat_viewer.session import Marked, Query, Session, Things
 from langsplat_viewer.state import FileChoice, Recording, SceneState, ViewerState
@@ -180,7 +180,7 @@ def return_to(viewer: Viewer, visit: SceneState) -> None:
     session, saved = visit.session.moved(offset).found_again(now=state.session), visit.saved.moved(offset)
     kept = {name: getattr(saved, name) for name in ("things", "notes", "bookmarks")}
     state.saved = replace(state.session, **kept)
-    state.project, state.project_read = visit.project, visit.project_read
+    state.project, state.project_digest = visit.project, visit.project_digest
     take_session(viewer, session if visit.count == state.count else replace(session, things=Things()))
 
 
@@ -311,16 +311,17 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
 def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lambda viewer: None) -> None:
     """Open the scene of a project, and have in it what the project holds; `then` runs once it is there."""
     try:
-        project = read_project(path)
+        digest, project = digest_of(path), read_project(path)
         if not Path(project.scene).exists():
             remedy = "move it back, or mend its path"
             raise InputError(f"{project.scene}: the project's scene is not there; {remedy}")
-    except InputError as error:
+    except (InputError, OSError) as error:
         viewer.say_error(one_line(error))
         return
 
     def restore(viewer: Viewer) -> None:
         _restore(viewer, project, path.absolute())
+        viewer.state.project_digest = digest
         then(viewer)
 
     open_scene(viewer, Path(project.scene), restore)
@@ -349,7 +350,7 @@ def _restore(viewer: Viewer, project: Project, path: Path) -> None:
         take_session(viewer, replace(session, moves=()))
     view = viewpoint.bookmarked_view(project.view.moved(offset), state.extent)
     state.view = view if project.intrinsics is None else replace(view, intrinsics=project.intrinsics)
-    state.saved, state.project, state.project_read = state.session, path, project
+    state.saved, state.project = state.session, path
     state.preferences = state.preferences.with_recent(path)
     if project.panels:
         state.preferences = replace(state.preferences, panels=project.panels)
@@ -470,7 +471,7 @@ def open_beside(viewer: Viewer, path: Path) -> None:
     if viewer.beside is not None:
         viewer.beside.worker.close()
     viewer.beside = beside
-    viewer.change(split=replace(viewer.state.session.split, mode="scenes"))
+    compare(viewer, "scenes")
     open_scene(beside, path)
 
 

@@ -199,14 +199,11 @@ def teach_given(viewer: Viewer) -> None:
 # The list of queries.
 
 
-def show(viewer: Viewer, phrase: str) -> None:
-    """Show the heat of a query; it takes the first free colour, else that of the longest shown one."""
-    viewer.change(queries=viewer.state.session.showing(phrase).queries)
-
-
-def hide(viewer: Viewer, phrase: str) -> None:
-    """Keep a query in the list without its heat."""
-    viewer.change(queries=viewer.state.session.with_query(phrase, slot=None).queries)
+def show(viewer: Viewer, phrase: str, shown: bool = True) -> None:
+    """Show the heat of a query, in the first free colour, else that of the longest shown; or hide it."""
+    session = viewer.state.session
+    session = session.showing(phrase) if shown else session.with_query(phrase, slot=None)
+    viewer.change(queries=session.queries)
 
 
 def remove(viewer: Viewer, phrase: str) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from langsplat_core import registry
 from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError, LangSplatError
+from langsplat_core.errors import InputError
 from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import check_keeps, save_scene, scene_files
@@ -26,19 +26,15 @@ from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
-from langsplat_viewer.actions.editing import adopt
 from langsplat_viewer.actions.settings import ask_for, folder_of
 from langsplat_viewer.actions.viewpoint import bookmarked_view, path_seconds
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.projects import (
-    MADE,
     PATHS,
     PROJECTS,
     Project,
-    checked,
-    plain,
     write_flight,
     write_project,
 )
@@ -409,7 +405,7 @@ def save_project(viewer: Viewer, to: Path = Path()) -> Path | None:
     if not viewer.has_scene("save the project") or not (state.scene and state.path and state.view):
         return None
     path = to if to.name.endswith(PROJECTS) else state.project or _new_file(viewer, to, PROJECTS)
-    read = state.project_read if path == state.project else None
+    known = state.project_digest if path == state.project else ""
     project = Project(
         scene=os.path.abspath(state.path),
         gaussians=len(state.scene.gaussians),
@@ -419,38 +415,19 @@ def save_project(viewer: Viewer, to: Path = Path()) -> Path | None:
         intrinsics=state.view.intrinsics,
         panels=state.preferences.panels or (),
     )
-    written: list[tuple[Project, Path | None]] = []
+    written: list[tuple[str, Path | None]] = []
 
     def apart() -> Path:
         return output.free_name(path.parent, f"{path.name.removesuffix(PROJECTS)}-other", PROJECTS)
 
-    def write() -> None:
-        written.append(write_project(path, project, apart, read))
-
-    if viewer.save(path, write) is None:
+    if viewer.save(path, lambda: written.append(write_project(path, project, apart, known))) is None:
         return None
-    ((state.project_read, kept),) = written
-    state.project = path
+    ((state.project_digest, kept),) = written
     if kept is not None:
         viewer.say_error(f"{path.name} held what this window has not: kept as {kept.name}")
-    _take_over(viewer, state.project_read.session)
-    state.saved = state.session
+    state.saved, state.project = state.session, path
     state.preferences = state.preferences.with_recent(path)
     return path
-
-
-def _take_over(viewer: Viewer, written: Session) -> None:
-    """Show what another window has made in the same project."""
-    session = viewer.state.session
-    made = {name: getattr(written, name) for name in MADE}
-    if plain(written) == plain(checked(session)):
-        return
-    viewer.remember()  # or what is undone next is the other window's work, too
-    try:
-        adopt(viewer, replace(session, **made))
-        viewer.state.say("with what another window has saved in it meanwhile")
-    except LangSplatError as error:
-        viewer.say_error(f"not shown, although saved: {one_line(error)}")
 
 
 def show_in_folder(viewer: Viewer, path: Path) -> None:

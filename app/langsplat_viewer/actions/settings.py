@@ -6,14 +6,23 @@ from dataclasses import fields, replace
 from functools import partial
 from os.path import exists
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.projects import BUNDLED
 from langsplat_viewer.rendering.request import AT_RANGE, Clip, SplitMode
-from langsplat_viewer.session import LONGEST_NOTE, MOST_NOTES, OVERLAYS, SCALES, Note, Overlay, Ruler
+from langsplat_viewer.session import (
+    LONGEST_NOTE,
+    MOST_NOTES,
+    OVERLAYS,
+    SCALES,
+    Bookmark,
+    Note,
+    Overlay,
+    Ruler,
+)
 from langsplat_viewer.state import FileChoice, Recording, ViewerState
 from langsplat_viewer.viewer import Viewer
 
@@ -56,32 +65,26 @@ def set_clip(viewer: Viewer, clip: Clip) -> None:
     viewer.change("clip", clip=Clip(near, max(clip.far, near)))
 
 
-def compare_with(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:
-    """Show a second display right of a line across the scene; `latent_level` indexes `scene.LEVELS`."""
+def compare(
+    viewer: Viewer, mode: SplitMode, second: Display | None = None, latent_level: int | None = None
+) -> None:
+    """Divide the scene's area, or show one image ("off").
+
+    `second` is what a wipe shows right of its line; `latent_level` indexes `scene.LEVELS`.
+    """
     split = viewer.state.session.split
+    second = second or split.second
     level = split.second_level if latent_level is None else latent_level
-    if _can_show(viewer, DISPLAYS[display].needs_field):
-        viewer.change(split=replace(split, mode="wipe", second=display, second_level=level))
+    needs_field = mode == "levels" or (mode == "wipe" and DISPLAYS[second].needs_field)
+    if _can_show(viewer, needs_field):
+        viewer.change(split=replace(split, mode=mode, second=second, second_level=level))
 
 
-def set_split(viewer: Viewer, mode: SplitMode) -> None:
-    """Choose how the scene's area is divided."""
-    if mode != "levels" or _can_show(viewer, needs_field=True):
-        viewer.change(split=replace(viewer.state.session.split, mode=mode))
+def _toggle_compare(viewer: Viewer, mode: SplitMode) -> None:
+    compare(viewer, "off" if viewer.state.session.split.mode == mode else mode)
 
 
-def toggle_split(viewer: Viewer, mode: SplitMode) -> None:
-    """Divide the scene's area, or show one image."""
-    split = viewer.state.session.split
-    if split.mode == mode:
-        set_split(viewer, "off")
-    elif mode == "wipe":
-        compare_with(viewer, split.second)
-    else:
-        set_split(viewer, mode)
-
-
-toggle_wipe, toggle_levels = partial(toggle_split, mode="wipe"), partial(toggle_split, mode="levels")
+toggle_wipe, toggle_levels = (partial(_toggle_compare, mode=mode) for mode in ("wipe", "levels"))
 
 
 def move_line(viewer: Viewer, at: float) -> None:
@@ -150,9 +153,10 @@ def write_note(viewer: Viewer, note: Note, text: str) -> None:
     viewer.change(f"note at {note.at}", notes=notes)
 
 
-def remove_note(viewer: Viewer, note: Note) -> None:
-    """Take a note off."""
-    viewer.change(notes=tuple(other for other in viewer.state.session.notes if other is not note))
+def take_off(viewer: Viewer, name: Literal["notes", "bookmarks"], gone: Note | Bookmark) -> None:
+    """Take a note or a bookmark off its list."""
+    kept = tuple(other for other in getattr(viewer.state.session, name) if other is not gone)
+    viewer.change("", **{name: kept})
 
 
 # The window: preferences and panels.
@@ -176,11 +180,6 @@ def take_preferences(viewer: Viewer) -> None:
     kept, picture = viewer.state.preferences, viewer.state.session.picture
     overlays = tuple(name for name in OVERLAYS if name in kept.overlays)
     viewer.put(picture=replace(picture, colour_map=kept.colour_map), overlays=overlays)
-
-
-def toggle_theme(viewer: Viewer) -> None:
-    """Make the panels light, or dark again."""
-    prefer(viewer, theme="dark" if viewer.state.preferences.theme == "light" else "light")
 
 
 def scale_text(viewer: Viewer, by: float) -> None:

@@ -435,12 +435,6 @@ def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
     return replace(view, target=target, distance=bookmark.distance)
 
 
-def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
-    """Take a bookmark off the list."""
-    kept = tuple(other for other in viewer.state.session.bookmarks if other is not bookmark)
-    viewer.change(bookmarks=kept)
-
-
 def read_bookmarks(viewer: Viewer, path: Path, origin: Array) -> tuple[Bookmark, ...]:
     """Read what an earlier version kept of a scene with an `origin` (3,); where it makes no sense, say so."""
     try:

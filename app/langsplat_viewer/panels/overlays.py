@@ -505,4 +505,4 @@ def draw_notes(viewer: Viewer) -> None:
                 settings.write_note(viewer, note, text)
             imgui.same_line()
             if ui.small("x", side):
-                settings.remove_note(viewer, note)
+                settings.take_off(viewer, "notes", note)

@@ -1,6 +1,8 @@
 """The panels "Scene", "Display", "Train" and "Messages": what is open and how it is shown, what goes on."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 
@@ -147,17 +149,18 @@ def _compared(viewer: Viewer) -> None:
     ui.leave_room("Compare with", WIDTH_EM)
     if not imgui.begin_combo("Compare with", shown):
         return
-    if imgui.selectable("nothing", split.mode == "off")[0]:
-        settings.set_split(viewer, "off")
+    off, levels = (partial(settings.compare, mode=mode) for mode in ("off", "levels"))
+    rows: list[tuple[str, bool, Callable[[Viewer], None]]] = [("nothing", False, off)]  # which need a field
     for button in BUTTONS:
-        with ui.disabled(not state.has_field and DISPLAYS[button.display].needs_field):
-            if imgui.selectable(button.name, shown == button.name)[0]:
-                settings.compare_with(viewer, button.display, button.latent_level)
-    with ui.disabled(not state.has_field):
-        if imgui.selectable("three levels", split.mode == "levels")[0]:
-            settings.set_split(viewer, "levels")
-    if imgui.selectable("another scene ...", split.mode == "scenes")[0]:
-        opening.ask_for_beside(viewer)
+        beside = partial(
+            settings.compare, mode="wipe", second=button.display, latent_level=button.latent_level
+        )
+        rows.append((button.name, DISPLAYS[button.display].needs_field, beside))
+    rows += [("three levels", True, levels), ("another scene ...", False, opening.ask_for_beside)]
+    for label, needs_field, act in rows:
+        with ui.disabled(needs_field and not state.has_field):
+            if imgui.selectable(label, label == shown)[0]:
+                act(viewer)
     imgui.end_combo()
 
 

@@ -172,7 +172,7 @@ def _swatch(viewer: Viewer, query: Query, side: float) -> None:
     red, green, blue = HIDDEN if query.slot is None else QUERY_COLOURS[query.slot]
     flags = imgui.ColorEditFlags_.no_tooltip
     if imgui.color_button("##shown", ImVec4(red, green, blue, 1.0), flags, ImVec2(side, side)):
-        (queries.hide if shown else queries.show)(viewer, query.phrase)
+        queries.show(viewer, query.phrase, shown=not shown)
     ui.tip("Click to hide" if shown else "Click to show")
     state, result = viewer.state, viewer.state.result(query)
     alone = state.session.picture.display == "relevancy" and len(painted(state.shown_results())) == 1

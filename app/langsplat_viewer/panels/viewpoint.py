@@ -209,4 +209,4 @@ def draw_bookmarks(viewer: Viewer) -> None:
     if clicked is not None:
         viewpoint.go_to_bookmark(viewer, bookmarks[clicked])
     if gone is not None:
-        viewpoint.delete_bookmark(viewer, bookmarks[gone])
+        settings.take_off(viewer, "bookmarks", bookmarks[gone])
