@@ -318,6 +318,7 @@ def change_between(before: Session, after: Session) -> str:
     return next(changed, "change")
 
 
+OF_PROJECT = ("things", "notes", "bookmarks", "keyframes")  # what is lost unless a project has it
 OF_WINDOW = ("picture", "latent_level", "split", "splats", "overlays", "level", "adds")  # not of a scene
 
 

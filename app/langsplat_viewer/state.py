@@ -22,7 +22,7 @@ from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, unmarked
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes
-from langsplat_viewer.session import Move, Note, Point, Preferences, Query, Session
+from langsplat_viewer.session import OF_PROJECT, Move, Note, Point, Preferences, Query, Session
 
 # Camera path and film: the panel "Record".
 
@@ -247,7 +247,7 @@ class SceneState:
     def visit(self) -> "SceneState":
         """Return what is kept of a scene that is left, to be found again: no large arrays."""
         files = ("saved", "project", "project_digest", "count", "origin")
-        names = ("session", *files, "view", "opening_camera", "camera_index")
+        names = ("session", *files, "path", "view", "opening_camera", "camera_index")
         return SceneState(**{name: getattr(self, name) for name in names})
 
     @property
@@ -263,13 +263,12 @@ class SceneState:
 
     @property
     def has_unsaved_notes(self) -> bool:
-        """True where no project has the names, notes and bookmarks that there are."""
-        now, saved = ((one.things, one.notes, one.bookmarks) for one in (self.session, self.saved))
-        return now != saved
+        """True where no project has the names, notes, bookmarks and keyframes that there are."""
+        return any(getattr(self.session, name) != getattr(self.saved, name) for name in OF_PROJECT)
 
     @property
     def is_changed(self) -> bool:
-        """True where something would be lost if the window closed."""
+        """True where something of the scene would be lost if the window closed."""
         return self.is_unsaved or self.has_unsaved_notes
 
 

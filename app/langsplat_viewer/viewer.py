@@ -244,6 +244,12 @@ class Viewer:
             report = here(failed) if failed else self.say_error
             self.run(label, lambda progress: work(engine, progress), here(done), report)
 
+    def unsaved(self) -> list[SceneState]:
+        """Return the scenes, the one shown first, of which no project has all that was noted in them."""
+        here = None if self.state.path is None else self.state.path.absolute()
+        left = (visit for path, visit in self.visits.items() if path != here)
+        return [state for state in (self.state, *left) if state.has_unsaved_notes]
+
     def has_scene(self, then: str) -> bool:
         """Return whether a scene is open; say that it is opened first where none is."""
         if self.state.scene is None:

@@ -593,6 +593,15 @@ def record_and_play(s: Any) -> None:
     assert np.abs(s.state.view.eye - last.eye).max() > 1e-3
     s.drag((600, 300), (620, 310))
     assert record.began is None
+    assert glfw.get_window_title(glfw_window_hello_imgui()).startswith("*blobs.ply")
+    s.drop("plain.ply")  # they stay with their scene, and are asked about when the window closes
+    s.shows("plain.ply")
+    s.menu("File", "Quit")
+    s.wait(lambda: s.state.leaving is not None)
+    s.click("//**/Cancel")
+    opening.switch_scene(s.viewer, s.folder / "blobs.ply")
+    s.shows("blobs.ply")
+    assert len(s.state.session.keyframes) == 3
 
 
 # Keys, palette, toolbar, and where panels lie.

@@ -545,17 +545,20 @@ def test_notes_are_pinned_edited_and_removed(opened):
 
 @pytest.mark.parametrize("leave", [saving.save_project_and_leave, saving.end])
 def test_unsaved_notes_are_asked_about_before_closing(opened, tmp_path, leave):
+    """Keyframes, too, and those of a scene that was left."""
     settings.pin_at(opened, 0.5, 0.5)
     assert not saving.may_close(opened)
     settings.escape(opened)
     editing.undo(opened)
     assert saving.may_close(opened)
     opened.state.may_close = False
-    editing.redo(opened)
+    viewpoint.add_keyframe(opened)
+    open_scene(opened, "plain.ply")
+    assert not opened.state.is_changed
     assert not saving.may_close(opened)
     leave(opened, tmp_path)
     assert opened.state.may_close
-    assert len(read_project(tmp_path / "blobs-001.langsplat").session.notes) == 1
+    assert len(read_project(tmp_path / "blobs-001.langsplat").session.keyframes) == 1
     assert saving.may_close(opened)
 
 

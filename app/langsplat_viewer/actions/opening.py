@@ -29,7 +29,7 @@ from langsplat_viewer.marks import unmarked
 from langsplat_viewer.output import free_name
 from langsplat_viewer.projects import PATHS, PROJECTS, Project, digest_of, read_project
 from langsplat_viewer.rendering.request import Split, why_undrawable
-from langsplat_viewer.session import Marked, Query, Session, Things
+from langsplat_viewer.session import OF_PROJECT, Marked, Query, Session, Things
 from langsplat_viewer.state import FileChoice, Recording, SceneState, ViewerState
 from langsplat_viewer.viewer import History, Training, Viewer
 
@@ -178,7 +178,7 @@ def return_to(viewer: Viewer, visit: SceneState) -> None:
     if visit.camera_index is not None and visit.camera_index < len(state.scene.cameras):
         state.camera_index = visit.camera_index
     session, saved = visit.session.moved(offset).found_again(now=state.session), visit.saved.moved(offset)
-    kept = {name: getattr(saved, name) for name in ("things", "notes", "bookmarks")}
+    kept = {name: getattr(saved, name) for name in OF_PROJECT}
     state.saved = replace(state.session, **kept)
     state.project, state.project_digest = visit.project, visit.project_digest
     take_session(viewer, session if visit.count == state.count else replace(session, things=Things()))
@@ -247,9 +247,10 @@ def step_scene(viewer: Viewer, by: int) -> None:
 
 
 def unlist_scene(viewer: Viewer, path: Path) -> None:
-    """Take a scene off the list, and forget its visit; the scene that is shown stays."""
+    """Take a scene off the list, and forget its visit unless that is not saved; the one shown stays."""
     viewer.state.scenes = tuple(other for other in viewer.state.scenes if other != path)
-    viewer.visits.pop(path, None)
+    if path in viewer.visits and not viewer.visits[path].has_unsaved_notes:
+        del viewer.visits[path]
 
 
 # Files that were chosen, dropped onto the window, or open lately.

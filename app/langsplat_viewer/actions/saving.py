@@ -40,14 +40,13 @@ from langsplat_viewer.projects import (
 )
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.session import Bookmark, Session
-from langsplat_viewer.state import ExportForm, FileChoice, Leaving, flight_of
+from langsplat_viewer.state import ExportForm, FileChoice, Leaving, SceneState, flight_of
 from langsplat_viewer.viewer import CommandProcess, Viewer, program
 
 
-def _new_file(viewer: Viewer, folder: Path, suffix: str, more: str = "") -> Path:
+def _new_file(state: SceneState, folder: Path, suffix: str, more: str = "") -> Path:
     """Return a free name in `folder`, after the scene's."""
-    path = viewer.state.path
-    return output.free_name(folder, f"{'scene' if path is None else path.stem}{more}", suffix)
+    return output.free_name(folder, f"{'scene' if state.path is None else state.path.stem}{more}", suffix)
 
 
 # Pictures, views and paths.
@@ -58,7 +57,7 @@ def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
     state = viewer.state
     if not viewer.has_scene("save a picture of it") or viewer.surface is None or state.view is None:
         return None
-    path = _new_file(viewer, folder, ".png")
+    path = _new_file(viewer.state, folder, ".png")
     beside, transparent = viewer.beside, state.session.picture.transparent
     shown = [viewer] if beside is None or beside.state.scene is None else [viewer, beside]
 
@@ -94,7 +93,7 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
     request = state.request((width, height), state.session.picture.transparent)
 
     def work(progress: Progress) -> tuple[Path, str]:
-        path = _new_file(viewer, folder, ".png", f"-{width}x{height}")
+        path = _new_file(viewer.state, folder, ".png", f"-{width}x{height}")
         progress("drawing", 0.0, path.name)
         with output.in_one_line(path, f"{width}x{height}"), open_renderer("cpu") as renderer:
             output.save_png(path, output.draw_something(request, renderer))
@@ -108,7 +107,7 @@ def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
     state = viewer.state
     if not viewer.has_scene("save a view of it") or state.view is None:
         return None
-    path = _new_file(viewer, folder, ".json", "-view")
+    path = _new_file(viewer.state, folder, ".json", "-view")
     camera = replace(state.view, orthographic=False).camera(*state.size).moved(state.origin)
     span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
     more = f"; show it again with --camera {path.name}{span}"
@@ -121,7 +120,7 @@ def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
     if not keyframes:
         viewer.say_error("a path to save needs a keyframe: add one at the current view")
         return None
-    path = _new_file(viewer, folder, PATHS)
+    path = _new_file(viewer.state, folder, PATHS)
     more = "; langsplat-viewer --headless --path makes a film of it"
     return viewer.save(
         path, lambda: write_flight(path, flight_of(keyframes).moved(viewer.state.origin)), more
@@ -141,7 +140,7 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
     try:
         new = folder.absolute() / typed
         if not typed:
-            new = _new_file(viewer, folder, output.VIDEO if output.has_video() else "", "-film")
+            new = _new_file(viewer.state, folder, output.VIDEO if output.has_video() else "", "-film")
         out = output.check_film(new, record.size)
         shot = output.Shot(
             request,
@@ -305,7 +304,7 @@ def choose_export(viewer: Viewer) -> None:
     if form is None:
         return
     then = partial(run_export, form=form)
-    new = _new_file(viewer, folder_of(viewer), form.suffix, f"-{form.title.split()[0]}")
+    new = _new_file(viewer.state, folder_of(viewer), form.suffix, f"-{form.title.split()[0]}")
     choice = FileChoice(f"Export: {form.title}", then, "save", (form.suffix,), new)
     ask_for(viewer, choice if form.suffix else replace(choice, kind="folder", start=new.parent))
 
@@ -392,28 +391,28 @@ def save(viewer: Viewer) -> None:
 def save_as(viewer: Viewer) -> None:
     """Have a dialog ask for the file that the project is saved to from now on."""
     if viewer.has_scene("save the project"):
-        new = _new_file(viewer, folder_of(viewer), PROJECTS)
+        new = _new_file(viewer.state, folder_of(viewer), PROJECTS)
         ask_for(viewer, FileChoice("Save the project", save_project, "save", (PROJECTS,), new))
 
 
-def save_project(viewer: Viewer, to: Path = Path()) -> Path | None:
+def save_project(viewer: Viewer, to: Path = Path(), of: SceneState | None = None) -> Path | None:
     """Save the project as `to`, or where that is a folder to the file that it came from or a new one there.
 
-    Return where it is, None where that failed.
+    `of`: a scene that was left, by default the one shown. Return where it is, None where that failed.
     """
-    state = viewer.state
-    if not viewer.has_scene("save the project") or not (state.scene and state.path and state.view):
+    state = of or viewer.state
+    if not viewer.has_scene("save the project") or not (state.path and state.view):
         return None
-    path = to if to.name.endswith(PROJECTS) else state.project or _new_file(viewer, to, PROJECTS)
+    path = to if to.name.endswith(PROJECTS) else state.project or _new_file(state, to, PROJECTS)
     known = state.project_digest if path == state.project else ""
     project = Project(
         scene=os.path.abspath(state.path),
-        gaussians=len(state.scene.gaussians),
+        gaussians=state.count,
         origin=(float(state.origin[0]), float(state.origin[1]), float(state.origin[2])),
         view=Bookmark("view", pose_of(state.view), state.view.distance),
         session=state.session,
         intrinsics=state.view.intrinsics,
-        panels=state.preferences.panels or (),
+        panels=viewer.state.preferences.panels or (),
     )
     written: list[tuple[str, Path | None]] = []
 
@@ -426,7 +425,7 @@ def save_project(viewer: Viewer, to: Path = Path()) -> Path | None:
     if kept is not None:
         viewer.say_error(f"{path.name} held what this window has not: kept as {kept.name}")
     state.saved, state.project = state.session, path
-    state.preferences = state.preferences.with_recent(path)
+    viewer.state.preferences = viewer.state.preferences.with_recent(path)
     return path
 
 
@@ -452,7 +451,7 @@ def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str, loses_more: b
 
 def quit_viewer(viewer: Viewer) -> None:
     """Close the window; ask first where something would be lost."""
-    leave(viewer, _close, "the window closes", viewer.state.is_changed)
+    leave(viewer, _close, "the window closes", loses_more=bool(viewer.unsaved()))
 
 
 def may_close(viewer: Viewer) -> bool:
@@ -480,8 +479,8 @@ def end(viewer: Viewer, folder: Path = Path()) -> None:
     Where they are is said in the terminal.
     """
     viewer.state.echoes = True
-    if viewer.state.has_unsaved_notes:
-        save_project(viewer, folder)
+    for state in viewer.unsaved():
+        save_project(viewer, folder, state)
     if viewer.state.is_unsaved:
         save_edited(viewer, folder, end_at_once)
     else:
@@ -498,11 +497,12 @@ def go_on(viewer: Viewer) -> None:
 def save_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
     """Write the scene without what was deleted to a new file in `folder`, and go on once it is there."""
     leaving, viewer.state.leaving = viewer.state.leaving, None
-    if leaving is not None:
-        save_edited(viewer, folder, leaving.then)
+    if leaving is not None:  # what is noted is asked about next
+        save_edited(viewer, folder, quit_viewer if leaving.then is _close else leaving.then)
 
 
 def save_project_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
-    """Save the project and go on; where it cannot be saved one stays."""
-    if save_project(viewer, folder) is not None:
+    """Save the projects of all scenes that need it and go on; where one cannot be saved one stays."""
+    edited = [viewer.state] if viewer.state.is_unsaved else []
+    if all(save_project(viewer, folder, state) for state in dict.fromkeys((*edited, *viewer.unsaved()))):
         go_on(viewer)

@@ -358,8 +358,9 @@ def _ask(viewer: Viewer, to: str) -> None:
         moved = " and some transformed" if state.session.moves else ""
         count = f"{int(state.marks.deleted.sum()):,} Gaussians"
         imgui.text_wrapped(f"{count} were deleted{moved}, and the scene is not saved so.")
-    if state.has_unsaved_notes:
-        imgui.text_unformatted("Notes, names or bookmarks are in no project.")
+    for other in viewer.unsaved():
+        of = other.path.name if other.path else "the scene"
+        imgui.text_wrapped(f"Notes, names, bookmarks or keyframes of {of} are in no project.")
     imgui.text_unformatted(f"Save before {to}?")
     if state.is_unsaved:
         if ui.button("Save", "The scene as a new file, without what was deleted"):
