@@ -329,8 +329,8 @@ def test_exports_are_commands_of_the_command_line(opened, title):
     switches = [flag for flag in row.options if saving.OPTIONS[flag][1] is False]
     values = [f"{flag}={value:g}" for flag, value in form.values.items() if flag not in switches]
     for suffix in row.sizes:
-        words = row.words.format(scene="a.ply", out=f"b{suffix}").split()
-        parse([*words, *values, *switches])
+        words = row.words.format(scene="a.ply", out=f"b{suffix}", encoder="--encoder=mine").split()
+        assert getattr(parse([*words, *values, *switches]), "encoder", "") in ("", None, "mine")
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".glb", ".splat"])
@@ -358,7 +358,7 @@ def test_edited_scene_is_exported(pruned, tmp_path, title, name, what):
 
 
 SLOW = "import sys, time; print(sys.argv, flush=True); time.sleep(60)"
-FAILS = "import sys; sys.exit('langsplat: no cameras; mend that')"
+FAILS = "import sys; sys.exit(f'langsplat: {sys.argv[1]} has no cameras; {sys.argv[-1]}')"
 
 
 def test_cancelled_export_ends_its_command(opened, tmp_path, monkeypatch):
@@ -373,9 +373,10 @@ def test_cancelled_export_ends_its_command(opened, tmp_path, monkeypatch):
 
 def test_failed_export_of_a_command_says_why(opened, tmp_path, monkeypatch):
     monkeypatch.setattr(saving, "program", lambda: [sys.executable, "-c", FAILS])
-    saving.run_export(opened, tmp_path / "a.glb", form_of(opened, "mesh"))
+    opened.services = replace(opened.services, encoder_id="my own")
+    saving.run_export(opened, tmp_path / "a.ply", form_of(opened, "labels"))
     recorded(opened)
-    assert errors(opened) == ["no cameras; mend that"]
+    assert errors(opened) == ["describe has no cameras; --encoder=my own"]
     saving.run_export(opened, opened.state.path, form_of(opened, "scene"))
     recorded(opened)
     assert "would replace the original scene" in errors(opened)[-1]

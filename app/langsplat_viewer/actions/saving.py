@@ -210,7 +210,7 @@ def finish_writing(viewer: Viewer) -> None:
 class ExportRow:
     """Something that a command of the command line makes of a scene."""
 
-    words: str  # the command, with places for the scene and what is written
+    words: str  # the command, with places for the scene, what is written, and --encoder
     about: str
     # Suffix, "" of a folder -> bytes in all, for each Gaussian, and for each coefficient of its colours, as
     # measured on the bundled scene. `at_most`: it may be much less. `beside`: companions are added.
@@ -254,12 +254,12 @@ EXPORTS = {
         {".glb": (15e6, 0, 0), ".ply": (15e6, 0, 0)}, ("--watertight",), at_most=True,
     ),
     "map for a robot": ExportRow(
-        "map {scene} {out}", "Occupancy grid, labelled voxels and a collider, into a folder.",
+        "map {scene} {out} {encoder}", "Occupancy grid, labelled voxels and a collider, into a folder.",
         {"": (5e6, 0, 0)}, (CELL, UNIT),
     ),
     "labels": ExportRow(
-        "describe {scene} --labels {out}", "The scene with instance, part and class of each Gaussian, and "
-        "the words for them.", {".ply": (6e4, 68, 12)}, beside=True,
+        "describe {scene} --labels {out} {encoder}", "The scene with instance, part and class of each "
+        "Gaussian, and the words for them.", {".ply": (6e4, 68, 12)}, beside=True,
     ),
 }  # fmt: skip
 
@@ -317,7 +317,8 @@ def run_export(viewer: Viewer, out: Path, form: ExportForm) -> None:
     shown, mask, scene = state.scene, exported(viewer, form), replace(state.scene, language=viewer.language)
     taught = viewer.engine is not None and bool(viewer.engine.taught)
     is_own = mask.all() and not (state.session.moves or taught or viewer.watch.changed) and path.exists()
-    rows, write_page_of = np.flatnonzero(mask), _page(viewer)
+    rows, write_page_of, chosen = np.flatnonzero(mask), _page(viewer), viewer.services.encoder_id
+    encoder = f"--encoder={chosen}" if chosen else ""  # of the window
     words = [flag if value is True else f"{flag}={value:g}" for flag, value in form.values.items() if value]
 
     def work(progress: Progress) -> tuple[Path, str]:
@@ -329,8 +330,8 @@ def run_export(viewer: Viewer, out: Path, form: ExportForm) -> None:
             if not is_own:
                 progress("copying the scene", 0.0)
                 save_scene(source, replace(scene.take(rows), path=source))
-            named = [word.format(scene=source, out=out) for word in row.words.split()]
-            process = CommandProcess([*program(), *named, *words], viewer.recorder.wake)
+            named = (word.format(scene=source, out=out, encoder=encoder) for word in row.words.split())
+            process = CommandProcess([*program(), *filter(None, named), *words], viewer.recorder.wake)
             try:
                 while process.exit_code is None:
                     stage, fraction = [("starting", 0.0), *process.progress.stages.items()][-1]
