@@ -52,16 +52,8 @@ GEOMETRY: Mapping[str, tuple[str, tuple[str, str]]] = MappingProxyType({
     "other": ("best cosine of a name that is not, median", ("0.21 to 0.235", "")),
     "margin": ("own name less nearest canonical phrase, median", ("0.011 to 0.065", "")),
     "alike": ("images of two things: mean, 5 and 95 %", ("0.54 to 0.73", "0.57, 0.43, 0.73")),
-    "typical": ("an image and a name: mean cosine", ("0.14 to 0.20", "0.182")),
-    "spread": ("deviation over names, for one image", ("", "0.0176")),
     "hubness": ("deviation of the names' means", ("", "0.0088")),
-    "places": ("deviation of the images' means", ("", "0.0131")),
-    "rest": ("deviation that is left after both", ("", "0.0155")),
     "best": ("best name less second best; its z", ("", "0.006, 4.1")),
-    "axes": ("axes for 50, 80 and 95 % of variance", ("", "21, 86, 193")),
-    "centre": ("length of the mean image", ("", "0.76")),
-    "prompts": ("two names: mean cosine", ("0.565", "0.743")),
-    "right": ("images nearest to their own name, %", ("", "")),
 })  # fmt: skip
 
 
@@ -236,27 +228,14 @@ def _geometry(
     apart = room.owners[nodes][:, None] != room.owners[nodes]
     pairs = (images @ images.T)[apart]
     second, best = np.sort(cosines, axis=1)[:, -2:].T
-    by_name, by_image = cosines.mean(0), cosines.mean(1)
-    shares = np.cumsum(np.linalg.svd(images - images.mean(0), compute_uv=False) ** 2)
     margins = own - (images @ engine.field.canonical.T).max(1, keepdims=True)
-    rows = np.flatnonzero(np.isin(nodes, list(room.wholes)))
-    nearest = own[rows].argmax(1)
-    right = [there[name] in room.wholes[nodes[row]] for row, name in zip(rows, nearest, strict=True)]
     figures = {
         "own": np.median(own.max(0)),
         "other": np.median(other.max(0)),
         "margin": np.median(margins.max(0)),
         "alike": [pairs.mean(), *np.quantile(pairs, (0.05, 0.95))],
-        "typical": cosines.mean(),
-        "spread": cosines.std(1).mean(),
-        "hubness": by_name.std(),
-        "places": by_image.std(),
-        "rest": (cosines - by_name - by_image[:, None]).std(),
-        "best": [np.median(best - second), np.median((best - by_image) / cosines.std(1))],
-        "axes": np.searchsorted(shares, np.array([0.5, 0.8, 0.95]) * shares[-1]) + 1,
-        "centre": np.linalg.norm(images.mean(0)),
-        "prompts": (words @ words.T)[np.triu_indices(len(words), 1)].mean(),
-        "right": 100 * np.mean(right),
+        "hubness": cosines.mean(0).std(),
+        "best": [np.median(best - second), np.median((best - cosines.mean(1)) / cosines.std(1))],
     }
     return {key: tuple(float(f"{x:.3g}") for x in np.atleast_1d(value)) for key, value in figures.items()}
 
