@@ -164,8 +164,7 @@ class TruthMasks(MaskSource):
             found, pixels = np.unique(ids[ids >= 0], return_counts=True)
             stacks.append(ids == found[pixels >= MIN_REGION][:, None, None])
         progress("reading the truth", 1.0)
-        subpart, part, whole = (np.ones(len(stack), np.float32) for stack in stacks)
-        return LevelMasks((stacks[0], stacks[1], stacks[2]), (subpart, part, whole))
+        return stacks[0], stacks[1], stacks[2]
 
 
 def _digest(image: Array) -> str:

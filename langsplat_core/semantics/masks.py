@@ -4,31 +4,18 @@ import heapq
 import json
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from langsplat_core.arrays import Array, check_array
+from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
 from langsplat_core.progress import Progress
 
-
-@dataclass(frozen=True, eq=False)
-class LevelMasks:
-    """Masks of one photograph at the levels subpart, part, whole; a level may have none."""
-
-    masks: tuple[Array, ...]  # three of (M_l, H, W) bool; may overlap, later ones lie on top
-    scores: tuple[Array, ...]  # three of (M_l,) float32, in [0, 1]
-
-    def __post_init__(self) -> None:
-        dims: dict[str, int] = {}
-        for level, (masks, scores) in enumerate(zip(self.masks, self.scores, strict=True)):
-            count = f"M{level}"
-            dims = check_array(f"masks[{level}]", masks, (count, "H", "W"), dims, dtype=np.bool_)
-            dims = check_array(f"scores[{level}]", scores, (count,), dims, dtype=np.float32)
+# Masks at the levels subpart, part, whole: (M, H, W) bool each, M may be 0; later ones lie on top.
+LevelMasks = tuple[Array, Array, Array]
 
 
 class MaskSource(Protocol):
@@ -63,9 +50,9 @@ def label_maps(levels: LevelMasks) -> Array:
     level); within a level later masks cover earlier ones. Unlike there, a mask that ends with no visible
     pixel has no row, so every row from 0 to the maximum occurs, each in one level.
     """
-    maps = np.full((len(levels.masks), *levels.masks[0].shape[1:]), -1, np.int32)
+    maps = np.full((len(levels), *levels[0].shape[1:]), -1, np.int32)
     first = 0
-    for labels, masks in zip(maps, levels.masks, strict=True):
+    for labels, masks in zip(maps, levels, strict=True):
         for row, mask in enumerate(masks, first):
             labels[mask] = row
         first += len(masks)
@@ -308,10 +295,10 @@ class GraphMasks(MaskSource):
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
         """Masks of an image (H, W, 3) uint8; at every level they cover each pixel exactly once."""
         progress("finding regions", 0.0)
-        levels = nested_partitions(image)
-        masks = [labels == np.arange(labels.max() + 1)[:, None, None] for labels in levels]
+        levels = (labels == np.arange(labels.max() + 1)[:, None, None] for labels in nested_partitions(image))
+        subparts, parts, wholes = levels
         progress("finding regions", 1.0)
-        return LevelMasks(tuple(masks), tuple(np.ones(len(stack), np.float32) for stack in masks))
+        return subparts, parts, wholes
 
 
 def nested_partitions(image: Array) -> Array:

@@ -282,8 +282,8 @@ class SamMasks(MaskSource):
             for proposals, more in zip(levels, found, strict=True):
                 proposals += more
         progress("finding masks", 1.0)
-        rest = [partial(filter_level, level, image.shape[:2], self._config) for level in levels]
-        return lambda: LevelMasks(*zip(*(kept() for kept in rest), strict=True))
+        subparts, parts, wholes = (partial(filter_level, of, image.shape[:2], self._config) for of in levels)
+        return lambda: (subparts(), parts(), wholes())
 
     def _in_crop(
         self, image: Array, crop: Array, progress: Progress, half_on: str | None
@@ -367,17 +367,15 @@ def measure(logits: Any, offset: float) -> Any:
     return torch.stack([column.float() for column in found], dim=1)
 
 
-def filter_level(
-    proposals: list[Proposal], shape: tuple[int, int], config: MaskConfig
-) -> tuple[Array, Array]:
-    """Filter one level: (M, H, W) bool masks and (M,) float32 scores, stability times IoU.
+def filter_level(proposals: list[Proposal], shape: tuple[int, int], config: MaskConfig) -> Array:
+    """Filter one level: (M, H, W) bool masks; scores are stability times IoU.
 
     proposals: of each crop those that no better one resembled. Order of the steps as in SAM's mask generator
     with LangSplat's mask suppression behind it: boxes of different crops, where the smaller crop shows more
     of a thing, crumbs, boxes again (there an untouched mask beats a cleaned one), pixels.
     """
     if not proposals:
-        return np.zeros((0, *shape), bool), np.zeros(0, np.float32)
+        return np.zeros((0, *shape), bool)
     closeness = np.array([1 / proposal.crop_area for proposal in proposals])
     boxes = np.stack([proposal.box for proposal in proposals])
     chosen = [proposals[i] for i in box_nms(boxes, closeness, config.box_nms)]
@@ -386,6 +384,5 @@ def filter_level(
     untouched = np.array([not changed for _, changed in cleaned], float)
     scores = np.array([p.stability * p.predicted_iou for p in chosen])
     again = box_nms(mask_boxes(masks), untouched, config.box_nms)
-    masks, scores = masks[again], scores[again]
-    kept = mask_nms(masks, scores, config)
-    return masks[kept], scores[kept].clip(0, 1).astype(np.float32)
+    masks = masks[again]
+    return np.asarray(masks[mask_nms(masks, scores[again], config)])

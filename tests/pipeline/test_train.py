@@ -218,7 +218,7 @@ class Blind(MaskSource):
 
     def __call__(self, image: np.ndarray, progress: Progress) -> LevelMasks:
         none = np.zeros((0, *image.shape[:2]), bool)
-        return LevelMasks((none, none, none), (np.zeros(0, np.float32),) * 3)
+        return none, none, none
 
 
 def test_without_any_mask_no_gaussians_are_trained(room, tmp_path):

@@ -84,8 +84,7 @@ class Halves(MaskSource):
         halves = np.zeros((2, height, width), bool)
         halves[0, :, : width // 2] = halves[1, :, width // 2 :] = True
         none, everything = np.zeros((0, height, width), bool), np.ones((1, height, width), bool)
-        scores = [np.ones(n, np.float32) for n in (2, 0, 1)]
-        return LevelMasks((halves, none, everything), (scores[0], scores[1], scores[2]))
+        return halves, none, everything
 
 
 def red_and_blue(height: int = 10, width: int = 20) -> np.ndarray:

@@ -18,7 +18,6 @@ from langsplat_core.progress import silent
 from langsplat_core.semantics import sam
 from langsplat_core.semantics.masks import (
     GraphMasks,
-    LevelMasks,
     RegionGraph,
     box_nms,
     clean_regions,
@@ -58,7 +57,7 @@ def test_later_masks_cover_earlier_ones_and_hidden_masks_have_no_row() -> None:
     first = np.stack([left, everything, right])  # `left` ends with no visible pixel
     second = np.stack([right])
     levels = (first, second, np.zeros((0, 2, 4), bool))
-    maps = label_maps(LevelMasks(levels, tuple(np.ones(len(masks), np.float32) for masks in levels)))
+    maps = label_maps(levels)
     assert maps.dtype == np.int32
     assert maps[0].tolist() == [[0, 0, 1, 1]] * 2
     assert maps[1].tolist() == [[-1, -1, 2, 2]] * 2
@@ -99,7 +98,7 @@ def test_degenerate_pictures_work(shape: tuple[int, int], noise: bool) -> None:
     if noise:
         image = np.random.default_rng(0).integers(0, 256, image.shape, dtype=np.uint8)
     masks = GraphMasks()(image, silent)
-    for stack in masks.masks:
+    for stack in masks:
         assert (stack.sum(axis=0) == 1).all()
     maps = label_maps(masks)
     assert maps.min() == 0
@@ -386,10 +385,10 @@ def compare(config: MaskConfig, model: Any, image: np.ndarray, crops: list[tuple
     levels = load_mask_source(config, "cpu")(image, silent)
     for level in range(3):
         want = plain_level(model, image, crops, config, level)
-        assert len(levels.masks[level]) == len(want)
-        for got, mask in zip(levels.masks[level], want, strict=True):
+        assert len(levels[level]) == len(want)
+        for got, mask in zip(levels[level], want, strict=True):
             assert (got ^ mask).sum() <= 2  # batches of another size: float32 logits near zero may flip
-    return [len(masks) for masks in levels.masks]
+    return [len(masks) for masks in levels]
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -401,7 +400,7 @@ def test_the_whole_source_agrees_with_one_point_at_a_time(family: str, tmp_path:
     assert sum(counts) >= 3
     everything = replace(config, predicted_iou=-99.0, stability=0.0)
     loose = load_mask_source(everything, "cpu")(image, silent)
-    assert sum(map(len, loose.masks)) > sum(counts)  # so both scores did filter something
+    assert sum(map(len, loose)) > sum(counts)  # so both scores did filter something
 
 
 @pytest.mark.parametrize("family", ["sam", "sam2"])
@@ -444,20 +443,20 @@ def test_sam_2_masks_are_ordered_by_size_at_each_point() -> None:
 def test_batches_do_not_change_the_masks(config: MaskConfig) -> None:
     one, many = (load_mask_source(replace(config, points_per_batch=count), "cpu") for count in (1, 64))
     assert one.key == many.key
-    for a, b in zip(one(photograph(), silent).masks, many(photograph(), silent).masks, strict=True):
+    for a, b in zip(one(photograph(), silent), many(photograph(), silent), strict=True):
         assert a.shape == b.shape
         assert (a ^ b).sum() <= 2 * len(a)
 
 
 def test_no_mask_at_all_is_an_answer(config: MaskConfig) -> None:
     levels = load_mask_source(replace(config, predicted_iou=99.0), "cpu")(photograph(), silent)
-    assert [masks.shape for masks in levels.masks] == [(0, 48, 80)] * 3
+    assert [masks.shape for masks in levels] == [(0, 48, 80)] * 3
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 70), (70, 1)])
 def test_thin_pictures_work(config: MaskConfig, shape: tuple[int, int]) -> None:
     levels = load_mask_source(config, "cpu")(np.full((*shape, 3), 80, np.uint8), silent)
-    assert all(masks.shape[1:] == shape for masks in levels.masks)
+    assert all(masks.shape[1:] == shape for masks in levels)
 
 
 def test_sources_are_chosen_and_absences_named(config: MaskConfig, tmp_path: Path) -> None:
@@ -488,6 +487,6 @@ def test_overflow_of_float16_is_computed_in_float32(config: MaskConfig) -> None:
             return encoded
 
     found = SamMasks(Overflowing(), config, half_on="cpu")(photograph(), silent)
-    for got, want in zip(found.masks, SamMasks(segmenter, config)(photograph(), silent).masks, strict=True):
+    for got, want in zip(found, SamMasks(segmenter, config)(photograph(), silent), strict=True):
         np.testing.assert_array_equal(got, want)
     assert asked == [True, False]
