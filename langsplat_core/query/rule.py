@@ -62,7 +62,7 @@ class Rule:
 RULE = Rule(
     advantage={"thing": (0.0, 0.25, 0.75), "part": (0.0, 0.0, 0.5), "part of a thing": (0.0, 0.1, 0.0)},
     found={
-        "thing": (1.35, 2.6),
+        "thing": (1.1, 4.0),
         "part": (2.55, 1.3),
         "part of a thing": (2.55, 1.3),
         "inside": (np.inf, 1.8),

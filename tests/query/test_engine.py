@@ -39,10 +39,21 @@ from langsplat_core.scene import (
     PlattScaling,
     Scene,
 )
+from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.semantics import relevancy as relevancies
 from langsplat_core.semantics.encoders import DEMO, OPEN_MODEL, keep_calibration
 from langsplat_core.semantics.relevancy import FEWEST, Scale, latent_relevancy, relevancy, relevancy_of
-from tests.support.fakes import DIM, PER_BLOB, WORDS, FakeEncoder, axis, blob_scene, named_scene
+from tests.support.fakes import (
+    DIM,
+    PER_BLOB,
+    WORDS,
+    FakeEncoder,
+    axis,
+    blob_scene,
+    blobs,
+    named_field,
+    named_scene,
+)
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_camera, random_gaussians
 
@@ -487,6 +498,18 @@ def test_field_through_cells_keeps_unknown_gaussians():
     np.testing.assert_allclose(vectors, want, atol=1e-5)
     nothing = replace(field, confidence=0 * field.confidence)
     assert not through_cells(nothing).known.any()
+
+
+def test_by_peaks_one_gaussian_scores_no_whole():
+    """Where every Gaussian has its own relevancy, that of a thing is smoothed along its surface."""
+    field = named_field(codebook=False)
+    field.latents[2, :PER_BLOB] = unit(np.array([0.7, 0, 0, 0.7]))
+    field.latents[2, 5] = 2 * field.latents[2, 5] * (1, 0, 0, 0)
+    tree = tree_of_wholes(np.repeat(np.arange(3, dtype=np.int32), PER_BLOB))
+    engine = QueryEngine(Scene(blobs(), replace(field, tree=tree)), rule="peak")
+    (thing,) = engine.instances(engine.run("mug", level="whole"))
+    assert thing.members[:PER_BLOB].all()
+    assert thing.score < engine.relevancy(engine.text_vectors(["mug"])[0])[2, 5] - 0.05
 
 
 def test_both_orders_agree_inside_an_object():
