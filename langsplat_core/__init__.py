@@ -3,6 +3,7 @@
 The public names below load on first use, so that importing the package costs nothing.
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from langsplat_core.config import TrainConfig
     from langsplat_core.io.scenes import load_scene, save_scene
     from langsplat_core.io.sidecar import Words, read_words, write_words
+    from langsplat_core.pipeline.notebook import draw, show
     from langsplat_core.pipeline.train import train_scene
     from langsplat_core.query.answers import QueryResult
     from langsplat_core.query.engine import QueryEngine
@@ -32,6 +34,7 @@ _HOMES = {
         "semantics.encoders": "load_text_encoder",
         "query.engine": "QueryEngine QueryResult",
         "pipeline.train": "train_scene",
+        "pipeline.notebook": "show draw",
         "config": "TrainConfig",
         "scene": "Camera Gaussians Intrinsics LanguageField Scene look_at",
     }.items()
@@ -40,8 +43,8 @@ _HOMES = {
 
 __all__ = [
     "Camera", "Gaussians", "Intrinsics", "LanguageField", "QueryEngine", "QueryResult", "Rendering",
-    "Scene", "TrainConfig", "Words", "load_lifting_rasterizer", "load_rasterizer", "load_scene",
-    "load_text_encoder", "look_at", "read_words", "render", "save_scene", "train_scene", "view_of",
+    "Scene", "TrainConfig", "Words", "draw", "load_lifting_rasterizer", "load_rasterizer", "load_scene",
+    "load_text_encoder", "look_at", "read_words", "render", "save_scene", "show", "train_scene", "view_of",
     "write_words",
 ]  # fmt: skip
 
@@ -51,3 +54,17 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'langsplat_core' has no attribute {name!r}")
     with optional_imports():
         return getattr(import_module(_HOMES[name]), name)
+
+
+def load_ipython_extension(shell: Any) -> None:
+    """Have IPython show a scene at the end of a cell as the page that can be searched."""
+    html = shell.display_formatter.formatters["text/html"]
+    html.for_type_by_name("langsplat_core.scene.scene", "Scene", _page)
+
+
+def _page(scene: Any) -> Any:
+    return __getattr__("show")(scene)._repr_html_()
+
+
+if "IPython" in sys.modules and (shell := sys.modules["IPython"].get_ipython()) is not None:
+    load_ipython_extension(shell)

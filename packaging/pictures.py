@@ -17,7 +17,8 @@ from PIL import Image
 
 from langsplat_core.config import CodecConfig, PictureConfig
 from langsplat_core.io.hostile import opened
-from langsplat_core.io.scenes import save_scene
+from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.pipeline.notebook import show
 from langsplat_core.training.language.codec_fit import train_autoencoder
 from langsplat_viewer.actions import editing, opening, outline, settings, viewpoint
 from langsplat_viewer.options import ViewerOptions, scene_path, services
@@ -44,7 +45,7 @@ STILLS = {
     ],
 }
 PAGE, PAGE_VIEW, PAGE_PHRASE = "page.jpg", 20, "blue gift"
-HERO, LOOP, REAL = "hero.jpg", "page.webp", "real.jpg"
+HERO, LOOP, REAL, NOTEBOOK = "hero.jpg", "page.webp", "real.jpg", "notebook.jpg"
 LOOKS: tuple[dict[str, Any], ...] = (
     {"display": "rgb"},
     {"display": "latent", "level": "whole"},
@@ -289,6 +290,21 @@ def page_picture(path: Path) -> None:
         tab.page.screenshot(path=path, type="jpeg", quality=85)
 
 
+def notebook_picture(path: Path) -> None:
+    """Write a screenshot of what a cell of a notebook has: its line, and its output."""
+    shown = show(load_scene(scene_path(None)), PAGE_PHRASE)
+    style = "font: 15px monospace; margin: 16px 24px; color: #555"
+    line = f"[1]: &nbsp;show(scene, &quot;{PAGE_PHRASE}&quot;)"
+    with tempfile.TemporaryDirectory() as folder, open_browser() as browser:
+        cell = Path(folder) / "cell.html"
+        cell.write_text(f'<!doctype html><body style="{style}"><p>{line}</p>{shown._repr_html_()}')
+        tab = browser.new_page(viewport={"width": 1000, "height": 620}, reduced_motion="reduce")
+        tab.goto(cell.as_uri())
+        tab.frames[1].wait_for_function("async () => (await langsplat).page.answers.length")
+        tab.wait_for_timeout(8_000)  # until the order is found
+        tab.screenshot(path=path, type="jpeg", quality=85)
+
+
 class Undimmed(ViewerOptions):
     """Options that leave the colours around an answer as they are."""
 
@@ -373,7 +389,7 @@ def page_loop(path: Path) -> None:
     images[0].save(path, save_all=True, append_images=images[1:], duration=PACE, loop=0, quality=60, method=6)
 
 
-OTHERS = {PAGE: page_picture, LOOP: page_loop, HERO: hero_picture}
+OTHERS = {PAGE: page_picture, NOTEBOOK: notebook_picture, LOOP: page_loop, HERO: hero_picture}
 
 
 def main() -> None:

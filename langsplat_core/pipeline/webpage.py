@@ -1,4 +1,4 @@
-"""A scene as one HTML file that a browser draws and searches without a network: `write_page`.
+"""A scene as one HTML file that a browser draws and searches without a network: `write_page`, `make_page`.
 
 The file holds a compressed safetensors file (Gaussians of 8 and 16 bits, codes, codebook, words, regions)
 and the modules of `langsplat_core/web`. A phrase is answered there by the rule of `query.rule`:
@@ -19,6 +19,7 @@ from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
 from PIL import Image
@@ -86,28 +87,51 @@ def write_page(
     first: Sequence[Camera] = (),
     notes: Sequence[tuple[str, Sequence[float]]] = (),
 ) -> PageReport:
-    """Write `scene` as an HTML file, searched by `engine`; InputError where nothing can be drawn.
+    """Write the page of `make_page` as a file."""
+    text, report = make_page(scene, engine, title, progress, first, notes)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return report
+
+
+def make_page(
+    scene: Scene,
+    engine: QueryEngine | None,
+    title: str,
+    progress: Progress = silent,
+    first: Sequence[Camera] = (),
+    notes: Sequence[tuple[str, Sequence[float]]] = (),
+    phrase: str = "",
+    at_most: int | None = None,
+) -> tuple[str, PageReport]:
+    """Return the HTML of `scene`, searched by `engine`; InputError where nothing can be drawn.
 
     first: views ahead of the scene's cameras, the first of which the page opens with. notes: texts and the
-    (3,) points that they are pinned to, in the scene's units.
+    (3,) points that they are pinned to, in the scene's units. phrase: what is asked at first. at_most: so
+    many Gaussians are drawn, those that cover most; answers are those of all.
     """
-    opacities = sigmoid(scene.gaussians.opacity_logits.astype(np.float64))
-    rows = np.flatnonzero(scene.gaussians.valid() & (opacities >= 1 / 255))
-    rows = rows[np.argsort(along_curve(scene.gaussians.means[rows]), kind="stable")]
+    gaussians = scene.gaussians
+    opacities = sigmoid(gaussians.opacity_logits.astype(np.float64))
+    rows = np.flatnonzero(gaussians.valid() & (opacities >= 1 / 255))
+    if at_most is not None and len(rows) > at_most:
+        cover = np.log(opacities[rows]) + np.sort(gaussians.log_scales[rows], axis=1)[:, 1:].sum(1)
+        rows = rows[np.argsort(-cover, kind="stable")[:at_most]]
+    rows = rows[np.argsort(along_curve(gaussians.means[rows]), kind="stable")]
     if len(rows) == 0:
         raise InputError(f"{scene.path}: no Gaussian of this scene can be drawn; there is nothing to export")
     centre, radius = scene.bounds()
     seen_from = views(scene, first)
     progress("packing the Gaussians", 0.1)
-    tensors = pack_gaussians(scene.gaussians.take(rows), centre)
+    tensors = pack_gaussians(gaussians.take(rows), centre)
     meta: dict[str, Any] = {
         "title": title,
+        "address": urlencode({"phrase": phrase, "show": "relevancy"}) if phrase else "",
         "origin": scene.in_world(centre).tolist(),
         "radius": radius,
         "up": scene.up().tolist(),
         "metres_per_unit": scene.metres_per_unit,
         "raster": asdict(scene.raster_settings()),
-        "sh_count": scene.gaussians.sh.shape[1],
+        "sh_count": gaussians.sh.shape[1],
         "views": [
             {
                 "name": camera.name or f"view {number}",
@@ -138,10 +162,8 @@ def write_page(
     plain = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     packed = zlib.compress(save(plain, {"page": json.dumps(meta, allow_nan=False)}))
     text = page_text(title, packed, _still(scene, seen_from[0]))
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
     free = "encoder" in language
-    return PageReport(len(rows), len(language.get("phrases", ())), free, len(text.encode()), why_not)
+    return text, PageReport(len(rows), len(language.get("phrases", ())), free, len(text.encode()), why_not)
 
 
 def unsearchable(engine: QueryEngine) -> str:

@@ -57,6 +57,9 @@ class QueryResult(Judged):
     members: Deferred = Deferred()  # (N,) bool: the Gaussians that answer, wherever they are
     own_cut: float | None = None  # relevancy from which on everything is a member, where it was set by hand
 
+    def __repr__(self) -> str:
+        return f"<{self.phrase!r}: {self.said}, as {LEVELS[self.level]}, near {self.place}>"
+
     @property
     def cut(self) -> float:
         """The least relevancy of a member, of its region where it has one; the peak where there is none."""

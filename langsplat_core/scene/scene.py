@@ -294,6 +294,12 @@ class Scene:
                 f"language field of {len(self.language)} Gaussians on a scene of {len(self.gaussians)}"
             )
 
+    def __repr__(self) -> str:
+        what = "with" if self.language else "without"
+        return (
+            f"<Scene of {len(self.gaussians):,} Gaussians {what} a language field: {self.path or 'no file'}>"
+        )
+
     def in_world(self, points: Array) -> Array:
         """(..., 3) positions in this scene -> (..., 3) float64 positions in the world."""
         return np.asarray(points, np.float64) + self.origin

@@ -235,8 +235,8 @@ class Page {
   // Say in the address what is shown: as a step that the browser goes back from, or in place of the last one.
   remember(step) {
     this.address = this.state();
-    if (this.address === (location.hash || "#")) {
-      return;
+    if (this.address === (location.hash || "#") || location.protocol === "about:") {
+      return; // a page in a notebook has no address of its own
     }
     if (step) {
       location.hash = this.address;
@@ -250,7 +250,7 @@ class Page {
     if (location.hash === this.address) {
       return;
     }
-    const said = new URLSearchParams(location.hash.slice(1));
+    const said = new URLSearchParams(location.hash.slice(1) || this.meta.address);
     const [level, show, view] = ["level", "show", "view"].map((name) => said.get(name));
     this.level = Object.hasOwn(LEVELS, level) ? level : "auto";
     const numbers = (said.get("at") ?? "").split(",").map(Number);

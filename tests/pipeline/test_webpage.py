@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from langsplat_core import load_ipython_extension, show
 from langsplat_core.arrays import Array, psnr, unit
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.export import Export
@@ -600,3 +601,31 @@ def test_export_command_writes_a_page(tmp_path: Path, capsys: pytest.CaptureFixt
     parse(["export", str(tmp_path / "s.ply"), str(tmp_path / "room.html"), "--title", "Über <b>"]).run()
     assert "40 Gaussians" in capsys.readouterr().out
     assert "<title>Über &lt;b&gt;</title>" in (tmp_path / "room.html").read_text(encoding="utf-8")
+
+
+def test_notebooks_show_a_page_that_was_asked(browser, demo, tmp_path):
+    """In a frame without rights, as a cell has it: bounded, answered over all Gaussians, searchable."""
+    shown = show(demo, "teddy bear", at_most=5000)
+    assert shown.report.gaussians == 5000
+    (tmp_path / "cell.html").write_text(f"<!doctype html><p>Out [1]</p>{shown._repr_html_()}")
+    tab = browser.new_page(offline=True)
+    tab.goto((tmp_path / "cell.html").as_uri())
+    frame = tab.frames[1]
+    said = QueryEngine(demo, load_text_encoder).run("teddy bear").said
+    frame.wait_for_function("said => document.body.innerText.includes(said)", arg=said)
+    assert frame.evaluate("async () => (await langsplat).page.display") == "relevancy"
+    frame.fill("#phrase", "laptop")
+    frame.press("#phrase", "Enter")
+    frame.wait_for_function("async () => (await langsplat).page.answers[0]?.phrase === 'laptop'")
+    tab.close()
+
+
+def test_ipython_shows_scenes_as_pages(monkeypatch, demo):
+    shell = pytest.importorskip("IPython.core.interactiveshell").InteractiveShell.instance()
+    try:
+        load_ipython_extension(shell)
+        shown, _ = shell.display_formatter.format(demo.take(np.arange(50)))
+    finally:
+        type(shell).clear_instance()
+    assert shown["text/html"].startswith("<iframe")
+    assert len(shown["text/plain"]) < 200

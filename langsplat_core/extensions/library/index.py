@@ -30,14 +30,12 @@ from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
-from langsplat_core.config import PictureConfig
-from langsplat_core.display.composing import compose
-from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats
 from langsplat_core.errors import EncoderError, FormatError, InputError, LangSplatError, printable_line
 from langsplat_core.io.files import atomic_path, is_utf8, locked, shown
 from langsplat_core.io.hostile import FromFile, exists, open_for_reading
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
 from langsplat_core.io.sidecar import SUFFIX, read_stored
+from langsplat_core.pipeline.notebook import draw
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
@@ -56,8 +54,7 @@ from langsplat_core.query.rule import (
     region_relevancies,
     triple,
 )
-from langsplat_core.raster.render import render
-from langsplat_core.scene import LEVELS, NO_ORIGIN, Calibration, Camera, LanguageField, Scene
+from langsplat_core.scene import LEVELS, NO_ORIGIN, Calibration, LanguageField, Scene
 from langsplat_core.scene.codec import LinearCodec
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.language import phrase_key
@@ -214,7 +211,7 @@ def digest(path: Path, name: str, load_encoder: LoadEncoder | None) -> Digest:
     try:
         scene = load_scene(path)
         engine = QueryEngine(scene, load_encoder)
-        field, picture = engine.field, draw(scene, THUMBNAIL)
+        field, picture = engine.field, np.asarray(draw(scene, THUMBNAIL))
     except LangSplatError as error:
         return Digest(replace(listed, unread=str(error)))
     taught = tuple(word.key for word in field.taught)
@@ -539,7 +536,7 @@ def _ask_group(
         try:
             scene = load_scene(hits[name].path)
             answer = run_phrase(QueryEngine(scene, load_encoder), phrase).answer
-            picture = draw(scene, PICTURE, answer)
+            picture = np.asarray(draw(scene, PICTURE, answer))
         except LangSplatError as error:
             unread.append((name, str(error)))
             del hits[name]
@@ -584,27 +581,3 @@ def _vector(library: Library, group: EncoderGroup, text: str, load_encoder: Load
                 if phrase_key(text) in book:
                     return book[phrase_key(text)]
         raise
-
-
-# Pictures.
-
-
-def draw(scene: Scene, size: tuple[int, int], answer: QueryResult | None = None) -> Array:
-    """(H, W, 3) uint8 of a scene; an `answer` as heat, from the nearest camera that has it in its image."""
-    fitted = [camera.with_intrinsics(camera.intrinsics.fitted(*size)) for camera in scene.cameras]
-    camera = fitted[0] if fitted else scene.framing_camera(size)
-    if answer is None:
-        drawn = render(scene, camera)
-        return compose(Channels(drawn.colours, drawn.alpha), PictureConfig())
-    if answer.place is not None:
-        camera = min(fitted, key=partial(_away, place=answer.place), default=camera)
-    drawn = render(scene, camera, heats(Subject(len(scene.gaussians), answers=[answer])))
-    heat = Channels(drawn.colours, drawn.alpha, drawn.values)
-    return compose(heat, PictureConfig(display="relevancy"), heat_ranges([answer]))
-
-
-def _away(camera: Camera, place: Array) -> float:
-    """Return the distance of a place (3,) from a camera; far more where it is not well within its image."""
-    pixels, depth = camera.project(place[None])
-    inside = (np.abs(pixels[0] / (camera.width, camera.height) - 0.5) < 0.4).all() and depth[0] > 0
-    return float(np.linalg.norm(camera.position - place)) + (0 if inside else 1e9)

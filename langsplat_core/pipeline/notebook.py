@@ -1,0 +1,79 @@
+"""Scenes in a notebook: `show`, the exported page in a frame of the cell; `draw`, a picture.
+
+Nothing is served or fetched, and no widget is needed: the page is in the notebook's file, so that it stays
+where the notebook is read without Python. In IPython a `Scene` at the end of a cell is shown by itself.
+"""
+
+import html
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from PIL import Image
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import PictureConfig
+from langsplat_core.display.composing import compose
+from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats
+from langsplat_core.pipeline.webpage import PageReport, make_page
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster.render import render
+from langsplat_core.scene import Camera, Scene
+from langsplat_core.semantics.encoders import load_text_encoder
+
+
+@dataclass(frozen=True)
+class NotebookPage:
+    """A page as the output of a cell."""
+
+    text: str  # the HTML file
+    report: PageReport
+    height: int  # pixels; it is as wide as the cell
+
+    def _repr_html_(self) -> str:
+        """Return a frame that may run the page's own script and nothing else."""
+        return (
+            f'<iframe srcdoc="{html.escape(self.text)}" sandbox="allow-scripts allow-downloads" '
+            f'allow="fullscreen" style="width: 100%; height: {self.height}px; border: 0"></iframe>'
+        )
+
+    def __repr__(self) -> str:
+        return f"a page of {self.report.gaussians:,} Gaussians, {self.report.bytes / 1e6:.1f} MB"
+
+
+def show(
+    source: Scene | QueryEngine, phrase: str = "", height: int = 540, at_most: int = 100_000
+) -> NotebookPage:
+    """Return the page of a scene, or of the scene of an engine, in which `phrase` is asked.
+
+    at_most: Gaussians that are drawn, those that cover most, so that a notebook stays small (20 bytes each
+    without view dependence); answers are those of the whole scene.
+    """
+    scene = source if isinstance(source, Scene) else source.scene
+    engine = source if isinstance(source, QueryEngine) else None
+    if engine is None and scene.language is not None:
+        engine = QueryEngine(scene, load_text_encoder)
+    title = scene.path.stem if scene.path else "scene"
+    return NotebookPage(*make_page(scene, engine, title, phrase=phrase, at_most=at_most), height)
+
+
+def draw(scene: Scene, size: tuple[int, int] = (960, 540), answer: QueryResult | None = None) -> Image.Image:
+    """Return a picture of a scene; an `answer` as heat, from the nearest camera that has it in its image."""
+    fitted = [camera.with_intrinsics(camera.intrinsics.fitted(*size)) for camera in scene.cameras]
+    camera = fitted[0] if fitted else scene.framing_camera(size)
+    if answer is None:
+        drawn = render(scene, camera)
+        return Image.fromarray(compose(Channels(drawn.colours, drawn.alpha), PictureConfig()))
+    if answer.place is not None:
+        camera = min(fitted, key=partial(_away, place=answer.place), default=camera)
+    drawn = render(scene, camera, heats(Subject(len(scene.gaussians), answers=[answer])))
+    heat = Channels(drawn.colours, drawn.alpha, drawn.values)
+    return Image.fromarray(compose(heat, PictureConfig(display="relevancy"), heat_ranges([answer])))
+
+
+def _away(camera: Camera, place: Array) -> float:
+    """Return the distance of a place (3,) from a camera; far more where it is not well within its image."""
+    pixels, depth = camera.project(place[None])
+    inside = (np.abs(pixels[0] / (camera.width, camera.height) - 0.5) < 0.4).all() and depth[0] > 0
+    return float(np.linalg.norm(camera.position - place)) + (0 if inside else 1e9)
