@@ -4,7 +4,7 @@ A fit (`semantics.relevancy.Scale`) says by how many spreads a region is nearer 
 phrases are by chance, so that one rule serves all encoders. The exported page has the table as JSON and
 `decide` in JavaScript (`web/rule.js`); the index over scans calls these functions for many scenes at once.
 The numbers were chosen on rooms 201 to 203, with the bundled encoder and CLIP's geometry; `common_share` on
-401 and 402, in four real spaces and with CLIP's geometry.
+401 and 402, in four real spaces and with CLIP's geometry; the bars of things on these, 501 and 502.
 """
 
 from collections.abc import Mapping, Sequence
