@@ -143,7 +143,7 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
     ("bottom", "Ctrl+Keypad7"),
 )
 PANEL_TITLES = (
-    *("Search", "Display", "Camera", "Outline", "Select", "Transform", "Record", "Bookmarks"),
+    *("Search", "Display", "Camera", "Outline", "Selection", "Transform", "Record", "Bookmarks"),
     *("Notes", "Scene", "Train", "Timeline", "Messages"),
     *registry.references("panels"),
 )

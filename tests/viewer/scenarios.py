@@ -206,7 +206,7 @@ def select_with_the_mouse(s: Any) -> None:
     """A rectangle, keys and buttons; what they did is undone."""
     s.key("period")  # the camera in front: no blob hides another
     plain = s.shot("plain")
-    s.menu("Window", "Select")
+    s.menu("Window", "Selection")
     s.click("//**/Rectangle##tool")
     s.drag(*around(s, PLANT))
     seen = s.state.marks.selected
@@ -524,8 +524,11 @@ def large_letters(s: Any) -> None:
         assert 0 <= over.pos.x <= over.pos.x + over.size.x <= 1280, name
         assert 0 <= over.pos.y <= over.pos.y + over.size.y <= 720, name
         settings.escape(s.viewer)
+    s.ctx.dock_into("Messages", "Inspector", imgui.Dir.down)  # by hand, which it survives
+    docked = imgui.internal.find_window_by_name("Messages").dock_id
     settings.prefer(s.viewer, ui_scale=1.0)
     s.settle()
+    assert imgui.internal.find_window_by_name("Messages").dock_id == docked
     assert abs(s.state.size[0] - narrow) < 0.15 * narrow
 
 
@@ -744,7 +747,7 @@ def leave_settings(s: Any) -> None:
     assert s.state.show_help  # at the first start
     s.key("escape", frames=1)
     s.menu("Window", "Light theme, or dark again")
-    for title in ("Select", "Timeline", "Display"):
+    for title in ("Selection", "Timeline", "Display"):
         s.menu("Window", title)
     s.key("f11")  # hidden at the end, there again the next time
     assert s.state.size[0] == 1040

@@ -44,7 +44,7 @@ CORE_PANELS: tuple[Panel, ...] = (
     Panel("Display", scene.draw_display, is_open=True),
     Panel("Camera", viewpoint.draw_camera, needs_scene=True),
     Panel("Outline", outline.draw),
-    Panel("Select", select.draw, needs_scene=True),
+    Panel("Selection", select.draw, needs_scene=True),
     Panel("Transform", select.draw_transform, needs_scene=True),
     Panel("Record", viewpoint.draw_record, needs_scene=True),
     Panel("Bookmarks", viewpoint.draw_bookmarks, needs_scene=True),
@@ -83,10 +83,14 @@ def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
     return docking
 
 
+def _share(scale: float, width: float) -> float:
+    """Return the part of a window `width` units wide that the inspector takes."""
+    return min(COLUMN * scale / width, MOST_SHARE)
+
+
 def _splits(scale: float, width: float) -> list[hello_imgui.DockingSplit]:
-    share = min(COLUMN * scale / width, MOST_SHARE)
     return [
-        hello_imgui.DockingSplit(ui.MAIN_DOCK, INSPECTOR, imgui.Dir.right, share),
+        hello_imgui.DockingSplit(ui.MAIN_DOCK, INSPECTOR, imgui.Dir.right, _share(scale, width)),
         hello_imgui.DockingSplit(ui.MAIN_DOCK, FOOT, imgui.Dir.down, FOOT_SHARE),
     ]
 
@@ -124,6 +128,18 @@ def draw_inspector(viewer: Viewer) -> None:
                 imgui.dummy(ImVec2(0, imgui.get_style().item_spacing.y))
 
 
+def _widen(scale: float) -> None:
+    """Make the inspector's column as wide as letters want; what is docked by hand stays where it is."""
+    window, width = imgui.internal.find_window_by_name(INSPECTOR), imgui.get_main_viewport().size.x
+    node = None if window is None else window.dock_node
+    while node is not None and node.parent_node is not None:
+        if node.parent_node.split_axis == imgui.internal.Axis.x:
+            size = ImVec2(_share(scale, width) * width, node.size.y)
+            imgui.internal.dock_builder_set_node_size(node.id_, size)
+            return
+        node = node.parent_node
+
+
 class Docks:
     """Keeps the docked windows as the state wants them."""
 
@@ -136,11 +152,11 @@ class Docks:
         params, state = hello_imgui.get_runner_params(), viewer.state
         docking, scale = params.docking_params, state.preferences.ui_scale
         if self._scale not in (0.0, scale):
-            docking.docking_splits = _splits(scale, imgui.get_main_viewport().size.x)
-            docking.layout_reset = True
+            _widen(scale)
         self._scale = scale
         if settings.take(state, "resets_panels"):
             settings.prefer(viewer, panels=None)
+            docking.docking_splits = _splits(scale, imgui.get_main_viewport().size.x)
             docking.layout_reset = True
         settings.prefer(viewer, panels=tuple(opened(state)))
         for window in docking.dockable_windows:

@@ -1,4 +1,4 @@
-"""The panels "Select" and "Transform", and the strokes of tools and the gizmo over the scene."""
+"""The panels "Selection" and "Transform", and the strokes of tools and the gizmo over the scene."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -28,7 +28,7 @@ OF_SELECTED = (
 
 
 def draw(viewer: Viewer) -> None:
-    """Draw the panel "Select": counts, tools, the search, verbs, files."""
+    """Draw the panel "Selection": counts, tools, the search, verbs, files."""
     ui.small_wrapped(counts(viewer.state.marks), ui.muted())
     disabled = () if viewer.state.marks.selected.any() else OF_SELECTED
     _tools(viewer)
