@@ -13,7 +13,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.inventory import Suggestions
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_viewer.actions import editing, opening, saving, settings, viewpoint
-from langsplat_viewer.camera.controls import from_side
+from langsplat_viewer.camera.controls import from_side, pan
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.panels import select
 from langsplat_viewer.panels.layout import INSPECTOR, all_panels
@@ -23,7 +23,7 @@ from langsplat_viewer.projects import thumbnail_of
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
 from tests.support.windowless import answer, marked, result
 
-from imgui_bundle import hello_imgui, imgui  # isort: skip
+from imgui_bundle import ImVec2, hello_imgui, imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 
@@ -159,6 +159,24 @@ def offers_keep_still(s: Any) -> None:
     assert [query.phrase for query in s.state.session.queries] == ["book"]
     s.click_at((700, 500))
     assert not s.ctx.item_exists("//**/###offer 1")
+    move_aside_for_what_is_covered(s)
+
+
+def move_aside_for_what_is_covered(s: Any) -> None:
+    """Once for every answer, so that a hand may bring it back below the search."""
+    panel = imgui.internal.find_window_by_name("Search")
+    viewpoint.move(s.viewer, lambda view: replace(view, distance=3 * view.distance))
+    for _ in range(3):
+        by = panel.pos + panel.size / 2 - ImVec2(*s.on_screen(BOOK))
+        viewpoint.move(s.viewer, lambda view, by=by: pan(view, by.x, by.y, s.state.size))
+    below = s.state.view
+    s.rest(20)
+    assert s.state.view is below
+    s.search("book", stay=True)
+    assert s.on_screen(BOOK)[0] > panel.pos.x + panel.size.x
+    viewpoint.move(s.viewer, lambda view: below)
+    s.rest(20)
+    assert s.state.view is below
 
 
 def turn_the_wheel(s: Any, times: int) -> None:

@@ -157,6 +157,7 @@ def focus_result(viewer: Viewer, query: Query | None = None) -> None:
     """
     state = viewer.state
     shown = state.session.in_order_of_showing() if query is None else [query]
+    state.uncovered = ()
     results = [result for query in shown if (result := state.result(query)) is not None]
     found = [result for result in results if result.found or query is not None]
     if found and found[-1].place is not None:
@@ -178,6 +179,24 @@ def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
     most = max(float(np.linalg.norm(place - view.eye)), home.distance)
     distance = min(max(controls.holding_distance(view, box), NEAREST * extent.radius), most)
     glide_to(viewer, controls.focus(view, place, distance))
+
+
+def move_aside(viewer: Viewer, points: Array, left: float, right: float) -> None:
+    """Glide sideways until (M, 3) points lie beside what covers the image from `left` to `right`.
+
+    Both are fractions of its width. What is wider than the room beside it comes to the middle of that.
+    """
+    view, (width, height) = viewer.state.view, viewer.state.size
+    if view is None or viewer.state.record.began is not None:
+        return
+    pixels, depths = view.camera(width, height).project(points)
+    near, far = pixels[:, 0].min() / width, pixels[:, 0].max() / width
+    start, end = (right, 1.0) if left + right < 1 else (0.0, left)
+    by = start - near if left + right < 1 else end - far
+    if far - near > end - start:
+        by = (start + end - near - far) / 2
+    scale = 1.0 if view.orthographic else float(depths.mean()) / view.distance
+    glide_to(viewer, controls.pan(view, by * width * scale, 0, (width, height)))
 
 
 def focus_pixel(viewer: Viewer, u: float, v: float) -> None:

@@ -209,8 +209,7 @@ def _details(viewer: Viewer, query: Query) -> None:
         queries.explain(viewer, query)
     if answer.like is not None and ui.next_button("Like it", "Find what is like it, too"):
         queries.show_alike(viewer, query)
-    if _is_covered(viewer, answer):
-        ui.small_wrapped("All of it lies below this panel: Focus goes there", theme.colour("weak"))
+    _uncover(viewer, answer)
     if imgui.tree_node_ex("Threshold, scores, place", imgui.TreeNodeFlags_.no_tree_push_on_open):
         _figures(viewer, query, answer, result)
 
@@ -225,16 +224,25 @@ def _figures(viewer: Viewer, query: Query, answer: QueryAnswer, result: QueryRes
         ui.small_wrapped(NO_EVIDENCE, ui.muted())
 
 
-def _is_covered(viewer: Viewer, answer: QueryAnswer) -> bool:
-    """Return whether all that was found is in the part of the image that the search lies over."""
+def _uncover(viewer: Viewer, answer: QueryAnswer) -> None:
+    """Move the view aside where a panel lies over what was found: once, and not under a hand; else say so."""
     state, area = viewer.state, ui.scene_area()
-    if state.view is None or not answer.things:
-        return False
+    if state.view is None or state.glide is not None or not answer.things:
+        return
+    is_new = state.uncovered is not answer.things
+    settings.put(state, uncovered=answer.things)
     corners = np.concatenate([thing.oriented.corners for thing in answer.things])
     pixels, depths = state.view.camera(*area.size).project(corners)
-    low, size = imgui.get_window_pos() - (area.left, area.top), imgui.get_window_size()
-    under = (pixels >= tuple(low)) & (pixels <= tuple(low + size))
-    return bool((under.all(1) & (depths > 0)).all())
+    for window in ui.windows_over(TITLE):
+        low = window.pos - ImVec2(area.left, area.top)
+        high, gap = low + window.size, hello_imgui.em_size(1)
+        under = ((pixels >= tuple(low)) & (pixels <= tuple(high))).all(1) & (depths > 0)
+        if under.mean() < 0.5:  # of the corners of boxes
+            continue
+        if is_new and not imgui.is_any_mouse_down():
+            viewpoint.move_aside(viewer, corners, (low.x - gap) / area.width, (high.x + gap) / area.width)
+        else:
+            ui.small_wrapped("It lies below a panel: Focus goes there", theme.colour("weak"))
 
 
 def _scores(result: QueryResult) -> None:

@@ -75,6 +75,14 @@ def scene_area() -> Area:
     return Area(node.pos.x, node.pos.y, max(node.size.x, 1.0), max(node.size.y, 1.0))
 
 
+def windows_over(*titles: str) -> list[Any]:
+    """Return the open windows of these titles and of panels that are docked nowhere, as imgui has them."""
+    docks = hello_imgui.get_runner_params().docking_params.dockable_windows
+    found = map(imgui.internal.find_window_by_name, (*titles, *(window.label for window in docks)))
+    windows = [window for window in found if window is not None and window.active]
+    return [one for one in windows if one.dock_node is None or one.dock_node.is_floating_node()]
+
+
 TIP_LETTERS = 72  # of a line
 LABEL_EM = 5.2  # width of what is written before a row of choices
 MOST_OVER = 0.94  # of the window that something which lies over it may take
