@@ -55,7 +55,8 @@ class Page {
     addEventListener("resize", () => this.redraw());
     addEventListener("keydown", (event) => this.key(event));
     addEventListener("hashchange", () => this.open());
-    addEventListener("beforeprint", () => this.paint());
+    addEventListener("beforeprint", () => this.paint(true));
+    addEventListener("afterprint", () => this.redraw());
     this.panel(true);
     this.open();
   }
@@ -80,31 +81,27 @@ class Page {
     const gaussians = `${this.painter.count.toLocaleString("en")} Gaussians`;
     const { language } = this.meta;
     let about = `Nothing can be searched: ${this.meta.why_not}.`;
-    if (language?.encoder) {
-      about = "The text encoder is in this page: ask any of its words, in any combination.";
-    } else if (language) {
-      about = `${this.language.keys.size.toLocaleString("en")} phrases can be asked.`;
-    }
     if (language) {
-      about += ` Answers: ${language.basis}.`;
+      const asked = language.encoder
+        ? "The text encoder is in this page: ask any of its words, in any combination."
+        : `${this.language.keys.size.toLocaleString("en")} phrases can be asked.`;
+      about = `${asked} Answers: ${language.basis}.`;
     }
     byId("about").textContent = `${gaussians}. ${about} Made with the LangSplat viewer.`;
-    for (const id of ["search", "examples", "levels", "displays", "verdict"]) {
+    for (const id of ["search", "examples", "levels", "displays", "verdict", "labels"]) {
       byId(id).hidden = !language;
     }
-    document.querySelector(".check").hidden = !language;
-    if (language) {
-      if (language.examples.length) {
-        byId("phrase").placeholder = `${language.examples.slice(0, 2).join(", ")} …`;
-      }
-      byId("examples").append(
-        ...language.examples.map((phrase) => {
-          const button = element("button", phrase, { type: "button" });
-          button.addEventListener("click", () => this.search(phrase));
-          return button;
-        }),
-      );
+    const examples = language?.examples ?? [];
+    if (examples.length) {
+      byId("phrase").placeholder = `${examples.slice(0, 2).join(", ")} …`;
     }
+    byId("examples").append(
+      ...examples.map((phrase) => {
+        const button = element("button", phrase, { type: "button" });
+        button.addEventListener("click", () => this.search(phrase));
+        return button;
+      }),
+    );
   }
 
   fillRadios(id, texts, chosen) {
@@ -524,17 +521,19 @@ class Page {
     });
   }
 
-  paint() {
+  paint(print = false) {
     const camera = this.controls.camera(devicePixelRatio * this.share);
     this.painter.sort(camera, this.coarse);
     this.painter.paint(camera, this.appearance());
-    this.draw();
+    this.draw(print);
   }
 
   // Save what is seen, with its boxes, as a PNG.
-  save() {
+  async save() {
     const image = element("canvas");
     const scene = byId("scene");
+    Object.assign(this, { share: 1, coarse: false });
+    await this.painter.sort(this.controls.camera(devicePixelRatio));
     this.paint();
     Object.assign(image, { width: scene.width, height: scene.height });
     for (const layer of [scene, byId("marks")].filter(({ hidden }) => !hidden)) {
@@ -567,7 +566,7 @@ class Page {
   }
 
   // Boxes over the image, in pixels of the screen.
-  draw() {
+  draw(print) {
     const canvas = byId("marks");
     const { notes } = this.meta;
     canvas.hidden = !(this.shown.length || notes.length) || !byId("boxes").checked; // a cleared one may stay
@@ -577,11 +576,11 @@ class Page {
     const dots = devicePixelRatio;
     const camera = this.controls.camera(dots);
     const { width, height } = camera;
-    if (canvas.width !== width || canvas.height !== height) {
-      Object.assign(canvas, { width, height });
-    }
+    Object.assign(canvas, { width, height }); // which clears it
     const context = canvas.getContext("2d");
-    context.clearRect(0, 0, width, height);
+    if (print) {
+      context.drawImage(byId("scene"), 0, 0, width, height); // what is clear is printed white
+    }
     for (const { text, at } of notes) {
       const seen = project(camera, at);
       if (seen[2] >= this.meta.raster.near) {

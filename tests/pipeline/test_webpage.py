@@ -2,6 +2,7 @@
 hostile scene can do."""
 
 import re
+import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib.resources import files
@@ -572,6 +573,38 @@ def test_page_hides_boxes_with_their_answer(browser: Any, thin: Path) -> None:
             tab.run(f"async () => (await langsplat).page.search({phrase!r})")
             tab.page.wait_for_timeout(100)
             assert marks.is_visible() == visible, phrase
+
+
+# An image in a PDF: its sides on the page.
+PLACED = rb"(?<![\d.])(\d\d+[\d.]*) 0 0 -([\d.]+) [\d.]+ [\d.]+ cm\n(?:.*\n){,3}/X\d+ Do"
+
+
+def test_page_turns_fills_the_screen_saves_and_prints(browser: Any, thin: Path) -> None:
+    with open_tab(browser, thin, color_scheme="dark", viewport={"width": 800, "height": 480}) as tab:
+        tab.run("async () => (await langsplat).page.search('teddy bear')")
+        tab.page.focus("#scene")
+        tab.page.keyboard.press("t")
+        before = tab.run(STATE)
+        tab.page.wait_for_timeout(300)
+        assert tab.run(STATE)["rotation"] != before["rotation"]
+        tab.page.click("#spin")
+        assert tab.page.get_attribute("#spin", "aria-pressed") == "false"
+        ink = "() => getComputedStyle(document.body).color"
+        dark = tab.run(ink)
+        tab.page.click("#theme")
+        assert tab.run(ink) != dark
+        with tab.page.expect_download() as saved:
+            tab.page.click("#picture")
+        image = np.asarray(Image.open(saved.value.path()).convert("RGB"))
+        assert (image.shape, image.std() > 20) == ((480, 800, 3), True)
+        streams = re.findall(rb"stream\r?\n(x.*?)endstream", tab.page.pdf(format="A4"), re.DOTALL)
+        drawn = re.findall(PLACED, b"".join(map(zlib.decompress, streams)))
+        assert len(drawn) == 2  # also below the boxes, whose clear pixels Chromium prints white
+        for across, down in drawn:
+            assert float(across) / float(down) == pytest.approx(800 / 480, rel=0.01)
+        tab.page.click("#full")
+        tab.page.wait_for_function("() => document.fullscreenElement === document.body")
+        assert tab.faults == []
 
 
 def test_unsearchable_scenes_are_shown(browser: Any, tmp_path: Path) -> None:
