@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,9 +26,10 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.lookup import PLANES, PeakPixels, decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.selection import of_rows
 from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.cpu.rasterizer import CpuView
 from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
@@ -353,37 +355,66 @@ def _answer(result: QueryResult, camera: Camera | None) -> dict[str, Any]:
 
 
 class _Pixels:
-    """Pixels of answers in one view, drawn for several together."""
+    """Pixels of answers in one view, found for several together."""
 
     def __init__(self, engine: QueryEngine, view: View, mode: str) -> None:
         self._engine, self._view, self._paper = engine, view, mode == "paper"
         size = max(view.count, view.camera.height * view.camera.width)
-        self._most = max(min(CHANNELS_AT_ONCE // 2, 2**25 // size), 1)  # more fall out of the caches
-        self._waiting: list[tuple[dict[str, Any], Array]] = []
+        self._most = max(min(CHANNELS_AT_ONCE, 2**25 // size), 1)  # 128 MB of numbers, twice
+        self._even: list[tuple[dict[str, Any], Array]] = []  # with relevancies of `engine.alike`
+        self._others: list[tuple[dict[str, Any], Array]] = []  # with those of all Gaussians
 
     def add(self, result: QueryResult, answer: dict[str, Any]) -> None:
         """Take an answer, whose pixel fields are filled sooner or later."""
         if self._paper:
             phrase, gate = self._engine.text_vectors([result.phrase]), PictureConfig().alpha_gate
             image = decoded_relevancy(self._view, self._engine.field, result.level, phrase, gate)
-            _fill(answer, image[..., 0])
-            return
-        self._waiting.append((answer, result.even))
-        if len(self._waiting) == self._most:
-            self.fill()
+            _fill(answer, peak_pixel(image[..., 0], PAPER_FILTER))
+        elif result.spread is not None:
+            self._even.append((answer, result.spread.at(self._engine.alike[1])))
+            if len(self._even) == self._most:
+                self._find(self._even, self._engine.alike[0], self._peaks)
+        else:
+            self._others.append((answer, result.even))
+            if len(self._others) == self._most:
+                self._find(self._others)
+
+    @cached_property
+    def _peaks(self) -> PeakPixels | None:
+        """Of many answers; None where the sets' shares take too much memory."""
+        assert isinstance(self._view, CpuView)
+        painted, gate = self._view.paint_sets(self._engine.alike[0], PLANES), PictureConfig().alpha_gate
+        if painted is None:
+            return None
+        return PeakPixels(self._view.camera, painted, gate, PAPER_FILTER, self._most)
 
     def fill(self) -> None:
         """Fill the pixel fields of all that was added."""
-        if self._waiting:
-            answers, values = zip(*self._waiting, strict=True)
-            images = splatted_relevancy(self._view, np.stack(values, 1), PictureConfig().alpha_gate)
-            for answer, image in zip(answers, np.moveaxis(images, -1, 0), strict=True):
-                _fill(answer, image)
-            self._waiting.clear()
+        if self._even:
+            self._find(self._even, self._engine.alike[0], vars(self).get("_peaks"))
+        if self._others:
+            self._find(self._others)
+
+    def _find(
+        self,
+        waiting: list[tuple[dict[str, Any], Array]],
+        sets: Array | slice = slice(None),
+        peaks: PeakPixels | None = None,
+    ) -> None:
+        answers, values = zip(*waiting, strict=True)
+        if peaks is None:
+            columns = np.stack(values, 1)[sets]
+            images = splatted_relevancy(self._view, columns, PictureConfig().alpha_gate)
+            found = [peak_pixel(image, PAPER_FILTER) for image in np.moveaxis(images, -1, 0)]
+        else:
+            found = peaks.of(np.stack(values))
+        for answer, peak in zip(answers, found, strict=True):
+            _fill(answer, peak)
+        waiting.clear()
 
 
-def _fill(answer: dict[str, Any], relevancy: Array) -> None:
-    column, row, score = peak_pixel(relevancy, PAPER_FILTER)
+def _fill(answer: dict[str, Any], peak: tuple[int, int, float]) -> None:
+    column, row, score = peak
     answer |= {"pixel": [column, row], "pixel_score": score}
 
 

@@ -61,6 +61,12 @@ class QueryResult(Judged):
         return f"<{self.phrase!r}: {self.said}, as {LEVELS[self.level]}, near {self.place}>"
 
     @property
+    def spread(self) -> "Spread | None":
+        """The even relevancy as that of whole regions, where it is and was not yet read."""
+        even = vars(self)["even"]
+        return even if isinstance(even, Spread) else None
+
+    @property
     def cut(self) -> float:
         """The least relevancy of a member, of its region where it has one; the peak where there is none."""
         if self.own_cut is not None:
@@ -216,6 +222,26 @@ def build_regions(tree: Tree, weights: Array) -> Regions:
     return Regions(tuple(nodes), np.stack(everywhere), weights, tuple(sizes), tuple(totals), table)
 
 
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Relevancy at a level, the same all over a region: of all N Gaussians when called, or of some."""
+
+    regions: Regions
+    level: int
+    values: Array  # (R,) float32 of the level's regions
+    own: Relevancy  # of what is in none of them
+
+    def __call__(self) -> Array:
+        """(N,) float32."""
+        return self.regions.spread(self.level, self.values, self.own.of_level(self.level))
+
+    def at(self, rows: Array) -> Array:
+        """Return the (K,) float32 of some Gaussians."""
+        of, spread = self.regions.everywhere[self.level, rows], self.own.of_level(self.level, rows)
+        spread[of >= 0] = self.values[of[of >= 0]]
+        return spread
+
+
 def place_of(points: Array) -> tuple[Array, Array]:
     """Return place (3,), at what is nearest to the middle, and box (2, 3) of (K, 3) points, K >= 1."""
     points = points.astype(np.float64)
@@ -259,7 +285,7 @@ def by_regions(
         level=chosen,
         scores=decision.scores,
         relevancy=relevancy,
-        even=lambda: regions.spread(chosen, decision.relevancies, relevancy.of_level(chosen)),
+        even=Spread(regions, chosen, decision.relevancies, relevancy),
         peak=decision.scores[chosen],
         fits=decision.fits,
         judgement=decision.verdict,

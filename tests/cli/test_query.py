@@ -15,6 +15,7 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.io.sidecar import read_words
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster.cpu.rasterizer import CpuView
 from langsplat_core.raster.protocol import CHANNELS_AT_ONCE
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import OPEN_MODEL
@@ -104,6 +105,23 @@ def test_commas_separate_phrases_and_exclusions_stay_one(folder, capsys):
     found = answers(capsys, "query", "a.ply", "mug, plant; mug or book, not book")
     assert [answer["phrase"] for answer in found] == ["mug", "plant", "mug or book, not book"]
     assert found[2]["reading"] == "(mug  or  book)  without  book"
+
+
+def test_plain_phrases_share_one_view(folder, capsys, monkeypatch):
+    drawn: list[str] = []
+    for name in ("splat", "paint_sets"):
+        method = getattr(CpuView, name)
+        monkeypatch.setattr(
+            CpuView, name, lambda *args, name=name, method=method: drawn.append(name) or method(*args)
+        )
+    names = ("mug", "book", "plant")
+    alone = answers(capsys, "query", "a.ply", *names)
+    monkeypatch.setattr(query, "CHANNELS_AT_ONCE", 2)
+    together = answers(capsys, "query", "a.ply", *names)
+    assert [answer["pixel"] for answer in together] == [answer["pixel"] for answer in alone]
+    assert drawn == ["splat", "paint_sets"]
+    answers(capsys, "query", "a.ply", "mug or book")
+    assert drawn == ["splat", "paint_sets", "splat"]
 
 
 def test_phrases_asked_together_answer_as_alone(folder, capsys):

@@ -21,6 +21,7 @@ from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import (
     Lookup,
+    PeakPixels,
     decoded_relevancy,
     peak_pixel,
     sphere_cells,
@@ -29,7 +30,7 @@ from langsplat_core.query.lookup import (
 )
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.raster.render import render
+from langsplat_core.raster.render import render, view_of
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     AutoencoderCodec,
@@ -155,6 +156,27 @@ def test_peak_pixel_equals_the_plain_filter(shape, window):
         assert got[2] == pytest.approx(want[2], abs=1e-9)
 
 
+@pytest.mark.parametrize("size", [(97, 61), (64, 48)])
+def test_peaks_by_shares_equal_those_of_images(size):
+    """Of values all over, a few high ones, one alone, ties, and none."""
+    rng = np.random.default_rng(4)
+    scene, camera = Scene(random_gaussians(400)), random_camera(3, *size)
+    view = view_of(scene, camera)
+    sets = rng.integers(0, 40, len(scene.gaussians)).astype(np.int32)
+    values = rng.random((25, 40)).astype(np.float32)
+    values[5:10] *= values[5:10] > 0.9
+    values[10:15] = np.eye(40)[rng.integers(0, 40, 5)]
+    values[15:20] = values[15:20].round()
+    values[20:] = np.array([0, 1, 0.5, 0, 1])[:, None]
+    painted = view.paint_sets(sets, 10**6)
+    found = PeakPixels(camera, painted, 0.3, 9, len(values)).of(values)
+    for own, (column, row, score) in zip(values, found, strict=True):
+        wanted = plain_peak(splatted_relevancy(view, own[sets][:, None], 0.3)[..., 0], 9)
+        assert score == pytest.approx(wanted[2], abs=1e-5)
+        assert (column, row) == wanted[:2]
+    assert view.paint_sets(sets, len(painted[0]) - 1) is None
+
+
 def test_many_answers_take_no_memory_per_gaussian():
     field = random_field(30_000, "codebook")
     vectors = unit(np.random.default_rng(8).normal(size=(60, field.codec.vector_dim))).astype(np.float32)
@@ -168,6 +190,8 @@ def test_many_answers_take_no_memory_per_gaussian():
     tracemalloc.stop()
     assert engine.rule == "regions"
     assert taken < 60 * 30_000
+    at = np.arange(0, 30_000, 7)
+    np.testing.assert_array_equal(many[7].spread.at(at), many[7].even[at])
     assert many[7].members.shape == (30_000,)
 
 
