@@ -65,7 +65,6 @@ log = logging.getLogger("langsplat")
 INDEX = ".langsplat-library"  # its name in the folder
 SCENES = "scenes 2"  # key of the metadata; "scenes" has bars of fits that common fits are in
 THUMBNAIL = (96, 72)  # width and height, pixels, of the picture that the index keeps of a scene
-REMADE = "remove it, and it is made again"
 PICTURE = (320, 240)  # and of the picture of an answer
 Whole = Annotated[int, msgspec.Meta(ge=0, lt=2**62)]
 
@@ -398,6 +397,12 @@ def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> 
             raise ValueError(f"{name} of another length than the scenes have")
         if not np.isfinite(values).all():
             raise ValueError(f"{name} that are not finite")
+    codewords, mixtures, regions = np.diff(group.starts, axis=0).T
+    inside = [(columns.words, codewords, mixtures), (columns.regions, regions, mixtures)]
+    inside += [(columns.parents, regions, regions)]
+    for values, most, count in inside:
+        if (values >= np.repeat(most, count)).any():
+            raise ValueError("numbers of what is not there")
     return group, shown
 
 
@@ -407,20 +412,16 @@ def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> 
 def fits_in(group: EncoderGroup, vector: Array) -> tuple[Array, Array]:
     """Return the (S, 3) float64 fits of a phrase's (D,) unit vector in every scene, and (S,) `common_fits`.
 
-    Fits are as in `QueryResult.fits`, -inf in scenes that are not indexed. Raises FormatError for an index
-    whose numbers do not fit each other.
+    Fits are as in `QueryResult.fits`, -inf in scenes that are not indexed. Raises FormatError for a vector of
+    another length than the index has.
     """
-    arrays, phrase = group.columns, np.require(vector, np.float32, "C")
-    means, sound = np.zeros(len(arrays.parents)), np.ones(len(group.scenes), bool)
+    columns, phrase = group.columns, np.require(vector, np.float32, "C")
+    means = np.zeros(len(columns.parents))
     try:
-        if group.starts[-1].tolist() != [len(arrays.steps), len(arrays.shares), len(means)]:
-            raise ValueError("arrays of other lengths than its scenes have")
-        shared_workers().run(_region_means, len(sound), phrase, arrays, group.starts, means, sound)
-    except ValueError as error:  # arrays of other sizes than a phrase, or each other
-        raise FormatError(f"the index of scenes does not fit ({error}); {REMADE}") from None
-    if not sound.all():
-        raise FormatError(f"the index of scenes is damaged; {REMADE}")
-    fits = region_fits(group.table, fit_of(means))
+        shared_workers().run(_region_means, len(group.scenes), phrase, columns, group.starts, means)
+    except ValueError as error:
+        raise FormatError(f"the index of scenes does not fit ({error}); search again") from None
+    fits = region_fits(group.table, fit_of(np.nan_to_num(means)))
     best = fit_of(best_relevancies(group.table, region_relevancies(fits)))
     indexed = np.array([scene.is_indexed for scene in group.scenes], bool)
     return np.where(indexed[:, None], best, -np.inf), common_fits(group.table, fits)
@@ -437,28 +438,21 @@ def _dot(row: Array, vector: Array) -> np.float32:
 @partial(
     kernel,
     shapes="vector D, columns.codewords K D, columns.steps K, columns.zeros K, columns.rates K, "
-    "columns.shares M, columns.words M, columns.regions M, columns.parents R, means R, sound S",
+    "columns.shares M, columns.words M, columns.regions M, columns.parents R, means R",
 )
 def _region_means(
-    first: int, last: int, vector: Array, columns: Columns, starts: Array, means: Array, sound: Array
+    first: int, last: int, vector: Array, columns: Columns, starts: Array, means: Array
 ) -> None:
-    """Add mean relevancies to `means` (R,); `sound` (S,) is False for scenes with numbers out of place."""
+    """Add mean relevancies to `means` (R,)."""
     for scene in range(first, last):
         k, m, r = starts[scene]
-        last_k, last_m, last_r = starts[scene + 1]
+        last_k, last_m, _ = starts[scene + 1]
         relevancy = np.empty(last_k - k, np.float64)
         for i in range(k, last_k):
             cosine = _dot(columns.codewords[i], vector) * columns.steps[i]
             relevancy[i - k] = 1 / (1 + np.exp(-columns.rates[i] * (cosine - columns.zeros[i])))
         for i in range(m, last_m):
-            region, word = columns.regions[i], columns.words[i]
-            if region >= last_r - r or word >= last_k - k:
-                sound[scene] = False
-                break
-            means[r + region] += columns.shares[i] * relevancy[word]
-        for i in range(r, last_r):
-            if np.isnan(means[i]) or columns.parents[i] >= last_r - r:
-                sound[scene] = False
+            means[r + columns.regions[i]] += columns.shares[i] * relevancy[columns.words[i]]
 
 
 # A phrase in all scenes of a library.
