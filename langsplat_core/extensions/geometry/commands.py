@@ -23,7 +23,7 @@ from langsplat_core.extensions.geometry.occupancy import (
     map_axes,
     reachable,
 )
-from langsplat_core.extensions.geometry.registration import TRUSTED, Registration, merge, register
+from langsplat_core.extensions.geometry.registration import NEAR, TRUSTED, Registration, merge, once, register
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
@@ -135,7 +135,8 @@ class Register:
 class Merge:
     """Write two scenes as one: Gaussians, cameras, language field, tree and taught words of both.
 
-    The second is first laid onto the first, as `langsplat register` finds it, or as told.
+    The second is first laid onto the first, as `langsplat register` finds it, or as told. What both show as a
+    whole, on much the same surface, is kept once: as the scene has it that shows it in more photographs.
     """
 
     first: tyro.conf.Positional[Path]
@@ -150,6 +151,8 @@ class Merge:
     """Both are in the same axes already: nothing is moved."""
     scaled: bool = False
     """As of `langsplat register`."""
+    keep_both: bool = False
+    """Keep what both show twice."""
 
     @optional_imports()
     def run(self) -> None:
@@ -166,6 +169,9 @@ class Merge:
             second = replace(transform_scene(second, similarity(found.transform)), origin=first.origin)
             said = f"registered, {100 * found.agreement:.0f} % of the surfaces agree"
         scene = merge(first, second)
+        if not self.keep_both:
+            scene, things = once(scene, len(first.gaussians), NEAR * first.bounds()[1])
+            said += f"; {things} things that both show are kept once (--keep-both: twice)" if things else ""
         save_scene(self.out, replace(scene, path=self.out))
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {len(scene.cameras)} cameras; {said}")
 

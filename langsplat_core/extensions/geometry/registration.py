@@ -6,16 +6,19 @@ Features of surface points are matched by RANSAC and refined by ICP (Open3D); re
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_matrix, diags
+from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.geometry.planes import cloud, sample_surface
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
-from langsplat_core.scene import Camera, LanguageField, Scene, Tree
+from langsplat_core.scene import LEVELS, Camera, LanguageField, Scene, Tree
 from langsplat_core.scene.codec import LARGEST, CodebookCodec, Codec, principal_colours
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.language import NO_NODE
+from langsplat_core.scene.surface import surface_areas
 from langsplat_core.scene.transform import place_scene, rotating, similarity
 
 SAMPLES = 40_000  # points of each surface
@@ -27,6 +30,8 @@ VIEWS, SIDE = 8, 120  # cameras of either scene that check it, and pixels of the
 ALIKE = 0.05  # of the depth: surfaces that are no farther apart are the same
 TRUSTED = 0.7  # of the pixels that both scenes fill, from which two scenes are one place
 OVERLAP = 0.2  # of an image that both scenes fill, below which a camera says nothing
+NEAR = 0.02  # of the first scene's radius: surfaces no farther apart may be of one thing
+SAME = 0.3, 0.5  # of the surface of one of two things, and of the other, that are one if it is near
 
 STAGE = "registering"
 
@@ -184,6 +189,45 @@ def merge(first: Scene, second: Scene) -> Scene:
         unread=first.unread + second.unread,
         origin=first.origin,
     )
+
+
+def once(both: Scene, count: int, near: float) -> tuple[Scene, int]:
+    """Return a merged scene with the things that both scenes show kept once, and how many there are.
+
+    count: Gaussians of the first scene, which come first. Two wholes are one thing if the surface of each has
+    the other's at most `near` units away, on `SAME` of it. The one that more photographs show stays, else the
+    one of more Gaussians; of the other stays what is farther than `near` from it, as a part of it.
+    """
+    tree = None if both.language is None else both.language.tree
+    if both.language is None or tree is None:
+        return both, 0
+    nodes, means, areas = tree.at(len(LEVELS) - 1), both.gaussians.means, surface_areas(both.gaussians)
+    solid = (nodes != NO_NODE) & (areas > 0)
+    sides = [np.flatnonzero(solid[:count]), count + np.flatnonzero(solid[count:])]
+    shared = []  # by nodes of the first and the second scene: how much of one has the other near
+    for mine, theirs in (sides, sides[::-1]):
+        gaps, nearest = cKDTree(means[theirs]).query(means[mine], distance_upper_bound=near, workers=-1)
+        there = np.isfinite(gaps)
+        pairs = nodes[mine[there]], nodes[theirs[nearest[there]]]
+        sums = csr_matrix((areas[mine[there]], pairs), (tree.count, tree.count))
+        whole = np.bincount(nodes[mine], areas[mine], tree.count)
+        shared.append(diags(1 / np.maximum(whole, 1e-300)) @ sums)
+    least, most = shared[0].minimum(shared[1].T).tocoo(), shared[0].maximum(shared[1].T).tocsr()
+    leaves, keep, paired = tree.leaves.copy(), np.ones(len(nodes), bool), set[int]()
+    seen, things = tree.votes.sum(1), 0
+    for row in np.argsort(-least.data):
+        pair = int(least.row[row]), int(least.col[row])
+        if least.data[row] < SAME[0] or most[pair] < SAME[1] or paired & {*pair}:
+            continue
+        paired |= {*pair}
+        members = [np.flatnonzero(nodes == node) for node in pair]
+        better = max((0, 1), key=lambda i: (seen[pair[i]], len(members[i])))
+        kept, other = members[better], members[1 - better]
+        gaps, nearest = cKDTree(means[kept]).query(means[other], workers=-1)
+        keep[other], leaves[other] = gaps > near, tree.leaves[kept[nearest]]
+        things += bool(tree.votes[pair[better], 0])
+    language = replace(both.language, tree=replace(tree, leaves=leaves))
+    return replace(both, language=language).take(keep), things
 
 
 def _language(first: Scene, second: Scene) -> LanguageField | None:

@@ -29,7 +29,7 @@ from langsplat_core.extensions.geometry.occupancy import (
     trace,
 )
 from langsplat_core.extensions.geometry.planes import FEWEST, Room, find_room
-from langsplat_core.extensions.geometry.registration import agreement, merge, quarter_turns, register
+from langsplat_core.extensions.geometry.registration import agreement, merge, once, quarter_turns, register
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -45,7 +45,7 @@ from langsplat_core.scene.transform import (
     transform_scene,
     turning,
 )
-from tests.support.fakes import FakeEncoder, blob_scene, named_scene
+from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, named_scene
 from tests.support.file_kinds import FileKind, drawable_share, few_and_many, in_json
 from tests.support.file_samples import random_field
 from tests.support.processes import refusal, run
@@ -259,6 +259,39 @@ def test_a_scene_without_a_field_gets_no_meaning():
     assert found.members.any()
     assert not found.members[len(named.gaussians) :].any()
     assert merge(plain, plain).language is None
+
+
+def test_merge_keeps_what_both_scenes_show_once(tmp_path, capsys):
+    """The second's mug, seen more often, and book lie on the first's; its plant lies elsewhere."""
+    made, tree = named_scene(), tree_of_wholes(np.arange(3 * PER_BLOB) // PER_BLOB)
+    first = replace(made, language=replace(made.language, tree=tree))
+    means, votes = made.gaussians.means.copy(), tree.votes + np.array([[2], [0], [0]], np.uint16)
+    means[2 * PER_BLOB :] += (0, 0, 2)
+    language = replace(made.language, tree=replace(tree, votes=votes))
+    second = replace(made, gaussians=replace(made.gaussians, means=means), language=language)
+    second = second.take(np.arange(0, 3 * PER_BLOB, 2))
+    both, things = once(merge(first, second), len(first.gaussians), 0.1)
+    assert things == 2
+    owners = both.language.tree.at(2)
+    sizes = np.bincount(owners, minlength=6).tolist()
+    assert sizes[:3] == [
+        0,
+        PER_BLOB,
+        PER_BLOB,
+    ]  # the first's mug is gone, and what lay beside the other is its
+    assert PER_BLOB / 2 <= sizes[3] < PER_BLOB
+    assert sizes[4:] == [0, PER_BLOB / 2]
+    for word, count in (("mug", 1), ("book", 1), ("plant", 2)):
+        engine = QueryEngine(both, lambda _: FakeEncoder())
+        assert len(engine.instances(engine.run(word))) == count
+    nothing = Scene(random_gaussians(0))
+    assert once(merge(first, nothing), len(first.gaussians), 0.1)[1] == 0
+    for name, scene in (("a", first), ("b", second)):
+        save_scene(tmp_path / f"{name}.ply", scene)
+    words = "merge", tmp_path / "a.ply", tmp_path / "b.ply", "--as-is", "--out", tmp_path / "both.ply"
+    assert run(*words) == run(*words, "--keep-both") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert ["2 things that both show are kept once" in line for line in said] == [True, False]
 
 
 def test_merge_refuses_scenes_of_two_encoders():
