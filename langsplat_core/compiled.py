@@ -115,7 +115,7 @@ def _say_once(reason: str) -> None:
 @cache
 def digest_of_sources(source: Path) -> str:
     """Digest of a file and all files of this package that it imports, directly or not."""
-    found, waiting = set(), [source]
+    found, waiting = set(), [source.resolve()]  # however it is reached
     while waiting:
         path = waiting.pop()
         if path not in found:

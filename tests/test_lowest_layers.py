@@ -205,6 +205,13 @@ def test_kernels_run_on_a_full_disk(tmp_path, monkeypatch, caplog):
     assert is_compiled(compiled.kernel(doubled))
 
 
+def test_kernels_are_the_same_through_a_link(tmp_path):
+    """As those of an editable installation and of the source folder."""
+    source, link = Path(compiled.__file__).parent / "raster" / "cpu", tmp_path / "link"
+    link.symlink_to(source)
+    assert compiled.digest_of_sources(link / "tiles.py") == compiled.digest_of_sources(source / "tiles.py")
+
+
 def test_kernels_of_other_signatures_are_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that processes that begin at once cannot take one for the other."""
 

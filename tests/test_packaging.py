@@ -226,6 +226,20 @@ def test_plain_install_holds_no_optional_package(light: Path) -> None:
     look = "import importlib.util as i, sys; print(*[n for n in sys.argv[1:] if i.find_spec(n)])"
     found = run(light, "python", "-c", look, "numpy", "langsplat_assets", *EXTRAS)
     assert found.stdout.split() == ["numpy", "langsplat_assets"]
+    (packages,) = light.parent.glob("lib/python*/site-packages")
+    assert sorted(path.parent.name for path in packages.glob("lang*/py.typed")) == [
+        "langsplat_core",
+        "langsplat_viewer",
+    ]
+
+
+def test_types_are_found_from_outside_in_an_editable_install(tmp_path: Path) -> None:
+    pytest.importorskip("mypy")
+    script = "import langsplat_viewer\nfrom langsplat_core.query.engine import QueryEngine\n"
+    (tmp_path / "script.py").write_text(script)
+    mypy = [sys.executable, "-m", "mypy", "--strict", "--follow-imports", "skip", "script.py"]
+    done = subprocess.run(mypy, capture_output=True, text=True, check=False, cwd=tmp_path, env=CLEAN)
+    assert "Success" in done.stdout, done.stdout
 
 
 @pytest.mark.long
