@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist
 export PIP_QUIET := 1
 .SILENT: $(STAMP) demo
 
-.PHONY: help demo quick test slow check sizes format elsewhere faults parity bench report gpu pictures app light bundle desktop clean
+.PHONY: help demo quick test slow check sizes format elsewhere faults parity bench report gpu pictures site app light bundle desktop clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -118,6 +118,21 @@ pictures: browser  ## make the README's pictures again (on a display, or on Xvfb
 	if [ -n "$$DISPLAY" ]; then $(BIN)/python packaging/pictures.py; \
 	else xvfb-run -a -s "-screen 0 1280x800x24" $(BIN)/python packaging/pictures.py; fi
 
+# Links to files that are no pages lose their address: there is none to give them.
+SITE_AT := build/site
+SITE_VENV := .venv-site
+PUBLIC = $$($(BIN)/python -c "import langsplat_core; print(*langsplat_core.__all__)")
+site: system  ## the pages of docs as a site, build/site/html, with the live page and the public names of Python
+	[ -d $(SITE_VENV) ] || $(PYTHON) -m venv $(SITE_VENV)
+	$(SITE_VENV)/bin/pip install --quiet --constraint packaging/constraints.txt mkdocs-material 'mkdocstrings[python]'
+	rm -rf $(SITE_AT) && mkdir -p $(SITE_AT) && cp -r docs $(SITE_AT)/docs
+	cp packaging/site/*.md $(SITE_AT)/docs && mv $(SITE_AT)/docs/README.md $(SITE_AT)/docs/pages.md
+	sed 's|](docs/|](|g' README.md > $(SITE_AT)/docs/index.md
+	sed -i -E 's#\[([^]]+)\]\((\.\./[^)]*|examples[^)]*|benchmarks|pictures|CONTRIBUTING\.md)\)#\1#g' $(SITE_AT)/docs/*.md
+	for name in $(PUBLIC); do printf '::: langsplat_core.%s\n\n' $$name >> $(SITE_AT)/docs/api.md; done
+	$(BIN)/langsplat export --quiet assets/demo/scene.ply $(SITE_AT)/docs/room.html --title "A toy table"
+	$(SITE_VENV)/bin/mkdocs build --quiet --config-file packaging/site/mkdocs.yml
+
 app: system  ## open the viewer
 	$(BIN)/langsplat-viewer
 
@@ -142,4 +157,4 @@ desktop: $(STAMP)  ## show the viewer among this user's programs, and open scene
 	-update-desktop-database $(DATA)/applications
 
 clean:  ## remove what these targets made
-	rm -rf $(VENV) $(LIGHT) $(GPU) $(NEWER) $(PARITY) demo_out elsewhere_out bench_out dist .pytest_cache .mypy_cache .ruff_cache $(NPM)
+	rm -rf $(VENV) $(LIGHT) $(GPU) $(NEWER) $(PARITY) $(SITE_VENV) build demo_out elsewhere_out bench_out dist .pytest_cache .mypy_cache .ruff_cache $(NPM)

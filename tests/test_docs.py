@@ -109,6 +109,13 @@ def run(start: list[str], more: tuple[str, ...] = ()) -> None:
 
 
 @pytest.mark.long
+def test_site_has_every_page() -> None:
+    nav = (ROOT / "packaging" / "site" / "mkdocs.yml").read_text().split("\nnav:\n")[1]
+    listed = set(re.findall(r"[\w/]+\.md", nav))
+    own = {path.name for path in (ROOT / "packaging" / "site").glob("*.md")}
+    assert listed - own - {"index.md", "pages.md"} == {p.name for p in ROOT.glob("docs/*.md")} - {"README.md"}
+
+
 def test_readme_query_runs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(["langsplat", "query"])
     answers = json.loads(capsys.readouterr().out)
