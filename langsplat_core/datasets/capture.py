@@ -7,6 +7,7 @@ cameras look.
 import hashlib
 import logging
 import math
+import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -17,10 +18,22 @@ from scipy.spatial.distance import pdist
 
 from langsplat_core.arrays import Array, check_array, near_power
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets.photos import WORKERS, Developed, Photo, View, counted, developer, place
+from langsplat_core.datasets.photos import (
+    SOLID,
+    WORKERS,
+    Layers,
+    Photo,
+    View,
+    counted,
+    developer,
+    place,
+    stray_masks,
+    unique_names,
+)
 from langsplat_core.datasets.workspace import Matches
-from langsplat_core.errors import InputError, report_loss
+from langsplat_core.errors import InputError, report_loss, shortened
 from langsplat_core.io.hostile import PictureError
+from langsplat_core.progress import Progress
 from langsplat_core.scene import NO_ORIGIN, Camera, moved_pose, origin_of
 
 DECIMALS = 9  # of the cameras' extent: what a digest tells apart, far above rounding and far below a pixel
@@ -150,11 +163,6 @@ def centred(capture: Capture) -> Capture:
     )
 
 
-def capture_of(views: Developed, points: Array, colours: Array) -> Capture:
-    """Return the capture of developed photographs, with (M, 3) points and (M, 3) uint8 colours."""
-    return Capture(points=points, colours=colours, **vars(views))
-
-
 def shrunk_view(camera: Camera, image: Array, mask: Array | None, size: tuple[int, int]) -> View:
     """Return a view at a smaller (width, height), shrunk as photographs are when they are read.
 
@@ -179,6 +187,111 @@ def report_lost_points(good: Array, source: str) -> None:
     if lost := len(good) - good.sum():
         share = f"{lost} of {len(good)} points of {source}"
         report_loss("%s are damaged or badly located: left out; was it written whole?", share)
+
+
+# Photographs developed into a capture.
+
+
+def _is_cut_out(alpha: Array | None) -> bool:
+    """Return True where most of a photograph, or of its edge, is transparent."""
+    if alpha is None:
+        return False
+    empty = alpha < SOLID
+    edge = np.concatenate([empty[0], empty[-1], empty[:, 0], empty[:, -1]])
+    return bool(empty.mean() > 0.5 or edge.mean() > 0.5)
+
+
+IN_MEMORY = 512_000_000  # bytes of images that are held there; further ones lie in files
+
+
+def in_file(image: Array) -> Array:
+    """Return the same image in a file without a name in `TMPDIR`, which ends with the process."""
+    try:
+        with tempfile.TemporaryFile(prefix="langsplat-") as file:
+            # Written, not mapped and filled: on a full disk that would kill the process without a word.
+            file.write(np.ascontiguousarray(image).data)
+            file.flush()
+            return np.memmap(file, np.uint8, "c", shape=image.shape)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
+
+
+def develop(
+    photos: Sequence[Photo], config: DatasetConfig, progress: Progress, points: Array, colours: Array
+) -> Capture:
+    """Return the capture of `photos` by `config`, with (M, 3) points and (M, 3) uint8 colours, by name.
+
+    Unreadable photographs are reported; InputError without any other.
+    """
+    if not photos:
+        raise InputError("the dataset lists no photographs")
+    names = unique_names([photo.label for photo in photos])
+    order = sorted(range(len(photos)), key=names.__getitem__)
+    told: list[tuple[str, str]] = []  # what was guessed, and of which photograph
+
+    developed = developer(config.max_side)
+
+    def view(index: int) -> Layers | str:
+        photo = photos[index]
+        try:
+            camera, image, mask, alpha = developed(photo, lambda what: told.append((what, photo.label)))
+        except PictureError as error:
+            return f"{photo.label} ({error.reason})"
+        if (shown := counted(mask, alpha, True)) is not None and not shown.any():
+            return f"{photo.label} (its mask leaves nothing of it)"
+        return replace(camera, name=names[index]), image, mask, alpha
+
+    room = IN_MEMORY
+    done: list[tuple[Camera, Array, Photo, Array | None, Array | None]] = []
+    broken: list[str] = []
+    with ThreadPoolExecutor(WORKERS) as pool:
+        for count, (index, found) in enumerate(zip(order, pool.map(view, order), strict=True), 1):
+            if isinstance(found, str):
+                broken.append(found)
+            else:
+                camera, image, mask, alpha = found
+                room -= image.nbytes
+                kept = image if room >= 0 else in_file(image)
+                done.append((camera, kept, photos[index], mask, alpha))
+            progress("reading photographs", count / len(order))
+    if not done:
+        raise InputError(f"no photograph can be read: {shortened(broken)}")
+    if broken:
+        report_loss("%d photographs cannot be used and are left out: %s", len(broken), shortened(broken))
+    cameras, images, files, masks, alphas = zip(*done, strict=True)
+    _report(told, masks)
+    if stray := stray_masks(photos):
+        remedy = "a mask is called masks/NAME.jpg.png or masks/NAME.png after its photograph"
+        report_loss("%d masks are of no photograph: %s; %s", len(stray), shortened(stray), remedy)
+    cut_out = _cut_out(masks, alphas, config)
+    masks = tuple(counted(mask, alpha, cut_out) for mask, alpha in zip(masks, alphas, strict=True))
+    masks = masks if any(mask is not None for mask in masks) else ()
+    return Capture(cameras, images, points, colours, photos=files, masks=masks, cut_out=cut_out)
+
+
+def _report(told: Sequence[tuple[str, str]], masks: Sequence[Array | None]) -> None:
+    """Say what was guessed, of which photographs, and where masks are missing."""
+    for what in dict(told):
+        labels = [label for said, label in told if said == what]
+        report_loss("%d photographs: %s (%s)", len(labels), what, shortened(labels))
+    if 0 < (masked := sum(mask is not None for mask in masks)) < len(masks):
+        report_loss("%d of %d photographs have a mask; of the others all pixels count", masked, len(masks))
+
+
+def _cut_out(masks: Sequence[Array | None], alphas: Sequence[Array | None], config: DatasetConfig) -> bool:
+    """Return True where what is transparent is an empty background, and say how transparency is taken."""
+    seen = sum(alpha is not None for alpha in alphas)
+    if not seen:
+        return False
+    cut_out = config.alpha == "background" or (
+        config.alpha == "auto" and 2 * sum(map(_is_cut_out, alphas)) > len(alphas)
+    )
+    cut_out = cut_out and all(mask is None for mask in masks)  # which say what does not count
+    said = "an empty background" if cut_out else "no part of the thing, and does not count"
+    say = report_loss if config.alpha == "auto" else log.info
+    message = "what is transparent in %d of %d photographs is %s; else: --alpha %s"
+    say(message, seen, len(alphas), said, "mask" if cut_out else "background")
+    return cut_out
 
 
 # Views that are held out from training, to measure it on.

@@ -19,9 +19,9 @@ import numpy as np
 
 from langsplat_core.arrays import Array, rotation_matrices
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets.capture import Capture, capture_of, report_lost_points
+from langsplat_core.datasets.capture import Capture, develop, report_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
-from langsplat_core.datasets.photos import Photo, develop, find_photos, finder, mask_beside
+from langsplat_core.datasets.photos import Photo, find_photos, finder, mask_beside
 from langsplat_core.errors import (
     FormatError,
     InputError,
@@ -351,7 +351,7 @@ def load_colmap(folder: Path, model_folder: Path, config: DatasetConfig, progres
         report_loss(
             "%s has %s, and another model may have more: without %s", shown(model_folder), share, lost
         )
-    return capture_of(develop(there, config, progress), *good_points(model, "the COLMAP model"))
+    return develop(there, config, progress, *good_points(model, "the COLMAP model"))
 
 
 def located_photos(model: SparseModel, folder: Path) -> list[Photo]:

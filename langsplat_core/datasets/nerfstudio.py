@@ -18,9 +18,9 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets.capture import Capture, capture_of, report_lost_points
+from langsplat_core.datasets.capture import Capture, develop, report_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
-from langsplat_core.datasets.photos import Photo, develop, find_photos, finder, mask_beside
+from langsplat_core.datasets.photos import Photo, find_photos, finder, mask_beside
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted, report_loss, shortened
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file
 from langsplat_core.io.ply import read_cloud
@@ -53,7 +53,7 @@ def load_nerfstudio(file: Path, config: DatasetConfig, progress: Progress) -> Ca
     except ValueError as error:
         raise FormatError(f"{file}: {error}") from None
     points, colours = _points(file, top.get("ply_file_path"))
-    capture = capture_of(develop(list(photos.values()), config, progress), points, colours)
+    capture = develop(list(photos.values()), config, progress, points, colours)
     # ours, of `python -m assets.making dataset`
     return replace(capture, metres_per_unit=metres, drawn=top.get("drawn") is True)
 

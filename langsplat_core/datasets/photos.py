@@ -3,9 +3,7 @@
 import logging
 import math
 import os
-import tempfile
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path, PurePosixPath
@@ -19,9 +17,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.colour import as_srgb, coded_as
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics, pinhole_for, resample, source_positions
-from langsplat_core.errors import InputError, Tell, report_loss, shortened
+from langsplat_core.errors import InputError, Tell
 from langsplat_core.io import hostile
-from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
 ASPECT_TOLERANCE = 0.02  # shrunk copies round their sizes
@@ -116,7 +113,7 @@ def mask_beside(photo: Path) -> Path | None:
     return next((path for path in candidates if path != photo and os.path.isfile(path)), None)
 
 
-def _stray_masks(photos: Sequence[Photo]) -> list[str]:
+def stray_masks(photos: Sequence[Photo]) -> list[str]:
     """Return the names of images in folders "masks" that are of no photograph."""
     folders = {photo.path.parent for photo in photos}
     beside = {folder / "masks" for folder in folders}
@@ -337,111 +334,3 @@ def developer(max_side: int) -> Callable[..., Layers]:
         return camera, shown(over_black(image)), mask, alpha
 
     return developed
-
-
-def _is_cut_out(alpha: Array | None) -> bool:
-    """Return True where most of a photograph, or of its edge, is transparent."""
-    if alpha is None:
-        return False
-    empty = alpha < SOLID
-    edge = np.concatenate([empty[0], empty[-1], empty[:, 0], empty[:, -1]])
-    return bool(empty.mean() > 0.5 or edge.mean() > 0.5)
-
-
-IN_MEMORY = 512_000_000  # bytes of images that are held there; further ones lie in files
-
-
-def in_file(image: Array) -> Array:
-    """Return the same image in a file without a name in `TMPDIR`, which ends with the process."""
-    try:
-        with tempfile.TemporaryFile(prefix="langsplat-") as file:
-            # Written, not mapped and filled: on a full disk that would kill the process without a word.
-            file.write(np.ascontiguousarray(image).data)
-            file.flush()
-            return np.memmap(file, np.uint8, "c", shape=image.shape)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
-
-
-@dataclass(frozen=True, eq=False)
-class Developed:
-    """The views of photographs, sorted by name."""
-
-    cameras: tuple[Camera, ...]
-    images: tuple[Array, ...]
-    photos: tuple[Photo, ...]  # their files
-    masks: tuple[Array | None, ...]  # none at all where no photograph has one
-    cut_out: bool  # pixels that do not count are empty
-
-
-def develop(photos: Sequence[Photo], config: DatasetConfig, progress: Progress) -> Developed:
-    """Return the views of `photos` by `config`; unreadable ones are reported, InputError without any."""
-    if not photos:
-        raise InputError("the dataset lists no photographs")
-    names = unique_names([photo.label for photo in photos])
-    order = sorted(range(len(photos)), key=names.__getitem__)
-    told: list[tuple[str, str]] = []  # what was guessed, and of which photograph
-
-    developed = developer(config.max_side)
-
-    def view(index: int) -> Layers | str:
-        photo = photos[index]
-        try:
-            camera, image, mask, alpha = developed(photo, lambda what: told.append((what, photo.label)))
-        except hostile.PictureError as error:
-            return f"{photo.label} ({error.reason})"
-        if (shown := counted(mask, alpha, True)) is not None and not shown.any():
-            return f"{photo.label} (its mask leaves nothing of it)"
-        return replace(camera, name=names[index]), image, mask, alpha
-
-    room = IN_MEMORY
-    done: list[tuple[Camera, Array, Photo, Array | None, Array | None]] = []
-    broken: list[str] = []
-    with ThreadPoolExecutor(WORKERS) as pool:
-        for count, (index, found) in enumerate(zip(order, pool.map(view, order), strict=True), 1):
-            if isinstance(found, str):
-                broken.append(found)
-            else:
-                camera, image, mask, alpha = found
-                room -= image.nbytes
-                kept = image if room >= 0 else in_file(image)
-                done.append((camera, kept, photos[index], mask, alpha))
-            progress("reading photographs", count / len(order))
-    if not done:
-        raise InputError(f"no photograph can be read: {shortened(broken)}")
-    if broken:
-        report_loss("%d photographs cannot be used and are left out: %s", len(broken), shortened(broken))
-    cameras, images, files, masks, alphas = zip(*done, strict=True)
-    _report(told, masks)
-    if stray := _stray_masks(photos):
-        remedy = "a mask is called masks/NAME.jpg.png or masks/NAME.png after its photograph"
-        report_loss("%d masks are of no photograph: %s; %s", len(stray), shortened(stray), remedy)
-    cut_out = _cut_out(masks, alphas, config)
-    masks = tuple(counted(mask, alpha, cut_out) for mask, alpha in zip(masks, alphas, strict=True))
-    masks = masks if any(mask is not None for mask in masks) else ()
-    return Developed(cameras, images, files, masks, cut_out)
-
-
-def _report(told: Sequence[tuple[str, str]], masks: Sequence[Array | None]) -> None:
-    """Say what was guessed, of which photographs, and where masks are missing."""
-    for what in dict(told):
-        labels = [label for said, label in told if said == what]
-        report_loss("%d photographs: %s (%s)", len(labels), what, shortened(labels))
-    if 0 < (masked := sum(mask is not None for mask in masks)) < len(masks):
-        report_loss("%d of %d photographs have a mask; of the others all pixels count", masked, len(masks))
-
-
-def _cut_out(masks: Sequence[Array | None], alphas: Sequence[Array | None], config: DatasetConfig) -> bool:
-    """Return True where what is transparent is an empty background, and say how transparency is taken."""
-    seen = sum(alpha is not None for alpha in alphas)
-    if not seen:
-        return False
-    cut_out = config.alpha == "background" or (
-        config.alpha == "auto" and 2 * sum(map(_is_cut_out, alphas)) > len(alphas)
-    )
-    cut_out = cut_out and all(mask is None for mask in masks)  # which say what does not count
-    said = "an empty background" if cut_out else "no part of the thing, and does not count"
-    say = report_loss if config.alpha == "auto" else log.info
-    message = "what is transparent in %d of %d photographs is %s; else: --alpha %s"
-    say(message, seen, len(alphas), said, "mask" if cut_out else "background")
-    return cut_out

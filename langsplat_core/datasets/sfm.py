@@ -16,7 +16,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import photos
 from langsplat_core.datasets import workspace as workspaces
-from langsplat_core.datasets.capture import Capture, capture_of, random_points
+from langsplat_core.datasets.capture import Capture, develop, random_points
 from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
 from langsplat_core.errors import FormatError, InputError, printable_line, report_loss, shortened
 from langsplat_core.io.files import atomic_path
@@ -78,9 +78,7 @@ def load_photos(
         for copy in located_photos(model, workspace / "images")
         for path in (files[copy.label],)
     ]
-    return replace(
-        capture_of(photos.develop(located, config, progress), *good_points(model)), matches=matches
-    )
+    return replace(develop(located, config, progress, *good_points(model)), matches=matches)
 
 
 def numbered(paths: Sequence[Path]) -> dict[str, Path]:

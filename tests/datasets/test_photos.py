@@ -20,12 +20,11 @@ from scipy.ndimage import gaussian_filter
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig, RadianceConfig
 from langsplat_core.datasets import Capture, load_capture, load_photographs
+from langsplat_core.datasets.capture import develop, in_file
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.photos import (
     Photo,
     count_photographs,
-    develop,
-    in_file,
     mask_beside,
     optics,
     photo_folder,
@@ -306,6 +305,10 @@ def test_a_mask_lies_beside_its_photograph(place: str, name: str, tmp_path: Path
     assert mask_beside(mask) is None
 
 
+def developed(photos: list[Photo]) -> Capture:
+    return develop(photos, DatasetConfig(max_side=120), silent, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
 def test_a_mask_has_the_shape_of_the_photograph_as_it_is_shown(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6  # stored lying on its side
@@ -314,12 +317,12 @@ def test_a_mask_has_the_shape_of_the_photograph_as_it_is_shown(tmp_path: Path) -
     shown[:, :20] = False
     mask = mask_file(tmp_path / "masks/a.png", shown)
     photo = Photo(tmp_path / "a.jpg", "a.jpg", LENS, np.eye(4), upright=True, mask=mask)
-    (found,) = develop([photo], DatasetConfig(max_side=120), silent).masks
+    (found,) = developed([photo]).masks
     assert found is not None
     np.testing.assert_array_equal(found, shown.repeat(2, 0).repeat(2, 1))
     mask_file(mask, shown.T)
     with pytest.raises(InputError, match=r"a\.png: is 45x60 pixels, its photograph 120x90"):
-        develop([photo], DatasetConfig(max_side=120), silent)
+        developed([photo])
 
 
 def test_masks_that_are_missing_or_stray_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -329,7 +332,7 @@ def test_masks_that_are_missing_or_stray_are_said(tmp_path: Path, caplog: pytest
         mask_file(tmp_path / "masks" / name, white)
     paths = [tmp_path / "images" / name for name in names]
     photos = [Photo(path, path.name, LENS, np.eye(4), mask=mask_beside(path)) for path in paths]
-    masks = develop(photos[:2], DatasetConfig(max_side=120), silent).masks  # of the third none is stray
+    masks = developed(photos[:2]).masks  # of the third none is stray
     assert [mask is None for mask in masks] == [False, True]
     missing, stray = caplog.messages
     assert missing.startswith("1 of 2 photographs have a mask")
@@ -341,7 +344,7 @@ def test_a_photograph_of_which_nothing_counts_is_left_out(tmp_path, caplog):
     mask = mask_file(tmp_path / "masks/view_1.png", np.zeros((90, 120), bool))
     photos = [Photo(tmp_path / name, name, LENS, np.eye(4)) for name in names]
     photos[1] = replace(photos[1], mask=mask)
-    views = develop(photos, DatasetConfig(max_side=120), silent)
+    views = developed(photos)
     assert ([camera.name for camera in views.cameras], views.masks) == (["view_0"], ())
     assert "view_1.png (its mask leaves nothing of it)" in caplog.text
 
