@@ -113,10 +113,8 @@ class GsplatView(LiftingView):
     """Valid Gaussians on the device; gsplat projects them anew in every call."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> None:
-        valid = gaussians.valid()
         self.camera, self._settings = camera, settings
-        self.dropped = int((~valid).sum())
-        self.count, self._rows = len(gaussians), np.flatnonzero(valid)
+        self.count, self._rows = len(gaussians), np.flatnonzero(gaussians.valid())
         kept = gaussians.take(self._rows)
         # Relative to the camera in float64 first: float32 has no digits left far from the origin.
         means = kept.means.astype(np.float64) - camera.position

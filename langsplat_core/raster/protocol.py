@@ -27,7 +27,6 @@ class View(ABC):
 
     camera: Camera
     count: int  # N
-    dropped: int  # rows that were invalid (see `Gaussians.valid`) and therefore not drawn
 
     @abstractmethod
     def splat(self, values: Array) -> tuple[Array, Array]:

@@ -134,11 +134,9 @@ def rim(f: Footprints, settings: RasterSettings, relative: float) -> Array:
 class ReferenceView(LiftingView):
     """Blending weights of one view, recomputed Gaussian by Gaussian in every call."""
 
-    def __init__(
-        self, footprints: Footprints, camera: Camera, settings: RasterSettings, dropped: int
-    ) -> None:
+    def __init__(self, footprints: Footprints, camera: Camera, settings: RasterSettings) -> None:
         self.camera, self.settings, self.footprints = camera, settings, footprints
-        self.count, self.dropped = len(footprints.depths), dropped
+        self.count = len(footprints.depths)
         self.order = np.argsort(footprints.depths, kind="stable")
 
     def steps(self, wider: float = 0.0) -> Iterator[Step]:
@@ -217,5 +215,4 @@ class ReferenceRasterizer:
     name = "reference"
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> ReferenceView:
-        dropped = int(len(gaussians) - gaussians.valid().sum())
-        return ReferenceView(project(gaussians, camera, settings), camera, settings, dropped)
+        return ReferenceView(project(gaussians, camera, settings), camera, settings)

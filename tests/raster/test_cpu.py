@@ -46,7 +46,6 @@ def test_images_equal_the_reference(channels, distance, settings):
     halves = np.abs(fast.median_depth() - slow.median_depth()) > 1e-5 * max(slow.depth().max(), 1)
     assert halves.sum() <= 1 + band.sum()  # T of exactly 0.5 is one more step
     assert (fast.median_rows() != slow.median_rows()).sum() <= 1 + band.sum()
-    assert fast.dropped == slow.dropped
     assert image.max() > 0.1
 
 

@@ -294,7 +294,7 @@ def reference_gradients(
     exact = Exact(*(getattr(gaussians, name).astype(np.float64) for name in PARAMETERS))
 
     def loss(footprints: Footprints) -> float:
-        image, alpha = ReferenceView(footprints, camera, settings, 0).splat(values)
+        image, alpha = ReferenceView(footprints, camera, settings).splat(values)
         return float((image * image_grad).sum() + (alpha * alpha_grad).sum())
 
     def moved(array: Array, place: tuple[int, ...], step: float) -> Array:
@@ -317,5 +317,5 @@ def reference_gradients(
         ends_px = [moved(footprints.means_px, at, step) for step in (STEP, -STEP)]
         high, low = (loss(replace(footprints, means_px=end)) for end in ends_px)
         grad[place] = (high - low) / (2 * STEP)
-    found["values"] = ReferenceView(footprints, camera, settings, 0).gather(image_grad)[rows]  # linear
+    found["values"] = ReferenceView(footprints, camera, settings).gather(image_grad)[rows]  # linear
     return found

@@ -516,7 +516,7 @@ def _window(
     rows, columns = at
     height, width = rows.stop - rows.start, columns.stop - columns.start
     moved = replace(footprints, means_px=footprints.means_px - (columns.start, rows.start))
-    view = ReferenceView(moved, replace(camera, width=width, height=height), settings, dropped=0)
+    view = ReferenceView(moved, replace(camera, width=width, height=height), settings)
     pixels = np.arange(height * width).reshape(height, width)
     indices, where, weights = [np.empty(0, int)], [np.empty(0, int)], [np.empty(0)]
     for step in view.steps():

@@ -315,7 +315,6 @@ class CpuView(LiftingView):
         self.order, self._depths = drawn[order], depths[order]  # (M,) int32 rows, (M,) float64
         size = camera.width, camera.height
         self.tiles = tiling.bin_tiles(found.geometry, self.order, size, settings, workers, self._empty)
-        self.dropped = int(np.count_nonzero(found.status == projection.INVALID))
 
     @property
     def radii(self) -> Array:

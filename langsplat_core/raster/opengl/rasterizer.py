@@ -245,6 +245,7 @@ class GlRasterizer:
                 f"rasterizer 'opengl': this driver draws at most {limit} pixels a side, "
                 f"not {camera.width}x{camera.height}; use a smaller size or --backend cpu"
             )
+        self.scene(gaussians)  # one too large for the device is refused here
         return GlView(self, gaussians, camera, settings)
 
     def scene(self, gaussians: Gaussians) -> SceneTextures:
@@ -375,7 +376,6 @@ class GlView(View):
         self.rasterizer = rasterizer
         self.gaussians, self.camera, self.settings = gaussians, camera, settings
         self.count = len(gaussians)
-        self.dropped = self.count - len(rasterizer.scene(gaussians).rows)
 
     def splat(self, values: Array) -> tuple[Array, Array]:
         values = np.asarray(values)
