@@ -30,6 +30,7 @@ from langsplat_core.config import Count, check_settings
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.compaction.compact import (
     BudgetConfig,
+    Loss,
     Views,
     choose_views,
     contributions,
@@ -133,23 +134,17 @@ def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -
     return share
 
 
-@dataclass(frozen=True)
-class CleanReport:
-    """Report of a cleaning: what went, and its cost; losses over measuring views, dB, negative for a gain."""
+@dataclass(frozen=True, kw_only=True)
+class CleanReport(Loss):
+    """Report of a cleaning: what went, and its cost."""
 
     gaussians: int  # before
     invalid: int  # rows removed because nothing can draw them
     regions: int  # floaters removed: of small regions
     free_space: int  # floaters removed: in free space
     kept: int  # suspected, but too dear for the budget
-    budget: float
-    loss: float  # mean
-    worst_loss: float
     psnr_before: float | None  # mean over the photographs that measure; None without
     psnr_after: float | None
-    assumed_psnr: float | None  # None: measured against photographs
-    measuring_views: int
-    views_from: str
 
     @property
     def removed(self) -> int:
@@ -182,20 +177,15 @@ def clean(
     lost = losses()
     keep &= valid
     gone = valid & ~keep
-    report = CleanReport(
+    report = CleanReport.of(
+        *(lost, config, views),
         gaussians=len(keep),
         invalid=int((~valid).sum()),
         regions=int((gone & found.region).sum()),
         free_space=int((gone & ~found.region).sum()),
         kept=int((found.suspicion[keep] > 0).sum()),
-        budget=config.max_psnr_loss,
-        loss=float(lost.mean()),
-        worst_loss=float(lost.max()),
         psnr_before=mean_psnr(scene, measured),
         psnr_after=mean_psnr(scene.take(keep), measured),
-        assumed_psnr=config.assumed_psnr if views.photographs[0] is None else None,
-        measuring_views=len(measured),
-        views_from=views.origin,
     )
     return keep, report
 

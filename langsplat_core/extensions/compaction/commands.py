@@ -40,12 +40,10 @@ class Clean:
 
 
 def _clean_lines(report: CleanReport) -> list[str]:
-    how = "on photographs" if report.assumed_psnr is None else f"if the scene has {report.assumed_psnr:g} dB"
     lines = [
         f"removed: {report.removed} of {report.gaussians} Gaussians: {report.regions} in small regions, "
         f"{report.free_space} in free space, {report.invalid} that cannot be drawn",
-        f"loss: {report.loss:.3f} dB of {report.budget:g} allowed, worst view {report.worst_loss:.2f} dB "
-        f"({how}; {report.measuring_views} views; {report.views_from})",
+        *report.lines,
     ]
     if report.psnr_before is not None and report.psnr_after is not None:
         lines.append(f"PSNR: {report.psnr_before:.2f} dB before, {report.psnr_after:.2f} after")
@@ -78,7 +76,7 @@ class Compact:
             print_json({"out": str(out), **asdict(report)})
             return
         OutputConsole().print(_table(report))
-        print(*_notes(report), f"written: {out}", sep="\n")
+        print(*report.lines, f"written: {out}", sep="\n")
 
 
 def _table(report: CompactReport) -> Table:
@@ -95,18 +93,3 @@ def _table(report: CompactReport) -> Table:
     for name, old, new, form in rows:
         table.add_row(name, format(old, form), format(new, form), f"{100 * new / old:.1f} %" if old else "-")
     return table
-
-
-def _notes(report: CompactReport) -> list[str]:
-    how = (
-        "measured on photographs"
-        if report.assumed_psnr is None
-        else f"derived from the change, if the scene has {report.assumed_psnr:g} dB"
-    )
-    lines = [
-        f"loss: {report.loss:.3f} dB of {report.budget:g} allowed, worst view "
-        f"{report.worst_loss:.2f} dB ({how})",
-        f"views: {report.ranking_views} ranked the Gaussians, {report.measuring_views} others measured; "
-        f"{report.views_from}",
-    ]
-    return lines

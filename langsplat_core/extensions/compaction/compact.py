@@ -36,7 +36,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 
@@ -221,18 +221,45 @@ class Weight:
 
 
 @dataclass(frozen=True)
-class CompactReport:
-    """A compact scene beside its original; losses are over the measuring views, dB."""
+class Loss:
+    """What a smaller scene costs, over the measuring views, dB; negative for a gain."""
+
+    budget: float
+    loss: float  # mean
+    worst_loss: float  # of any one view
+    assumed_psnr: float | None  # None: measured against photographs
+    measuring_views: int
+    views_from: str
+
+    @classmethod
+    def of(cls, losses: Array, config: BudgetConfig, views: Views, **more: Any) -> Self:
+        """Return the report of (V,) losses; more: fields of a subclass."""
+        assumed = config.assumed_psnr if views.photographs[0] is None else None
+        mean, worst, count = float(losses.mean()), float(losses.max()), len(losses)
+        return cls(config.max_psnr_loss, mean, worst, assumed, count, views.origin, **more)
+
+    @property
+    def lines(self) -> list[str]:
+        """What people read of it."""
+        how = (
+            "measured on photographs"
+            if self.assumed_psnr is None
+            else f"derived from the change, if the scene has {self.assumed_psnr:g} dB"
+        )
+        loss = f"{self.loss:.3f} dB of {self.budget:g} allowed, worst view {self.worst_loss:.2f} dB"
+        return [
+            f"loss: {loss} ({how})",
+            f"views: {self.measuring_views} measured; {self.views_from}",
+        ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompactReport(Loss):
+    """A compact scene beside its original; losses are those of the file."""
 
     before: Weight
     after: Weight
-    budget: float
-    loss: float  # mean, of the file
-    worst_loss: float  # of any one view, of the file
-    assumed_psnr: float | None  # None: measured against photographs
     ranking_views: int
-    measuring_views: int
-    views_from: str
 
 
 def compact_scene(
@@ -261,17 +288,8 @@ def compact_scene(
         degree, memory = one.gaussians.sh_degree, memory_bytes(one)
         return Weight(len(one.gaussians), degree, stored_bytes, memory, mean_psnr(one, measured))
 
-    report = CompactReport(
-        before=weigh(scene, before_bytes),
-        after=weigh(after, after_bytes),
-        budget=config.max_psnr_loss,
-        loss=float(losses.mean()),
-        worst_loss=float(losses.max()),
-        assumed_psnr=config.assumed_psnr if photos is None else None,
-        ranking_views=len(views.ranking),
-        measuring_views=len(views.measuring),
-        views_from=views.origin,
-    )
+    sizes = {"before": weigh(scene, before_bytes), "after": weigh(after, after_bytes)}
+    report = CompactReport.of(losses, config, views, **sizes, ranking_views=len(views.ranking))
     save_scene(out, replace(candidate, path=out), tell=False)
     return report
 
