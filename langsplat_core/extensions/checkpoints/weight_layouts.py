@@ -69,11 +69,17 @@ IN_BLOCK = {
     **{f"mlp c_fc.{part}": f"mlp.fc1.{part}" for part in ("weight", "bias")},
     **{f"mlp c_proj.{part}": f"mlp.fc2.{part}" for part in ("weight", "bias")},
 }
-STATED = {  # settings of open_clip_config.json that are read or follow from the shapes
+# Settings of open_clip_config.json that are read or follow from the shapes; and what transformers calls those
+# that must be as the shapes say.
+STATED = {
     "model_cfg": {"embed_dim", "vision_cfg", "text_cfg", "quick_gelu", "custom_text", "init_logit_scale"},
     "vision_cfg": {"image_size", "patch_size", "width", "layers", "head_width", "mlp_ratio", "patch_dropout"},
     "text_cfg": {"context_length", "vocab_size", "width", "layers", "heads", "mlp_ratio"},
 }
+SAME = {
+    "context_length": "max_position_embeddings", "width": "hidden_size", "layers": "num_hidden_layers",
+    "image_size": "image_size", "patch_size": "patch_size", "vocab_size": "vocab_size",
+}  # fmt: skip
 # What other settings may be without any effect.
 USUAL: tuple[object, ...] = (None, False, 0, "", {}, "tok", "argmax", "linear")
 
@@ -246,25 +252,14 @@ def _clip_config(tensors: Tensors) -> Settings:
 
 def _check(model: Settings, config: Settings) -> None:
     """Raise ValueError where open_clip_config.json asks for another network than the tensors are."""
-    text, vision = config["text_config"], config["vision_config"]
-    for part in STATED:
-        settings = model if part == "model_cfg" else model[part]
+    for part, known in STATED.items():
+        settings, found = model.get(part, model), config.get(part.replace("cfg", "config"), {})
         for name, value in settings.items():
-            if name not in STATED[part] and value not in USUAL:
+            if name not in known and value not in USUAL:
                 raise ValueError(NOT_OURS.format(part=part, name=name, value=value))
-    found = {
-        ("vision_cfg", "image_size"): vision["image_size"],
-        ("vision_cfg", "patch_size"): vision["patch_size"],
-        ("vision_cfg", "width"): vision["hidden_size"],
-        ("vision_cfg", "layers"): vision["num_hidden_layers"],
-        ("text_cfg", "context_length"): text["max_position_embeddings"],
-        ("text_cfg", "vocab_size"): text["vocab_size"],
-        ("text_cfg", "width"): text["hidden_size"],
-        ("text_cfg", "layers"): text["num_hidden_layers"],
-    }
-    for (part, name), number in found.items():
-        if model[part].get(name, number) != number:
-            raise ValueError(f"{OPEN_CLIP_CONFIG} states {name} {model[part][name]}, tensors have {number}")
+            number = found.get(SAME.get(name), value)
+            if value != number:
+                raise ValueError(f"{OPEN_CLIP_CONFIG} states {name} {value}, tensors have {number}")
 
 
 def _clip_tensors(tensors: Tensors) -> dict[str, Any]:
