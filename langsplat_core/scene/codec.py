@@ -29,6 +29,7 @@ class Codec(ABC):
     """Latents of numbers, of which a blend lies between what was blended; other codecs override more."""
 
     kind: ClassVar[str]  # its name in the scene file
+    names: ClassVar[tuple[str, ...]]  # there, of its arrays, in the order of its fields
     dtype: ClassVar[type[np.generic]] = np.float32  # of latents
     blends: ClassVar[bool] = True  # a weighted mean of latents is a latent
     unit_latents: ClassVar[bool] = False  # they have length 1: of 3 numbers, cosines are smooth on a sphere
@@ -66,14 +67,14 @@ class Codec(ABC):
         towards, known = _directions(latents)
         return np.where(known[:, None], self.decode(towards) @ vectors.T, 0).astype(np.float32)
 
-    @abstractmethod
     def tensors(self) -> dict[str, Array]:
         """Named weights, as written to the scene file."""
+        return dict(zip(self.names, vars(self).values(), strict=True))
 
     @classmethod
-    @abstractmethod
     def from_tensors(cls, tensors: dict[str, Array]) -> Self:
         """Return the inverse of `tensors`; KeyError or ValueError where they do not belong together."""
+        return cls(*(tensors[name] for name in cls.names))
 
     def check(self, latents: Array) -> None:  # noqa: B027  any numbers will do
         """ValueError for (M, d) latents that no vector has."""
@@ -127,6 +128,7 @@ class LinearCodec(Codec):
 
     basis: Array  # (d, D) float32, orthonormal rows
     kind: ClassVar[str] = "linear"
+    names: ClassVar[tuple[str, ...]] = ("basis",)
 
     def __post_init__(self) -> None:
         check_array("codec basis", self.basis, ("d", "D"), dtype=np.float32)
@@ -145,13 +147,6 @@ class LinearCodec(Codec):
         # cos(B^T l, q) = l.(B q) / |l| for orthonormal rows of B: the big vectors never appear.
         towards, known = _directions(latents)
         return np.where(known[:, None], towards @ (vectors @ self.basis.T).T, 0).astype(np.float32)
-
-    def tensors(self) -> dict[str, Array]:
-        return {"basis": self.basis}
-
-    @classmethod
-    def from_tensors(cls, tensors: dict[str, Array]) -> "LinearCodec":
-        return cls(tensors["basis"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +246,7 @@ class CodebookCodec(Codec):
     vectors: Array  # (K, D) float32 unit vectors, 1 <= K <= LARGEST
     palette: Array  # (K, 3) float32 in [0, 1]; near codewords have near colours
     kind: ClassVar[str] = "codebook"
+    names: ClassVar[tuple[str, ...]] = ("vectors", "colours")
     dtype: ClassVar[type[np.generic]] = np.uint16
     blends: ClassVar[bool] = False
 
@@ -302,13 +298,6 @@ class CodebookCodec(Codec):
 
     def colours(self, latents: Array, weights: Array) -> Array:
         return self.palette[latents[:, 0]]
-
-    def tensors(self) -> dict[str, Array]:
-        return {"vectors": self.vectors, "colours": self.palette}
-
-    @classmethod
-    def from_tensors(cls, tensors: dict[str, Array]) -> "CodebookCodec":
-        return cls(tensors["vectors"], tensors["colours"])
 
 
 def principal_colours(vectors: Array, weights: Array) -> Array:
