@@ -399,15 +399,10 @@ class QueryEngine:
         assert self.scene.language is not None
         own, made_with = self.scene.language.canonical, self.field.encoder_id
         canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
-        if canonical.shape[1:] != own.shape[1:]:
-            raise EncoderError(
-                f"the encoder gives {canonical.shape[1]} numbers, the scene was made with {own.shape[1]} by "
-                f"{made_with}; give that one with --encoder"
-            )
         if not same_vectors(canonical, own):
             raise EncoderError(
-                f"the scene was made with other weights of {made_with}; give those with --encoder, or make "
-                "the scene again"
+                f"the scene was made with other weights of {made_with}, vectors of {own.shape[1]} numbers; "
+                "give those with --encoder, or make the scene again"
             )
         self._encoder_checked = True
 

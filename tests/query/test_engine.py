@@ -77,8 +77,8 @@ def test_engine_errors_say_what_to_do():
 
     with pytest.raises(UnknownWordError, match=r"'brook' \(did you mean 'book'\?\); use other words"):
         QueryEngine(scene, lambda _: FakeEncoder()).run("brook")
-    for vector, message in ((np.ones(3, np.float32), "3 numbers"), (axis(0), "other weights")):
-        with pytest.raises(EncoderError, match=message):
+    for vector in (np.ones(3, np.float32), axis(0)):
+        with pytest.raises(EncoderError, match="other weights of fake, vectors of 8 numbers"):
             QueryEngine(blob_scene(), lambda _, vector=vector: Other(vector)).run("mug")
 
 
