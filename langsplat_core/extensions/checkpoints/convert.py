@@ -7,6 +7,7 @@ from langsplat_core.extensions.checkpoints.langsplat_files import write_autoenco
 from langsplat_core.io.scenes import Exporter, ExportRequest, Importer, ImportRequest
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import LEVELS, AutoencoderCodec, LanguageField, Scene
+from langsplat_core.scene.codec import SHORTEST
 
 LANGSPLAT_LATENT = 3  # numbers per Gaussian that its rasterizer is compiled for
 BLOCK = 16_384  # Gaussians decoded at a time
@@ -26,6 +27,15 @@ def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[st
             f"with language features at subpart, part, whole: {shares} of the Gaussians; "
             f"codec {field.codec.kind} of {field.codec.size}, encoder {field.encoder_id}"
         )
+    if foreign.codec is not None:
+        every, told = np.arange(len(scene.gaussians)), [i for i in range(3) if foreign.levels[i] is not None]
+        lengths = np.linalg.norm(np.concatenate([foreign.rows(level, every) for level in told]), axis=1)
+        lengths = lengths[lengths > SHORTEST]
+        if (np.abs(lengths - 1) > 0.01).any():
+            low, high = lengths.min(), lengths.max()
+            lines.append(
+                f"latents {low:.3g} to {high:.3g} long, brought to length 1 as LangSplat does to draw"
+            )
     if loss is not None:
         lines.append(
             f"relevancy error of the codec: mean {loss.error_mean:.4f}, "

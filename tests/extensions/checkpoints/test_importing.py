@@ -16,10 +16,11 @@ import torch
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig
 from langsplat_core.errors import STRICTNESS, EncoderError, FormatError, InputError
-from langsplat_core.extensions.checkpoints.convert import export_langsplat, export_occam
+from langsplat_core.extensions.checkpoints.convert import IMPORTER, export_langsplat, export_occam
 from langsplat_core.extensions.checkpoints.importing import ForeignScene, import_scene, read_foreign
 from langsplat_core.io.ply import write_ply
-from langsplat_core.io.scenes import ExportRequest, load_scene, save_scene
+from langsplat_core.io.scenes import ExportRequest, ImportRequest, load_scene, save_scene
+from langsplat_core.progress import silent
 from langsplat_core.scene import CANONICAL_PHRASES, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.language.codec_fit import everyday_vocabulary
@@ -463,7 +464,9 @@ def langsplat_levels(folder: Path) -> tuple[list[Path], Array, torch.nn.Module]:
 
 @pytest.mark.long
 def test_langsplat_there_and_back(tmp_path, clip):
-    scene, _ = import_scene(read_foreign(langsplat_levels(tmp_path / "a")[0]), clip)
+    trained, request = langsplat_levels(tmp_path / "a")[0], ImportRequest((), clip, (), (), CodecConfig())
+    scene, lines = IMPORTER.read(replace(request, paths=tuple(trained)), silent)
+    assert "brought to length 1" in lines[-1]
     written = [Path(name) for name in export_langsplat(asked(scene, tmp_path / "b"))]
     assert [str(path.relative_to(tmp_path / "b")) for path in written] == [
         *(f"case_{level}/chkpnt30000.pth" for level in (1, 2, 3)),
@@ -475,7 +478,8 @@ def test_langsplat_there_and_back(tmp_path, clip):
     assert [tuple(elements[i].shape) for i in range(1, 8)] == shapes
     network = autoencoder(D)
     network.load_state_dict(torch.load(written[3], weights_only=True))  # the names are those of its layers
-    again, _ = import_scene(read_foreign(written), clip)
+    again, lines = IMPORTER.read(replace(request, paths=tuple(written)), silent)
+    assert "length 1" not in lines[-1]
     first, second = scene.language, again.language
     assert first is not None
     assert second is not None
