@@ -74,7 +74,7 @@ class Train:
         psnr = (
             "none held out, so that nothing was measured"
             if report.psnr is None
-            else f"held-out PSNR {report.psnr:.2f} dB{small} ({names})"
+            else f"held-out PSNR {report.psnr:.2f} dB{small} ({report.held_out_rule}: {names})"
         )
         print(
             f"{self.out}: {report.gaussians} Gaussians from {report.views} photographs, {psnr}; "

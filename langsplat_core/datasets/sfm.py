@@ -67,8 +67,10 @@ def load_photos(
             f"only {found} of {len(files)} photographs could be located together "
             f"({_listed(lost, 10)}); {matches.joined()}{matches.advice()}{anyway}"
         )
-    if not before:
-        lost.pop(workspaces.UNREADABLE, None)  # which the process has told of, with the reasons
+    unread = lost.pop(workspaces.UNREADABLE, [])
+    if before and unread:  # else the process has told of them, with the reasons
+        share = f"{len(unread)} of {len(files)} photographs"
+        report_loss("%s cannot be read and are left out: %s", share, shortened(unread))
     if lost:
         share = f"{sum(map(len, lost.values()))} of {len(files)} photographs"
         what = "could not be located and are left out"

@@ -24,7 +24,7 @@ from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.raster.render import render
-from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import C0
 
 REPORT, PAGE = "report.json", "report.html"
@@ -55,6 +55,8 @@ class TrainReport:
     psnr_small: float | None = None  # as `psnr`, of images shrunk to 320 px, by which presets compare
     # budget -> mean PSNR (dB) of views held out of the training views, by each training that decided on it
     rehearsed: dict[str, list[float]] = field(default_factory=dict)
+    psnr_trained: float | None = None  # mean over the views that were trained on, 48 of them at most
+    held_out_rule: str = ""  # which views are held out, in words
 
 
 def rehearsals_in_words(rehearsed: Mapping[str, Sequence[float]]) -> str:
@@ -95,30 +97,45 @@ def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
     return tuple(printable_line(line, 300) for line in lines[:5] if isinstance(line, str))
 
 
-def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """Return a sentence with a remedy for each sign of a poor scene; scores: of held-out views."""
-    found = []
-    if scores:
-        psnr = float(np.mean([score.psnr for score in scores]))
-        covered = float(np.mean([score.covered for score in scores]))
-        if psnr < 16:  # held-out photographs are hardly recognised
-            found.append(
-                f"held-out photographs are reproduced at {psnr:.1f} dB, below 16: cameras may "
-                "be wrong, or photographs too few; take more that overlap, or give COLMAP's cameras"
-            )
-        if covered < 0.5:
-            found.append(
-                f"only {100 * covered:.0f} % of the held-out pictures' pixels show anything: photograph "
-                "what is there from more sides, or train for more steps"
-            )
-    groups = camera_groups(np.array([camera.position for camera in cameras]).reshape(-1, 3))
-    if len(groups) > 1:
-        sizes = " and ".join(str(len(group)) for group in groups)
-        found.append(
-            f"the cameras stand in {len(groups)} groups far apart ({sizes} photographs): they may not belong "
-            "together; add photographs between them, or train each group alone"
-        )
-    return tuple(found)
+def quality_warnings(
+    capture: Capture, train: Sequence[int], held_out: Sequence[ViewScore], trained: Sequence[ViewScore]
+) -> tuple[str, ...]:
+    """Return a sentence with a remedy for each sign of a poor scene.
+
+    train: rows of the photographs that were trained on; held_out, trained: scores of views of each kind.
+    """
+    cameras, matches = [capture.cameras[index] for index in train], capture.matches
+    psnr, learnt = (float(np.mean([s.psnr for s in each] or [np.nan])) for each in (held_out, trained))
+    covered = float(np.mean([score.covered for score in held_out] or [1.0]))
+    positions = np.array([camera.position for camera in cameras]).reshape(-1, 3)
+    groups = camera_groups(positions)
+    seen = [(camera.in_image(*at), at[1]) for camera in cameras for at in [camera.project(capture.points)]]
+    points = float(np.median([np.count_nonzero(inside) for inside, _ in seen] or [0]))
+    depth = float(np.median(np.concatenate([z[inside] for inside, z in seen]))) if points else np.nan
+    beside = float(np.linalg.norm(positions[:, None] - positions, axis=2).max(initial=0)) / depth
+    readable = 0 if matches is None else sum(count >= 0 for count in matches.features)
+    lost = 0 if matches is None else readable - len(matches.located)
+    found = {
+        f"held-out photographs are reproduced at {psnr:.1f} dB, below 16: cameras may "
+        "be wrong, or photographs too few; take more that overlap, or give COLMAP's cameras": psnr < 16,
+        f"only {100 * covered:.0f} % of the held-out pictures' pixels show anything: photograph "
+        "what is there from more sides, or train for more steps": covered < 0.5,
+        f"even photographs that were trained on are reproduced at {learnt:.1f} dB, below 22: leaves, water "
+        "or what is far away hold more than fits; take a larger preset, or photograph from nearer": learnt
+        < 22,
+        f"held-out photographs are reproduced {learnt - psnr:.1f} dB worse than those that were trained on: "
+        "these are learnt by heart; take more photographs between them": learnt - psnr > 6,
+        f"a photograph sees only {points:.0f} points that others see (the median): cameras may be wrong by "
+        "pixels; take sharper photographs, and more that share two thirds of their view": 0 < points < 100,
+        f"the cameras stand within {100 * beside:.1f} % of the distance to what they see: depths are hardly "
+        "known; step aside between photographs, by a tenth of that distance in all and more": beside < 0.1,
+        f"{lost} of {readable} photographs could not be located: the scene lacks what they show; "
+        f"{matches.advice() if matches and lost else ''}": lost > readable / 4,
+        f"the cameras stand in {len(groups)} groups far apart "
+        f"({' and '.join(str(len(group)) for group in groups)} photographs): they may not belong "
+        "together; add photographs between them, or train each group alone": len(groups) > 1,
+    }
+    return tuple(warning for warning, holds in found.items() if holds)
 
 
 def camera_groups(positions: Array) -> list[Array]:
@@ -145,20 +162,20 @@ PLOT = 640  # units of a drawing's side
 CELLS = 220  # of the map, along its longer side
 
 
-def write_reports(
-    work: Path, report: TrainReport, capture: Capture, gaussians: Gaussians, near: float | None = None
-) -> None:
-    """Write the report of a finished training, as JSON and as a page; near: as of `evaluate_views`."""
-    from langsplat_core.training.radiance.differentiable import evaluate_views  # torch
+def shown_views(train: Sequence[int]) -> list[int]:
+    """Return the views that are measured and shown of those that were trained on, spread over all."""
+    rows = np.linspace(0, len(train) - 1, min(len(train), MOST_VIEWS)).round().astype(int)
+    return [train[row] for row in rows]
 
+
+def write_reports(
+    work: Path, report: TrainReport, capture: Capture, gaussians: Gaussians, trained: Sequence[ViewScore]
+) -> None:
+    """Write the report of a finished training, as JSON and as a page; trained: scores of `shown_views`."""
     write_json(work / REPORT, asdict(report))
     held_out = {score.name: score for score in report.held_out_views[:MOST_VIEWS]}
-    measured = {score.name for score in report.held_out_views}
     rows = {camera.name: index for index, camera in enumerate(capture.cameras)}
-    others = [index for name, index in rows.items() if name not in measured]
-    most = min(len(others), MOST_VIEWS - len(held_out))
-    shown = [others[at] for at in np.linspace(0, len(others) - 1, most).round().astype(int)]
-    scores = [*held_out.values(), *evaluate_views(gaussians, capture, shown, near=near)]
+    scores = [*held_out.values(), *trained][:MOST_VIEWS]
     scene = Scene(gaussians, cameras=capture.cameras)
     views = (_view(capture, scene, rows[score.name], score, score.name in held_out) for score in scores)
     more = len(capture) - len(scores)
@@ -196,9 +213,10 @@ def _tiles(report: TrainReport) -> str:
     scores = report.held_out_views
     tiles = {
         "photographs": report.views + report.held_out,
-        "held out": report.held_out,
+        f"held out{report.held_out_rule and ', '}{_text(report.held_out_rule)}": report.held_out,
         "held-out PSNR": "none" if report.psnr is None else f"{report.psnr:.1f} dB",
         "PSNR at 320 px": "none" if report.psnr_small is None else f"{report.psnr_small:.1f} dB",
+        "PSNR of training views": "none" if report.psnr_trained is None else f"{report.psnr_trained:.1f} dB",
         "held-out SSIM": f"{np.mean([s.ssim for s in scores]):.3f}" if scores else "none",
         "Gaussians": f"{report.gaussians:,}",
         "masks": f"{report.mask_count:,}",

@@ -14,7 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainConfig, check_settings
+from langsplat_core.config import (
+    QUICK,
+    DatasetConfig,
+    RadianceBudget,
+    RadianceConfig,
+    TrainConfig,
+    check_settings,
+)
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
 from langsplat_core.errors import STRICTNESS, FormatError, InputError
@@ -141,6 +148,7 @@ def _train(
             small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
             near = config.radiance.near or scene.near  # as whoever opens the scene has it
             scores = evaluate_views(gaussians, capture, held_out, small=small, near=near) if held_out else []
+            trained = evaluate_views(gaussians, capture, reports.shown_views(train), near=near)
         report = reports.TrainReport(
             views=len(cameras),
             held_out=len(scores),
@@ -156,13 +164,15 @@ def _train(
             relevancy_error=codec_report.error_mean,
             relevancy_error_p99=codec_report.error_p99,
             observed=float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
-            warnings=reports.quality_warnings(scores, cameras),
+            warnings=reports.quality_warnings(capture, train, scores, trained),
             seconds=run.seconds,
             dataset=str(run.dataset.resolve()),
             held_out_views=tuple(scores),
             rehearsed=rehearsed,
+            psnr_trained=_mean(score.psnr for score in trained),
+            held_out_rule=_held_out_rule(capture, config.dataset),
         )
-        reports.write_reports(run.work, report, capture, gaussians, near)
+        reports.write_reports(run.work, report, capture, gaussians, trained)
     processes.barrier()
     return reports.read_report(run.work)
 
@@ -171,6 +181,13 @@ def _mean(scores: Iterable[float | None]) -> float | None:
     """Mean of the scores that could be measured; None where none could."""
     measured = [score for score in scores if score is not None]
     return float(np.mean(measured)) if measured else None
+
+
+def _held_out_rule(capture: Capture, config: DatasetConfig) -> str:
+    """Return in words which views `split_views` holds out."""
+    if any(photo.held_out for photo in capture.photos):
+        return "as the dataset says"
+    return f"one in {config.test_every}, {'by name' if config.hold_out == 'every' else 'amid others'}"
 
 
 def _photographs(run: _Run) -> Capture:

@@ -132,12 +132,14 @@ def _never(**_: object) -> None:
     raise AssertionError("computed again")
 
 
-def test_repeated_reconstruction_computes_nothing(photos, located, monkeypatch):
+def test_repeated_reconstruction_computes_nothing(photos, located, monkeypatch, caplog):
     in_this_process(monkeypatch)
     for name in ("extract_features", "incremental_mapping"):
         monkeypatch.setattr(pycolmap, name, _never)
     again = load_capture(photos, CONFIG, located[1])
     np.testing.assert_array_equal(again.points, located[0].points)
+    (broken,) = [message for message in caplog.messages if "aa_broken.jpg" in message]
+    assert "cannot be read" in broken
 
 
 def aligned(points: Array, source: Array, target: Array) -> Array:

@@ -44,19 +44,43 @@ def sizes(positions: Array) -> list[int]:
     return [len(group) for group in camera_groups(positions)]
 
 
+def warnings_of(
+    cameras: Sequence[Camera], held_out=(), trained=(), points: Array | None = None, matches=None
+) -> tuple[str, ...]:
+    """Warnings of a training on all views, which share a thousand points unless told otherwise."""
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (1_000, 3)) if points is None else points
+    images = (np.zeros((48, 64, 3), np.uint8),) * len(cameras)
+    colours = np.zeros(points.shape, np.uint8)
+    made = Capture(tuple(cameras), images, points, colours, matches=matches)
+    return quality_warnings(made, range(len(cameras)), held_out, trained)
+
+
 @pytest.mark.parametrize(
-    ("scores", "says"), [([score(12.5), score(14.5)], "at 13.5 dB"), ([score(20, 0.3)], "only 30 %")]
+    ("found", "says"),
+    [
+        ({"held_out": [score(12.5), score(14.5)]}, "at 13.5 dB"),
+        ({"held_out": [score(20, 0.3)]}, "only 30 %"),
+        ({"trained": [score(21.0), score(22.5)]}, "at 21.8 dB, below 22"),
+        ({"held_out": [score(22)], "trained": [score(30)]}, "8.0 dB worse"),
+        ({"points": np.zeros((66, 3))}, "only 66 points"),
+        ({"points": np.full((200, 3), [0.0, 200.0, 0.0])}, "within 3.0 % of the distance"),
+        ({"matches": Matches(tuple("abcdefg"), (9, 9, 9, 9, 9, 9, -1), (), frozenset(range(4)))}, "2 of 6"),
+    ],
 )
-def test_a_warning_is_one_sentence_with_a_remedy(scores, says):
-    (warning,) = quality_warnings(scores, ring(12))
+def test_a_warning_is_one_sentence_with_a_remedy(found, says):
+    cameras = ring(12)
+    if "points" in found and len(found["points"]) == 200:  # far away
+        cameras = [look_at(camera.position, np.array([0, 200.0, 0]), UP, (64, 48)) for camera in cameras]
+    assert warnings_of(cameras) == ()
+    (warning,) = warnings_of(cameras, **found)
     assert says in warning
     assert "\n" not in warning
     assert "photograph" in warning.partition(":")[2]
 
 
 def test_cameras_in_two_groups_are_warned_of():
-    (warning,) = quality_warnings([], [*ring(9), *ring(6, (500.0, 0, 0))])
-    assert "2 groups far apart (9 and 6 photographs)" in warning
+    warnings = warnings_of([*ring(9), *ring(6, (500.0, 0, 0))])
+    assert any("2 groups far apart (9 and 6 photographs)" in warning for warning in warnings)
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.9])
@@ -144,8 +168,15 @@ def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path)
     names = [f"{number}{HOSTILE}" for number in range(8)]
     matches = Matches(tuple(names), (900,) * 8, ((0, 1, 80), (1, 2, 20), (5, 6, 3)), frozenset(range(7)))
     rehearsed = {"500 steps at 320 px": [24.61, 21.1], "1500 steps at 480 px": [24.0]}
-    warned = report(names[2:4], warnings=("it is dim: add <light>",), rehearsed=rehearsed, psnr_small=22.7)
-    write_reports(tmp_path, warned, capture(names, matches=matches), gaussians())
+    warned = report(
+        names[2:4],
+        warnings=("it is dim: add <light>",),
+        rehearsed=rehearsed,
+        psnr_small=22.7,
+        held_out_rule="one in 4",
+    )
+    others = [ViewScore(name, 30.0, 0.9, 0.9) for name in names if name not in names[2:4]]
+    write_reports(tmp_path, warned, capture(names, matches=matches), gaussians(), others)
     assert read_report(tmp_path) == warned
     page = Read(tmp_path / PAGE)
     assert not {"script", "link", "iframe", "light"} & {tag for tag, _ in page.tags}
@@ -156,7 +187,12 @@ def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path)
     assert views.index("2<script>") < views.index("3<script>") < views.index("0<script>")
     assert views.count("held out") == 2
     assert "after 500 steps at 320 px 24.6, 21.1 dB; after 1500 steps at 480 px 24.0 dB" in page.text
-    assert "22.7 dB" in page.text
-    for words in ("it is dim: add <light>", "21.4 dB, SSIM 0.712", "7 of 8 photographs are located"):
+    for words in (
+        "22.7 dB",
+        "held out, one in 4",
+        "it is dim: add <light>",
+        "21.4 dB, SSIM 0.712",
+        "7 of 8 photographs are located",
+    ):
         assert words in page.text
     assert len(page.of("polygon")) == 8  # cameras from above
