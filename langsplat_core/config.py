@@ -228,8 +228,8 @@ class RadianceConfig:
     # up to so many training views: Gaussians begin at depths by stereo and leave the space before surfaces,
     # opacities decay and are not reset; 0 (as published): never
     few_views: CountOrZero = 50
-    # up to so many training views, short trainings on some of them decide whether fewer `steps` are trained,
-    # with fewer Gaussians and smaller photographs, see `training.radiance.trainer`; 0: never
+    # up to so many training views, no more `steps` are trained than they support; where many are asked for,
+    # trainings on some of the views decide, see `training.radiance.trainer`; 0: never
     rehearsed_views: CountOrZero = 24
     # each photograph has an exposure and white balance of its own; auto: where that explains enough
     exposure: Literal["auto", "on", "off"] = "auto"

@@ -53,7 +53,7 @@ class TrainReport:
     dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
     held_out_views: tuple[ViewScore, ...] = ()  # one by one
     psnr_small: float | None = None  # as `psnr`, of images shrunk to 320 px, by which presets compare
-    # budget -> mean PSNR (dB) of views held out of the training views, by each training that decided on it
+    # budget -> PSNRs (dB) of views held out of the training views, where rehearsals decided on it
     rehearsed: dict[str, list[float]] = field(default_factory=dict)
     psnr_trained: float | None = None  # mean over the views that were trained on, 48 of them at most
     held_out_rule: str = ""  # which views are held out, in words
@@ -110,7 +110,7 @@ def quality_warnings(
     positions = np.array([camera.position for camera in cameras]).reshape(-1, 3)
     groups = camera_groups(positions)
     seen = [(camera.in_image(*at), at[1]) for camera in cameras for at in [camera.project(capture.points)]]
-    points = float(np.median([np.count_nonzero(inside) for inside, _ in seen] or [0]))
+    points = float(np.median([int(inside.sum()) for inside, _ in seen] or [0]))
     depth = float(np.median(np.concatenate([z[inside] for inside, z in seen]))) if points else np.nan
     beside = float(np.linalg.norm(positions[:, None] - positions, axis=2).max(initial=0)) / depth
     readable = 0 if matches is None else sum(count >= 0 for count in matches.features)

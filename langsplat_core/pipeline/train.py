@@ -220,19 +220,19 @@ def _described(
 
 
 def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[str, list[float]]]:
-    """Return Gaussians of the supported budget, and held-out PSNRs (dB) by budget; one process trains."""
+    """Return Gaussians of the supported budget, and PSNRs of held-out views by budget; one process trains."""
     config = run.config.radiance
     budgets = trainer.budgets_for(capture, config, len(train))
     found = run.processes.once(lambda: _rehearsals(run, capture, train, budgets))
     budget = trainer.supported(found, budgets)
     scores = [[round(decibels, 2) for decibels in each] for each in found]
     rehearsed = dict(zip(map(trainer.budget_text, budgets), scores, strict=False))
-    if budget != budgets[-1]:
+    if budget.steps < config.steps:
         log.info(
-            "training takes %s, not %s: with so few photographs more does not pay (held out: %s); "
+            "training takes %s, not %d: with %d photographs more does not pay%s; "
             "--radiance.rehearsed-views 0 spends all",
-            *(trainer.budget_text(budget), trainer.budget_text(budgets[-1])),
-            reports.rehearsals_in_words(rehearsed) or "none could be",
+            *(trainer.budget_text(budget), config.steps, len(train)),
+            f" (held out: {reports.rehearsals_in_words(rehearsed)})" if rehearsed else "",
         )
     made = run.processes.once(
         lambda: trained_gaussians(capture, train, config, budget, run.work, run.progress)
@@ -277,7 +277,7 @@ def trained_gaussians(
         return found
     checkpoint = done.with_suffix(".checkpoint.safetensors")
     stated.unlink(missing_ok=True)
-    gaussians = trainer.train_within(capture, budget, config, train, checkpoint, progress)
+    gaussians = trainer.train_radiance(capture, config.spending(budget), train, checkpoint, progress)
     write_ply(done, gaussians)
     with atomic_path(stated) as temporary:
         temporary.write_text(digest_of(read_ply(done)))

@@ -41,7 +41,7 @@ from langsplat_core.training.radiance.trainer import (
     budgets_for,
     rehearse,
     supported,
-    train_within,
+    train_radiance,
 )
 
 Kind = Literal["few", "walk"]  # on an arc around a room's table; straight ahead along a street
@@ -283,7 +283,7 @@ def _measured(
     budgets = budgets_for(capture, config, len(train))
     found = rehearse(capture, config, budgets, train, progress=progress)
     budget = supported(found, budgets)
-    gaussians = train_within(capture, budget, config, train, progress=progress)
+    gaussians = train_radiance(capture, config.spending(budget), train, progress=progress)
     seconds = time.process_time() - began
     small = capture.read_at(held_out, QUICK.longer_side)
     scores = evaluate_views(gaussians, capture, held_out, small=small)

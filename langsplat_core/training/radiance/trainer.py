@@ -123,8 +123,11 @@ def train_radiance(
     train_indices: Sequence[int],
     checkpoint: Path | None = None,
     progress: Progress = silent,
+    promising: Callable[[Gaussians], bool] = lambda gaussians: True,
 ) -> Gaussians:
     """Fit Gaussians to the photographs at `train_indices`; return those that can be seen.
+
+    Where those after half of the steps are not `promising`, the training ends with them.
 
     With a `checkpoint` path the run continues from that file if it exists, and writes it every
     `config.checkpoint_every` steps, at the end, and when it is interrupted (Ctrl-C, or an error
@@ -163,7 +166,9 @@ def train_radiance(
     signals: list[int] = []  # held back while a step runs: half a step is no state to resume from
     with one_torch_thread(), handled(lambda number, _: signals.append(number)):
         try:
-            while state.step < config.steps:
+            while state.step < config.steps and (
+                state.step != config.steps // 2 or promising(_visible(state))
+            ):
                 recent.append(run.step(state))
                 # Every photograph has another loss: what is told is the mean over each 200th of the run.
                 if state.step * 200 // config.steps > (state.step - 1) * 200 // config.steps:
@@ -177,7 +182,12 @@ def train_radiance(
             if checkpoint:
                 training.save_checkpoint(checkpoint, state, made_from)
             raise
-    gaussians = state.gaussians()  # without those that no image can show
+    return _visible(state)
+
+
+def _visible(state: TrainingState) -> Gaussians:
+    """Return the Gaussians without those that no image can show."""
+    gaussians = state.gaussians()
     return gaussians.take(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= INRIA.alpha_min))
 
 
@@ -339,32 +349,34 @@ def _extent(capture: Capture, gaussians: Gaussians) -> float:
     return max(capture.extent(), 0.05 * distance)
 
 
-# Rehearsal of a training: how large a budget a few photographs support.
+# How large a budget a few photographs support.
 #
-# Few photographs can be overfitted, and from some budget on they are: views that were held out get worse.
-# Which one that is depends on the capture (docs/photographs.md). So some of the training views are held out,
-# and the others trained on with the smallest budget, then with larger ones, unless one clearly loses. The
-# training itself then takes all views.
+# Few photographs can be overfitted, and from some number of steps on they are: views that were held out get
+# worse. That number grows with the photographs (`VISITS`). A budget far above it is rehearsed: some of the
+# training views are held out, and the others trained on with the smallest budget, then with larger ones. The
+# training itself then takes all views. Every budget has the photographs' size: at a smaller one PSNRs are
+# higher, and tell nothing of the size that is asked for.
 
 REHEARSING = "rehearsing"
-LEAST_GAIN = 0.25  # dB, for which more is spent: less may be chance
+LEAST_GAIN = 0.25  # dB, for which thrice the steps are spent: less may be chance
+VISITS = 64  # steps for each of few photographs, after which held-out views gain no more
 
 
 def budgets_for(capture: Capture, config: RadianceConfig, views: int) -> list[RadianceBudget]:
     """Return the ascending budgets that are tried with so many training views.
 
-    The last is all that is asked for, and the only one with many views or few steps. Steps grow threefold. A
-    larger preset's budgets begin with the smaller one's, so that it cannot choose worse.
+    The last is all that is asked for, and the only one with many views or few steps; but `good` is cut to
+    `VISITS` of each photograph, with which larger ones begin. Steps grow threefold.
     """
     longer_side = max(max(camera.width, camera.height) for camera in capture.cameras)
     whole = RadianceBudget(longer_side, config.steps, config.max_gaussians, config.sh_degree)
-    if views > config.rehearsed_views or config.steps < 3 * QUICK.steps:
+    if views > config.rehearsed_views or config.steps < GOOD.steps:
         return [whole]
-    steps = [QUICK.steps]
-    while 9 * steps[-1] <= config.steps:
-        steps.append(3 * steps[-1])
-    larger = [(GOOD if count <= GOOD.steps else whole)._replace(steps=count) for count in steps]
-    return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *larger, whole)))
+    steps = max(VISITS * views, QUICK.steps)
+    budgets = [GOOD._replace(longer_side=longer_side, steps=steps).at_most(whole)]
+    while config.steps > GOOD.steps and 3 * budgets[-1].steps < config.steps:
+        budgets.append(whole._replace(steps=3 * budgets[-1].steps))
+    return [*budgets, whole] if config.steps > GOOD.steps else budgets
 
 
 def budget_text(budget: RadianceBudget) -> str:
@@ -380,69 +392,41 @@ def rehearse(
     checkpoint: Path | None = None,
     progress: Progress = silent,
 ) -> list[list[float]]:
-    """Train with ascending budgets without some of the views at `train_indices`, and score these.
+    """Train with ascending budgets without three of the views at `train_indices`, and score these.
 
-    Returns for each budget, from the smallest on up to one that clearly loses, the mean PSNR (dB, exposures
-    fitted) of the held-out views, in one rehearsal after the other, see `climb`. Empty where there is nothing
-    to decide: one budget, or so few views that none can be held out.
+    Returns for each budget, until the second in a row does not pay, the PSNRs (dB, exposures fitted) of the
+    held-out views. A training that is behind the best budget after half of its steps ends there: from then on
+    the held-out views gain about a tenth of a decibel. Empty where there is nothing to decide: one budget, or
+    so few views that none can be held out.
 
     With a `checkpoint` path an interrupted rehearsal goes on where it stopped; the files are those of
     `checkpoints_of` it, and stay.
     """
-    held_out = _held_out([capture.cameras[i] for i in train_indices])
-    if len(budgets) < 2 or not held_out:
+    every = max(3, min(8, len(train_indices) // 3))
+    rows = surrounded_views([capture.cameras[index] for index in train_indices], every)[:3]
+    if len(budgets) < 2 or not rows:
         return []
-    done: list[float] = []
+    held_out = [train_indices[row] for row in rows]
+    train = [index for index in train_indices if index not in held_out]
+    found: list[list[float]] = []
 
-    def score(index: int, number: int) -> float:
-        budget, without = budgets[index], held_out[number]
-        part = progress.part(len(done), len(budgets) * len(held_out), REHEARSING, budget_text(budget))
-        at = checkpoint and checkpoint.with_name(f"{index}-{number}-{checkpoint.name}")
-        small = capture.read_at(train_indices, budget.longer_side)
-        train = [row for row in range(len(small)) if row not in without]
-        gaussians = train_radiance(small, config.spending(budget), train, at, _steps_alone(part))
-        scores = differentiable.evaluate_views(gaussians, small, without, config.backend, near=config.near)
-        done.append(float(np.mean([score.psnr_exposed or score.psnr for score in scores])))
-        log.debug("%s without %s: %.2f dB", budget_text(budget), without, done[-1])
-        return done[-1]
+    def scores(gaussians: Gaussians) -> list[float]:
+        views = differentiable.evaluate_views(gaussians, capture, held_out, config.backend, near=config.near)
+        return [view.psnr_exposed or view.psnr for view in views]
 
-    return climb(len(budgets), len(held_out), score)
+    def gains(gaussians: Gaussians) -> bool:
+        best = found[_best(found)] if found else [0.0]
+        return float(np.mean(scores(gaussians))) > float(np.mean(best))
 
-
-def climb(budgets: int, rehearsals: int, score: Callable[[int, int], float]) -> list[list[float]]:
-    """Return the scores (dB) of ascending budgets, from the smallest on up to one that clearly loses.
-
-    score(i, n): what budget i reaches in rehearsal n. One in which a budget does not gain over the best so
-    far is its last: others could not make it pay.
-    """
-    found: list[list[float]] = [[] for _ in range(budgets)]
-
-    def reached(index: int, number: int) -> float:
-        if len(found[index]) == number:
-            found[index].append(score(index, number))
-        return found[index][number]
-
-    best = 0
-    for index in range(1, budgets):
-        gains: list[float] = []
-        while len(gains) < rehearsals and all(gain > 0 for gain in gains):
-            before = reached(best, len(gains))
-            gains.append(reached(index, len(gains)) - before)
-        if _pays(gains):
-            best = index
-        elif np.mean(gains) < -LEAST_GAIN:
+    for index, budget in enumerate(budgets):
+        part = progress.part(index, len(budgets), REHEARSING, budget_text(budget))
+        at = checkpoint and checkpoint.with_name(f"{index}-{checkpoint.name}")
+        spent = config.spending(budget)
+        found.append(scores(train_radiance(capture, spent, train, at, _steps_alone(part), gains)))
+        log.debug("%s without %s: %s dB", budget_text(budget), held_out, found[-1])
+        if index - _best(found) == 2:
             break
-    return [scores for scores in found if scores]
-
-
-def _held_out(cameras: Sequence[Camera]) -> list[list[int]]:
-    """Return the views that each rehearsal leaves out: an eighth, and three in all at least."""
-    views: list[list[int]] = []
-    taken: list[int] = []
-    while len(taken) < 3 and (more := surrounded_views(cameras, 8, taken)):
-        taken = [*taken, *more]
-        views.append(more)
-    return views
+    return found
 
 
 def _steps_alone(progress: Progress) -> Progress:
@@ -461,48 +445,15 @@ def checkpoints_of(checkpoint: Path) -> list[Path]:
 
 
 def supported(found: Sequence[Sequence[float]], budgets: Sequence[RadianceBudget]) -> RadianceBudget:
-    """Return the largest budget that gains in every rehearsal; the smallest where none was held out."""
+    """Return the largest budget that pays by the scores of `rehearse`; the smallest where there are none."""
+    return budgets[_best(found)]
+
+
+def _best(found: Sequence[Sequence[float]]) -> int:
+    """Return the last row of scores (dB) above those of the best before it: in the mean, and most of them."""
     best = 0
     for index in range(1, len(found)):
-        if _pays([more - less for more, less in zip(found[index], found[best], strict=False)]):
+        gains = np.subtract(found[index], found[best])
+        if gains.mean() >= LEAST_GAIN and np.median(gains) > 0:
             best = index
-    return budgets[best]
-
-
-def _pays(gains: Sequence[float]) -> bool:
-    """Return True where a larger budget pays that gained so much (dB): one view alone tells little."""
-    return min(gains) > 0 and float(np.mean(gains)) >= LEAST_GAIN
-
-
-def train_within(
-    capture: Capture,
-    budget: RadianceBudget,
-    config: RadianceConfig,
-    train_indices: Sequence[int],
-    checkpoint: Path | None = None,
-    progress: Progress = silent,
-) -> Gaussians:
-    """Call `train_radiance` with the budget's share of `config`, for images as large as the photographs."""
-    spent, cameras = config.spending(budget), capture.cameras
-    if all(max(camera.width, camera.height) <= budget.longer_side for camera in cameras):
-        return train_radiance(capture, spent, train_indices, checkpoint, progress)
-    small = capture.read_at(range(len(capture)), budget.longer_side)
-    gaussians = train_radiance(small, spent, train_indices, checkpoint, progress)
-    return widened(gaussians, [(small.cameras[index], cameras[index]) for index in train_indices])
-
-
-def widened(gaussians: Gaussians, views: Sequence[tuple[Camera, Camera]]) -> Gaussians:
-    """Return Gaussians fitted to the first camera of each view, as large as the second has to see them.
-
-    The second has the same place and more pixels: what the dilation (`raster.protocol.dilation`) adds there
-    is less.
-    """
-    added = np.full(len(gaussians), np.inf)
-    for camera, finer in views:
-        pixels, depth = camera.project(gaussians.means)
-        seen = camera.in_image(pixels, depth)
-        less = 1 / (camera.fx * camera.fy) - 1 / (finer.fx * finer.fy)
-        added[seen] = np.minimum(added, INRIA.dilation * depth**2 * less)[seen]
-    added = np.where(np.isfinite(added), added, 0)[:, None]
-    variances = np.exp(2 * gaussians.log_scales.astype(np.float64)) + added
-    return replace(gaussians, log_scales=(np.log(variances) / 2).astype(np.float32))
+    return best
