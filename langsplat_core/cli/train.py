@@ -45,6 +45,8 @@ class Train:
     """A file of options, `preset = "good"` or `radiance.steps = 7000`; options beside it count more."""
     gaussians: Path | None = None
     """Take the Gaussians of this scene, trained elsewhere from the same cameras, and describe them."""
+    until: Literal["gaussians", "language field"] = "language field"
+    """"gaussians" writes a scene without a language field; the same command without this adds that."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:
@@ -66,6 +68,7 @@ class Train:
                 progress,
                 processes=processes,
                 gaussians_from=self.gaussians,
+                until=self.until,
             )
         if not processes.is_main:
             return
@@ -76,12 +79,14 @@ class Train:
             if report.psnr is None
             else f"held-out PSNR {report.psnr:.2f} dB{small} ({report.held_out_rule}: {names})"
         )
-        print(
-            f"{self.out}: {report.gaussians} Gaussians from {report.views} photographs, {psnr}; "
+        described = (
             f"{report.mask_count} masks by {report.masks}, encoder {report.encoder}; "
             f"{report.codec} of {report.codec_size}, relevancy error {report.relevancy_error:.4f} "
-            f"(99 % below {report.relevancy_error_p99:.3f}); "
-            f"{sum(report.seconds.values()):.0f} s"
+            f"(99 % below {report.relevancy_error_p99:.3f})"
+        )
+        print(
+            f"{self.out}: {report.gaussians} Gaussians from {report.views} photographs, {psnr}; "
+            f"{described if report.masks else 'no language field'}; {sum(report.seconds.values()):.0f} s"
         )
         for warning in report.warnings:
             print(f"warning: {warning}")

@@ -39,17 +39,17 @@ class TrainReport:
     held_out: int
     gaussians: int
     psnr: float | None  # mean over held-out views, dB; None without held-out views
-    masks: str  # name of the mask source
-    encoder: str
-    mask_count: int
-    codec: str  # its kind
-    codec_size: int  # codewords of a codebook, numbers per latent of other kinds
-    codec_cosine: float  # mean, of a Gaussian's vector with what the codec makes of it
-    relevancy_error: float  # mean absolute, of what the codec makes of it, over everyday phrases
-    relevancy_error_p99: float
-    observed: float  # fraction of Gaussians with language features at the whole level
     warnings: tuple[str, ...]  # quality warnings, each with its remedy
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
+    masks: str = ""  # name of the mask source; "" without a language field, as what follows
+    encoder: str = ""
+    mask_count: int = 0
+    codec: str = ""  # its kind
+    codec_size: int = 0  # codewords of a codebook, numbers per latent of other kinds
+    codec_cosine: float = 0.0  # mean, of a Gaussian's vector with what the codec makes of it
+    relevancy_error: float = 0.0  # mean absolute, of what the codec makes of it, over everyday phrases
+    relevancy_error_p99: float = 0.0
+    observed: float = 0.0  # fraction of Gaussians with language features at the whole level
     dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
     held_out_views: tuple[ViewScore, ...] = ()  # one by one
     psnr_small: float | None = None  # as `psnr`, of images shrunk to 320 px, by which presets compare
@@ -235,12 +235,15 @@ def _figures(report: TrainReport, matches: Matches | None) -> str:
     figures |= {
         "matches": found,
         "rehearsed": rehearsals_in_words(report.rehearsed) or "no",
+    }
+    described = {
         "masks by": report.masks,
         "encoder": report.encoder,
         "codec": f"{report.codec} of {report.codec_size}, mean cosine {report.codec_cosine:.4f}",
         "relevancy error": f"{report.relevancy_error:.4f} (99 % below {report.relevancy_error_p99:.3f})",
         "Gaussians with language features": f"{100 * report.observed:.1f} %",
     }
+    figures |= described if report.masks else {}
     cells = (f"<tr><td>{_text(name, 1000)}<td>{_text(value, 300)}" for name, value in figures.items())
     return _section("Stages and figures", f"<table>{''.join(cells)}</table>")
 

@@ -6,22 +6,17 @@ continues where it stopped and a changed setting recomputes only what depends on
 
 import json
 import logging
+import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
-from langsplat_core.config import (
-    QUICK,
-    DatasetConfig,
-    RadianceBudget,
-    RadianceConfig,
-    TrainConfig,
-    check_settings,
-)
+from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
 from langsplat_core.errors import STRICTNESS, FormatError, InputError
@@ -32,7 +27,7 @@ from langsplat_core.pipeline import language_field
 from langsplat_core.pipeline import report as reports
 from langsplat_core.pipeline.stages import ProcessGroup, digest_of, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene import Gaussians, LanguageField, Scene
 from langsplat_core.scene.transform import place_scene
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, Encoder, load_encoder
 from langsplat_core.semantics.features import FeatureStore, ImageFeatures, OnDemand, describe_capture
@@ -44,10 +39,12 @@ from langsplat_core.training.radiance.differentiable import evaluate_views
 FEWEST_VIEWS = 3
 VERSION = 7  # of what training and rehearsals make
 
+Until = Literal["gaussians", "language field"]  # what a training ends with
+
 log = logging.getLogger("langsplat")
 
 
-def train_scene(
+def train_scene(  # noqa: PLR0913  what the command has as options
     dataset: Path,
     out: Path,
     config: TrainConfig,
@@ -56,13 +53,14 @@ def train_scene(
     masks_of: Callable[[Capture], MaskSource] | None = None,
     processes: ProcessGroup | None = None,
     gaussians_from: Path | None = None,
+    until: Until = "language field",
 ) -> reports.TrainReport:
     """Train `out` (a .ply; sidecar and cameras beside it) from the photographs in `dataset`.
 
     `masks_of` makes another mask source than ``config.masks`` names, once the photographs are read.
     `processes`: the processes that share the work; all call this with the same arguments, and one writes the
     scene. `gaussians_from`: a scene in the photographs' world whose Gaussians are taken instead of training
-    some.
+    some. `until` "gaussians": a scene without a language field, which a later call adds to it.
     """
     check_settings(config)
     language_field.check_lift(config)
@@ -75,7 +73,7 @@ def train_scene(
     given = None if gaussians_from is None else load_scene(gaussians_from)
     processes = processes or ProcessGroup()
     with sole_use(work) if processes.is_main else nullcontext():
-        return _train(_Run(dataset, out, config, work, progress, processes), masks_of, given)
+        return _train(_Run(dataset, out, config, work, progress, processes, until), masks_of, given)
 
 
 @dataclass(frozen=True)
@@ -88,6 +86,7 @@ class _Run:
     work: Path
     progress: Progress
     processes: ProcessGroup
+    until: Until
     seconds: dict[str, float] = field(default_factory=dict)  # that each stage took
 
     @contextmanager
@@ -103,23 +102,22 @@ def _train(
     run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: Scene | None
 ) -> reports.TrainReport:
     """Train in a work folder that is this run's own; `given`: the scene whose Gaussians are taken."""
-    config, processes, shared = run.config, run.processes, (run.work, run.progress, run.processes)
+    config, processes = run.config, run.processes
+    encoder, named_source = None, None
     with run.timed("photographs"):
-        # First: absent weights should not cost an hour.
-        encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
-        named_source = None if masks_of else load_mask_source(config.masks, config.clip.device)
+        if run.until != "gaussians":  # first: absent weights should not cost an hour
+            encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
+            named_source = None if masks_of else load_mask_source(config.masks, config.clip.device)
         # One process solves for cameras, the others find them in the work folder.
         capture = processes.once(lambda: _photographs(run))
         train, held_out = split_views(capture, config.dataset)
-    mask_source = named_source or masks_of(capture)  # type: ignore[misc]  # one of them is there
-    log.info("masks: %s, encoder: %s", mask_source.name, encoder.id)
-    if encoder.id == DEMO and not capture.drawn:
-        log.warning("%s", DEMO_ELSEWHERE)
-
-    with run.timed("masks and vectors"):
         cameras = tuple(capture.cameras[i] for i in train)
-        features = _described(run, capture, train, mask_source, encoder)
-        language_field.check_masks(features)  # before the Gaussians, which may cost hours
+
+    if encoder is not None:
+        mask_source = named_source or masks_of(capture)  # type: ignore[misc]  # one of them is there
+        with run.timed("masks and vectors"):
+            features = _described(run, capture, train, mask_source, encoder)
+            language_field.check_masks(features)  # before the Gaussians, which may cost hours
 
     with run.timed("radiance"):
         if given is None:
@@ -127,17 +125,9 @@ def _train(
         else:
             gaussians, rehearsed = place_scene(given, origin=capture.origin).gaussians, {}
 
-    if not mask_source.agrees:
-        with run.timed("masks that agree"):
-            photographs = [(capture.images[i], capture.mask(i)) for i in train]
-            views = language_field.views_of(cameras, features)
-            features = language_field.agreed_features(gaussians, views, photographs, encoder, config, *shared)
-
-    with run.timed("language field"):
-        views = language_field.views_of(cameras, features)
-        language, codec_report = language_field.language_field(gaussians, views, encoder, config, *shared)
-        if not capture.drawn:
-            language = replace(language, calibration=None)  # which holds in drawn rooms alone
+    language, figures = None, dict[str, Any]()
+    if encoder is not None:
+        language, figures = _language(run, capture, train, gaussians, features, mask_source, encoder)
 
     if processes.is_main:
         with run.timed("saving and held-out views"):
@@ -149,45 +139,67 @@ def _train(
             near = config.radiance.near or scene.near  # as whoever opens the scene has it
             scores = evaluate_views(gaussians, capture, held_out, small=small, near=near) if held_out else []
             trained = evaluate_views(gaussians, capture, reports.shown_views(train), near=near)
+        rule = f"one in {config.dataset.test_every}, "
+        rule += "by name" if config.dataset.hold_out == "every" else "amid others"
         report = reports.TrainReport(
             views=len(cameras),
             held_out=len(scores),
             gaussians=len(gaussians),
             psnr=_mean(score.psnr for score in scores),
             psnr_small=_mean(score.psnr_small for score in scores),
-            masks=mask_source.name,
-            encoder=encoder.id,
-            mask_count=sum(len(item.vectors) for item in features),
-            codec=language.codec.kind,
-            codec_size=language.codec.size,
-            codec_cosine=codec_report.cosine,
-            relevancy_error=codec_report.error_mean,
-            relevancy_error_p99=codec_report.error_p99,
-            observed=float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
             warnings=reports.quality_warnings(capture, train, scores, trained),
             seconds=run.seconds,
             dataset=str(run.dataset.resolve()),
             held_out_views=tuple(scores),
             rehearsed=rehearsed,
             psnr_trained=_mean(score.psnr for score in trained),
-            held_out_rule=_held_out_rule(capture, config.dataset),
+            held_out_rule="as the dataset says" if any(photo.held_out for photo in capture.photos) else rule,
+            **figures,
         )
         reports.write_reports(run.work, report, capture, gaussians, trained)
     processes.barrier()
     return reports.read_report(run.work)
 
 
+def _language(
+    run: _Run,
+    capture: Capture,
+    train: list[int],
+    gaussians: Gaussians,
+    features: Sequence[ImageFeatures],
+    source: MaskSource,
+    encoder: Encoder,
+) -> tuple[LanguageField, dict[str, Any]]:
+    """Return the language field of the Gaussians, and the report's figures of it."""
+    config, shared = run.config, (run.work, run.progress, run.processes)
+    cameras = tuple(capture.cameras[i] for i in train)
+    if not source.agrees:
+        with run.timed("masks that agree"):
+            photographs = [(capture.images[i], capture.mask(i)) for i in train]
+            views = language_field.views_of(cameras, features)
+            features = language_field.agreed_features(gaussians, views, photographs, encoder, config, *shared)
+    with run.timed("language field"):
+        views = language_field.views_of(cameras, features)
+        language, codec = language_field.language_field(gaussians, views, encoder, config, *shared)
+        if not capture.drawn:
+            language = replace(language, calibration=None)  # which holds in drawn rooms alone
+    return language, {
+        "masks": source.name,
+        "encoder": encoder.id,
+        "mask_count": sum(len(item.vectors) for item in features),
+        "codec": language.codec.kind,
+        "codec_size": language.codec.size,
+        "codec_cosine": codec.cosine,
+        "relevancy_error": codec.error_mean,
+        "relevancy_error_p99": codec.error_p99,
+        "observed": float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
+    }
+
+
 def _mean(scores: Iterable[float | None]) -> float | None:
     """Mean of the scores that could be measured; None where none could."""
     measured = [score for score in scores if score is not None]
     return float(np.mean(measured)) if measured else None
-
-
-def _held_out_rule(capture: Capture, config: DatasetConfig) -> str:
-    """Return in words which views `split_views` holds out."""
-    if any(photo.held_out for photo in capture.photos):
-        return "as the dataset says"
-    return f"one in {config.test_every}, {'by name' if config.hold_out == 'every' else 'amid others'}"
 
 
 def _photographs(run: _Run) -> Capture:
@@ -209,6 +221,9 @@ def _described(
 
     Others are described once they agree. Kept by mask settings, encoder and image.
     """
+    log.info("masks: %s, encoder: %s", source.name, encoder.id)
+    if encoder.id == DEMO and not capture.drawn:
+        log.warning("%s", DEMO_ELSEWHERE)
     store = FeatureStore(run.work / ("features" if source.agrees else "masks"))
     mine = run.processes.share(train)
     names = [capture.cameras[i].name for i in mine]
@@ -224,7 +239,7 @@ def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians
     config = run.config.radiance
     budgets = trainer.budgets_for(capture, config, len(train))
     found = run.processes.once(lambda: _rehearsals(run, capture, train, budgets))
-    budget = trainer.supported(found, budgets)
+    budget = budgets[trainer.supported(found)]
     scores = [[round(decibels, 2) for decibels in each] for each in found]
     rehearsed = dict(zip(map(trainer.budget_text, budgets), scores, strict=False))
     if budget.steps < config.steps:
@@ -247,10 +262,10 @@ def _rehearsals(
     config = run.config.radiance
     done = run.work / f"{_radiance_key('rehearsal', capture, train, config)}.json"
     if not done.exists():
-        checkpoint = done.with_suffix(".checkpoint.safetensors")
-        write_json(done, trainer.rehearse(capture, config, budgets, train, checkpoint, run.progress))
-        for left in trainer.checkpoints_of(checkpoint):
-            left.unlink(missing_ok=True)
+        checkpoints = done.with_suffix(".checkpoints")
+        checkpoints.mkdir(exist_ok=True)
+        write_json(done, trainer.rehearse(capture, config, budgets, train, checkpoints, run.progress))
+        shutil.rmtree(checkpoints)
     try:
         found: list[list[float]] = json.loads(done.read_bytes())
     except ValueError as error:

@@ -282,7 +282,7 @@ def _measured(
     began = time.process_time()
     budgets = budgets_for(capture, config, len(train))
     found = rehearse(capture, config, budgets, train, progress=progress)
-    budget = supported(found, budgets)
+    budget = budgets[supported(found)]
     gaussians = train_radiance(capture, config.spending(budget), train, progress=progress)
     seconds = time.process_time() - began
     small = capture.read_at(held_out, QUICK.longer_side)

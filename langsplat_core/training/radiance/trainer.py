@@ -389,7 +389,7 @@ def rehearse(
     config: RadianceConfig,
     budgets: Sequence[RadianceBudget],
     train_indices: Sequence[int],
-    checkpoint: Path | None = None,
+    checkpoints: Path | None = None,
     progress: Progress = silent,
 ) -> list[list[float]]:
     """Train with ascending budgets without three of the views at `train_indices`, and score these.
@@ -399,8 +399,7 @@ def rehearse(
     the held-out views gain about a tenth of a decibel. Empty where there is nothing to decide: one budget, or
     so few views that none can be held out.
 
-    With a `checkpoint` path an interrupted rehearsal goes on where it stopped; the files are those of
-    `checkpoints_of` it, and stay.
+    With a folder for `checkpoints` an interrupted rehearsal goes on where it stopped.
     """
     every = max(3, min(8, len(train_indices) // 3))
     rows = surrounded_views([capture.cameras[index] for index in train_indices], every)[:3]
@@ -415,16 +414,16 @@ def rehearse(
         return [view.psnr_exposed or view.psnr for view in views]
 
     def gains(gaussians: Gaussians) -> bool:
-        best = found[_best(found)] if found else [0.0]
+        best = found[supported(found)] if found else [0.0]
         return float(np.mean(scores(gaussians))) > float(np.mean(best))
 
     for index, budget in enumerate(budgets):
         part = progress.part(index, len(budgets), REHEARSING, budget_text(budget))
-        at = checkpoint and checkpoint.with_name(f"{index}-{checkpoint.name}")
+        at = checkpoints and checkpoints / f"{index}.safetensors"
         spent = config.spending(budget)
         found.append(scores(train_radiance(capture, spent, train, at, _steps_alone(part), gains)))
         log.debug("%s without %s: %s dB", budget_text(budget), held_out, found[-1])
-        if index - _best(found) == 2:
+        if index - supported(found) == 2:
             break
     return found
 
@@ -439,18 +438,8 @@ def _steps_alone(progress: Progress) -> Progress:
     return Progress(show)
 
 
-def checkpoints_of(checkpoint: Path) -> list[Path]:
-    """Return the files that `rehearse` wrote."""
-    return list(checkpoint.parent.glob(f"*-{checkpoint.name}"))
-
-
-def supported(found: Sequence[Sequence[float]], budgets: Sequence[RadianceBudget]) -> RadianceBudget:
-    """Return the largest budget that pays by the scores of `rehearse`; the smallest where there are none."""
-    return budgets[_best(found)]
-
-
-def _best(found: Sequence[Sequence[float]]) -> int:
-    """Return the last row of scores (dB) above those of the best before it: in the mean, and most of them."""
+def supported(found: Sequence[Sequence[float]]) -> int:
+    """Return the last of the budgets with the scores of `rehearse` that pays over the best before it."""
     best = 0
     for index in range(1, len(found)):
         gains = np.subtract(found[index], found[best])
