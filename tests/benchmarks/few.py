@@ -171,11 +171,11 @@ def person(kit: Kit) -> Thing:
 
 # The report.
 
-LARGE = 800  # px, of a window beside them: with dilation as at the photographs' size, and growing
+LARGER = (480, 800)  # px, of windows beside them: with dilation as at the photographs' size, and growing
 HEAD = (
     "capture", "training / held out", "preset", "with", "seed", "held out, dB", "exposure fitted, dB",
-    f"at {QUICK.longer_side} px, dB", f"at {LARGE} px: dilation constant, growing", "SSIM", "training, dB",
-    "budget", "rehearsed, dB", "Gaussians", "CPU-s",
+    f"at {QUICK.longer_side} px, dB", f"at each of {LARGER} px: dilation constant, growing",
+    "SSIM", "training, dB", "budget", "rehearsed, dB", "Gaussians", "CPU-s",
 )  # fmt: skip
 # What a training has, beside its preset.
 VARIANTS: dict[str, dict[str, object]] = {
@@ -204,6 +204,7 @@ class Few:
     views: int = 0
     """Photographs, evenly spread over the capture; 0: all."""
     test_every: int = 4
+    hold_out: Literal["chosen", "every"] = "chosen"
     uneven: float = 0.0
     """Deviation of the logarithm of the exposure that each training photograph is given; of that of each
     channel's gain, a third."""
@@ -227,21 +228,21 @@ class Few:
         print(markdown(HEAD, rows))
 
     def _rows(self, folder: Path, name: str, work: Path, progress: Progress) -> Iterator[tuple[str, ...]]:
-        large = self._capture(folder, work, LARGE, progress)[0]
+        larger = [self._capture(folder, work, side, progress)[0] for side in LARGER]
         for preset in self.presets:
             config = with_preset(TrainConfig(), preset)
             capture, train, held_out = self._capture(folder, work, config.dataset.max_side, progress)
             for variant in self.variants:
                 for seed in self.seeds:
                     settings = replace(config.radiance, seed=seed, **VARIANTS[variant])  # type: ignore[arg-type]
-                    found = _measured(capture, large, settings, train, held_out, progress)
+                    found = _measured(capture, larger, settings, train, held_out, progress)
                     counts = f"{len(train)} / {len(held_out)}"
                     yield (name, counts, preset, variant, str(seed), *found)
 
     def _capture(
         self, folder: Path, work: Path, side: int, progress: Progress
     ) -> tuple[Capture, list[int], list[int]]:
-        config = DatasetConfig(max_side=side, test_every=self.test_every, allow_few_cameras=True)
+        config = DatasetConfig(side, self.test_every, self.hold_out, allow_few_cameras=True)
         capture = load_capture(folder, config, work, progress)
         if self.views:
             rows = np.unique(np.linspace(0, len(capture) - 1, self.views).round().astype(int))
@@ -273,7 +274,7 @@ def _subset(capture: Capture, rows: Sequence[int]) -> Capture:
 
 def _measured(
     capture: Capture,
-    large: Capture,
+    larger: Sequence[Capture],
     config: RadianceConfig,
     train: Sequence[int],
     held_out: Sequence[int],
@@ -289,20 +290,19 @@ def _measured(
     scores = evaluate_views(gaussians, capture, held_out, small=small)
     learnt = evaluate_views(gaussians, capture, train)
     scene = Scene(gaussians, cameras=tuple(capture.cameras[i] for i in train))
-    exposed = [score.psnr_exposed for score in scores if score.psnr_exposed is not None]
     means = [
-        np.mean([score.psnr for score in scores]),
-        np.mean(exposed) if exposed else np.nan,
-        np.mean([score.psnr_small for score in scores if score.psnr_small is not None]),
+        np.mean([found for score in scores if (found := getattr(score, name)) is not None] or [np.nan])
+        for name in ("psnr", "psnr_exposed", "psnr_small")
     ]
-    larger = [
-        np.mean([psnr(_image(drawn, large.cameras[i]) / 255, large.images[i] / 255) for i in held_out])
+    windows = [
+        np.mean([psnr(_image(drawn, at.cameras[i]) / 255, at.images[i] / 255) for i in held_out])
+        for at in larger
         for drawn in (Scene(gaussians), scene)
     ]
     ssim = np.mean([score.ssim for score in scores])
     return (
         *(f"{mean:.2f}" for mean in means),
-        ", ".join(f"{mean:.2f}" for mean in larger),
+        ", ".join(f"{mean:.2f}" for mean in windows),
         *(f"{ssim:.3f}", f"{np.mean([score.psnr for score in learnt]):.2f}"),
         *(
             budget_text(budget),

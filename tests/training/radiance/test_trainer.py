@@ -230,6 +230,8 @@ def test_presets_are_cut_and_rehearsed_with_few_views_only() -> None:
     assert tried(TrainConfig(radiance=RadianceConfig(rehearsed_views=0))) == [whole]
     small = RadianceConfig(steps=1_500, max_gaussians=5_000, sh_degree=0)
     assert budgets_for(noise(200, 1), small, 24) == [RadianceBudget(200, 1_500, 5_000, 0)]
+    assert rehearse(noise(), RadianceConfig(), [QUICK, GOOD], [0, 4, 7]) == []
+    assert rehearse(noise(), RadianceConfig(), [QUICK], range(8)) == []
 
 
 @pytest.mark.parametrize(
@@ -243,11 +245,6 @@ def test_presets_are_cut_and_rehearsed_with_few_views_only() -> None:
 )
 def test_larger_budgets_are_supported_where_most_views_gain(scores: list[list[float]], best: int) -> None:
     assert supported(scores) == best
-
-
-def test_few_views_train_without_rehearsals() -> None:
-    assert rehearse(noise(), RadianceConfig(), [QUICK, GOOD], [0, 4, 7]) == []
-    assert rehearse(noise(), RadianceConfig(), [QUICK], range(8)) == []
 
 
 @pytest.mark.parametrize("promising", [True, False])
