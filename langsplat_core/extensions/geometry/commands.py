@@ -89,8 +89,9 @@ class WriteMesh:
             if self.watertight:
                 mesh, area = close_holes(mesh, side)
                 share = 100 * area / max(float(mesh.areas().sum()), 1e-300)
-                left = "" if mesh.holes() == 0 else f", {mesh.holes()} left at the border of the scene"
-                made = f" closed{left}; made up: {area * unit.length**2:.3g} {unit.name}^2 ({share:.0f} %)"
+                made = f" closed; made up: {area * unit.length**2:.3g} {unit.name}^2 ({share:.0f} %)"
+                if hollows := mesh.hollows():
+                    made += f"; {hollows} hollow pieces, which what is solid surrounds, as walls do a room"
             mesh = replace(mesh, name=self.phrase or self.scene.stem)
             write_mesh(self.out, mesh, scene)
         print(
@@ -306,11 +307,11 @@ def write_grid(folder: Path, plan: FloorMap) -> None:
 
 
 def write_collider(path: Path, occupancy: Occupancy) -> None:
-    """Write everything that is occupied as squares, a Wavefront OBJ in metres."""
-    corners, squares = collider(occupancy)
+    """Write everything that is occupied as watertight triangles, a Wavefront OBJ in metres."""
+    corners, triangles = collider(occupancy)
     with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
         np.savetxt(file, corners, "v %.9g %.9g %.9g")
-        np.savetxt(file, squares + 1, "f %d %d %d %d")
+        np.savetxt(file, triangles + 1, "f %d %d %d")
 
 
 def write_voxels(

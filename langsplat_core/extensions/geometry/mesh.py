@@ -5,6 +5,10 @@ where this Gaussian is densest along the ray. The depth of its centre, which `Vi
 wherever a large Gaussian is seen aslant.
 """
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,12 +56,14 @@ class Mesh:
 
     def holes(self) -> int:
         """Return the number of holes: loops of edges with a triangle on one side alone."""
-        edges = np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        edges, sides = np.unique(edges, axis=0, return_counts=True)
-        rim = edges[sides == 1]
-        ends, at = np.unique(rim, return_inverse=True)
-        links = coo_matrix((np.ones(len(rim)), tuple(at.reshape(-1, 2).T)), shape=(len(ends), len(ends)))
-        return int(connected_components(links, directed=False)[0]) if len(rim) else 0
+        return int(_rims(self.triangles)[1].max(initial=-1)) + 1
+
+    def hollows(self) -> int:
+        """Return the number of pieces that are turned inside out: hollows in others, of a watertight mesh."""
+        piece = _pieces(self.triangles[:, [0, 1, 1, 2]].reshape(-1, 2), len(self.vertices))
+        a, b, c = (self.vertices[self.triangles[:, corner]] for corner in range(3))
+        volumes = np.bincount(piece[self.triangles[:, 0]], (np.cross(a, b) * c).sum(1))
+        return int(np.count_nonzero(volumes < 0))
 
     def areas(self) -> Array:
         """(T,) areas of the triangles, square world units."""
@@ -168,15 +174,100 @@ def _taken(mesh: "object") -> Mesh:
 
 def _cleaned(mesh: Mesh) -> Mesh:
     """Without the pieces of fewer triangles than a `SPECK`. InputError where nothing is left."""
-    count = len(mesh.vertices)
-    ends = mesh.triangles[:, [0, 1]].T, mesh.triangles[:, [1, 2]].T
-    links = coo_matrix((np.ones(2 * len(mesh.triangles)), tuple(np.hstack(ends))), shape=(count, count))
-    piece = connected_components(links, directed=False)[1][mesh.triangles[:, 0]]
+    vertices = _pieces(mesh.triangles[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices))
+    piece = vertices[mesh.triangles[:, 0]]
     kept = mesh.triangles[np.bincount(piece)[piece] >= SPECK] if len(piece) else mesh.triangles
     if len(kept) == 0:
         raise InputError("too few views show the same surface; take fewer --views, or a coarser --resolution")
     used, triangles = np.unique(kept, return_inverse=True)
     return Mesh(mesh.vertices[used], triangles.reshape(-1, 3), mesh.colour[used], mesh.name)
+
+
+def _pieces(edges: Array, count: int) -> Array:
+    """(count,) the number of the connected piece of each vertex, by (E, 2) edges."""
+    links = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1])
+
+
+def _distinct(rows: Array) -> tuple[Array, Array]:
+    """(N, k) integers >= 0 -> one row of each kind, in rising order, and (N,) the kind of each row."""
+    kind = first = np.zeros(len(rows), np.int64)
+    for column in rows.T:  # as single numbers: np.unique along an axis is twenty times slower
+        keys = kind * (column.max(initial=0) + 1) + column
+        _, first, kind = np.unique(keys, return_index=True, return_inverse=True)
+    return rows[first], kind
+
+
+def _means(values: Array, groups: Array) -> Array:
+    """(G, D) means of (N, D) values by their group, 0 to G - 1."""
+    return np.stack([np.bincount(groups, column) for column in values.T], 1) / np.bincount(groups)[:, None]
+
+
+def _rims(triangles: Array) -> tuple[Array, Array]:
+    """(R, 2) directed edges that no triangle runs back, and (R,) the number of their loop."""
+    sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges, which = _distinct(np.sort(sides, axis=1))
+    net = np.bincount(which, np.where(sides[:, 0] < sides[:, 1], 1, -1)).astype(int)
+    rims = np.repeat(np.where(net[:, None] > 0, edges, edges[:, ::-1]), np.abs(net), axis=0)
+    ends, at = np.unique(rims, return_inverse=True)
+    at = at.reshape(-1, 2)
+    return rims, np.unique(_pieces(at, len(ends))[at[:, 0]], return_inverse=True)[1]
+
+
+def watertight(points: Array, triangles: Array, near: float) -> tuple[Array, Array]:
+    """Return a surface as one of which every edge has two triangles, which run along it in opposite ways.
+
+    points: (V, D) places, and colours or nothing behind them; near: places that are closer are one.
+
+    Triangles without an area, beside their own reverse, or twice are left out, and a fan closes every rim.
+    Then every edge is run forth as often as back, and the triangles at it can be paired, each with the next
+    one across what is solid. Where there are several pairs each gets a vertex of its own on the edge, a hair
+    inside the solid, and its triangles become fans.
+    """
+    cells = np.rint((points[:, :3] - points[:, :3].min(axis=0, initial=0)) / near).astype(np.int64)
+    place = _distinct(cells)[1]
+    points, triangles = points[np.unique(place, return_index=True)[1]], place[triangles]
+    turns = np.sign(triangles - np.roll(triangles, 1, axis=1)).prod(axis=1)  # 0: without an area
+    faces, which = _distinct(np.sort(triangles, axis=1))
+    net = np.bincount(which, -turns)
+    used, triangles = np.unique(
+        np.where(net[:, None] > 0, faces, faces[:, ::-1])[net != 0], return_inverse=True
+    )
+    points, triangles = points[used], triangles.reshape(-1, 3)
+    rims, loops = _rims(triangles)
+    triangles = np.concatenate([triangles, np.column_stack([rims[:, ::-1], len(points) + loops])])
+    points = np.concatenate([points, _means(points[rims[:, 0]], loops)])
+    a, b, c = (points[triangles[:, corner], :3] for corner in range(3))
+    flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) < 1e-2 * near * np.linalg.norm(
+        b - a + c - a, axis=1
+    )
+    bent = _means(np.repeat((a + b + c) / 3, 3, axis=0), triangles.reshape(-1))[triangles[flat]]
+    points[triangles[flat], :3] += 0.05 * (bent - points[triangles[flat], :3])
+
+    start, end, third = (np.roll(triangles, -step, axis=1).reshape(-1) for step in range(3))
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    edge = _distinct(np.column_stack([low, high]))[1]
+    many = np.flatnonzero(np.bincount(edge)[edge] > 2)
+    axis, forth = unit((points[high] - points[low])[many, :3], 1e-30), (start < end)[many]
+    arms, edge = (points[third] - points[low])[many, :3], edge[many]
+    edges, opening = np.unique(edge[~forth], return_index=True)  # from which angles are counted
+    zero = arms[~forth][opening][np.searchsorted(edges, edge)]
+    zero -= (zero * axis).sum(1)[:, None] * axis
+    angles = np.arctan2((arms * np.cross(axis, zero)).sum(1), (arms * zero).sum(1))
+    order = np.lexsort((np.mod(angles + 1e-9, 2 * np.pi), edge))
+    # What is solid lies between one that runs back and the next that runs forth.
+    pairs = np.column_stack([many[order][~forth[order]], many[order][forth[order]]])
+    ends, inside = points[start[pairs[:, 0]]] + points[end[pairs[:, 0]]], points[third[pairs]].mean(1)
+    on, cut = np.full(triangles.size, -1), np.zeros(len(triangles), bool)
+    on[pairs], cut[pairs // 3] = (len(points) + np.arange(len(pairs)))[:, None], True
+    centres = len(points) + len(pairs) + np.cumsum(cut) - 1
+    middles = points[triangles[cut]].mean(1)
+    points = np.concatenate([points, 0.475 * ends + 0.05 * inside, middles])
+    sides = np.flatnonzero(np.repeat(cut, 3))
+    halves = sides[on[sides] >= 0]
+    fans = np.column_stack([start, np.where(on < 0, end, on), np.repeat(centres, 3)])[sides]
+    more = np.column_stack([on, end, np.repeat(centres, 3)])[halves]
+    return points, np.concatenate([triangles[~cut], fans, more])
 
 
 def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
@@ -193,10 +284,31 @@ def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     depth = int(np.clip(np.ceil(np.log2(ROOM * extent / resolution)), 5, 10))
     poisson = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson
-    closed = _taken(poisson(points, depth=depth, scale=ROOM, n_threads=1)[0])
+    with _silenced():
+        rough = _taken(poisson(points, depth=depth, scale=ROOM, n_threads=1)[0])
+    values, triangles = watertight(
+        np.concatenate([rough.vertices, rough.colour], axis=1), rough.triangles, 1e-3 * resolution
+    )
+    closed = Mesh(values[:, :3], triangles, values[:, 3:])
     middles = closed.vertices[closed.triangles].mean(1)
     gaps = cKDTree(mesh.vertices).query(middles, workers=-1)[0]
     return closed, float(closed.areas()[gaps > 2 * resolution].sum())
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Drop what native code prints: PoissonRecon tells of roots that it does not find, and does without."""
+    sys.stdout.flush()
+    kept = [os.dup(number) for number in (1, 2)]
+    with open(os.devnull, "wb") as nowhere:
+        for number in (1, 2):
+            os.dup2(nowhere.fileno(), number)
+    try:
+        yield
+    finally:
+        for number, copy in zip((1, 2), kept, strict=True):
+            os.dup2(copy, number)
+            os.close(copy)
 
 
 # Files that other programs open.

@@ -13,6 +13,7 @@ from scipy import ndimage
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.geometry.mesh import watertight
 from langsplat_core.extensions.geometry.planes import Room, turned_origin
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
@@ -243,7 +244,7 @@ def _between(plan: FloorMap, blocked: Array, start: Array, end: Array) -> bool:
 
 
 def collider(occupancy: Occupancy) -> tuple[Array, Array]:
-    """Return squares around all that is occupied, counterclockwise: (V, 3) corners, m, (F, 4) int64 faces."""
+    """Return triangles around all that is occupied, as `watertight` does: (V, 3) corners, m, and (T, 3)."""
     solid = np.pad(occupancy.occupied, 1)
     loop = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])  # counterclockwise from above
     corners = []
@@ -253,5 +254,7 @@ def collider(occupancy: Occupancy) -> tuple[Array, Array]:
         square[:, :, axis] += side
         square[:, :, [(axis + 1) % 3, (axis + 2) % 3]] += loop if side else loop[:, ::-1]
         corners.append(square.reshape(-1, 3))
-    every, which = np.unique(np.concatenate(corners), axis=0, return_inverse=True)
-    return occupancy.origin + every * occupancy.resolution, which.reshape(-1, 4)
+    every = np.concatenate(corners).astype(np.float64)
+    squares = np.arange(len(every)).reshape(-1, 4)
+    points, triangles = watertight(every, squares[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), 1e-3)
+    return occupancy.origin + points * occupancy.resolution, triangles
