@@ -220,9 +220,8 @@ def watertight(points: Array, triangles: Array, near: float) -> tuple[Array, Arr
     points: (V, D) places, and colours or nothing behind them; near: places that are closer are one.
 
     Triangles without an area, beside their own reverse, or twice are left out, and a fan closes every rim.
-    Then every edge is run forth as often as back, and the triangles at it can be paired, each with the next
-    one across what is solid. Where there are several pairs each gets a vertex of its own on the edge, a hair
-    inside the solid, and its triangles become fans.
+    Then every edge is run forth as often as back, so that its triangles are pairs. Where there are several
+    each gets a vertex of its own on the edge, a hair aside, and its triangles become fans.
     """
     cells = np.rint((points[:, :3] - points[:, :3].min(axis=0, initial=0)) / near).astype(np.int64)
     place = _distinct(cells)[1]
@@ -245,24 +244,16 @@ def watertight(points: Array, triangles: Array, near: float) -> tuple[Array, Arr
     points[triangles[flat], :3] += 0.05 * (bent - points[triangles[flat], :3])
 
     start, end, third = (np.roll(triangles, -step, axis=1).reshape(-1) for step in range(3))
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    edge = _distinct(np.column_stack([low, high]))[1]
+    edge = _distinct(np.sort(np.column_stack([start, end]), axis=1))[1]
     many = np.flatnonzero(np.bincount(edge)[edge] > 2)
-    axis, forth = unit((points[high] - points[low])[many, :3], 1e-30), (start < end)[many]
-    arms, edge = (points[third] - points[low])[many, :3], edge[many]
-    edges, opening = np.unique(edge[~forth], return_index=True)  # from which angles are counted
-    zero = arms[~forth][opening][np.searchsorted(edges, edge)]
-    zero -= (zero * axis).sum(1)[:, None] * axis
-    angles = np.arctan2((arms * np.cross(axis, zero)).sum(1), (arms * zero).sum(1))
-    order = np.lexsort((np.mod(angles + 1e-9, 2 * np.pi), edge))
-    # What is solid lies between one that runs back and the next that runs forth.
-    pairs = np.column_stack([many[order][~forth[order]], many[order][forth[order]]])
-    ends, inside = points[start[pairs[:, 0]]] + points[end[pairs[:, 0]]], points[third[pairs]].mean(1)
+    many = many[np.argsort(edge[many], kind="stable")]
+    pairs = np.column_stack([many[start[many] > end[many]], many[start[many] < end[many]]])
+    ends, aside = points[start[pairs[:, 0]]] + points[end[pairs[:, 0]]], points[third[pairs]].mean(1)
     on, cut = np.full(triangles.size, -1), np.zeros(len(triangles), bool)
     on[pairs], cut[pairs // 3] = (len(points) + np.arange(len(pairs)))[:, None], True
     centres = len(points) + len(pairs) + np.cumsum(cut) - 1
     middles = points[triangles[cut]].mean(1)
-    points = np.concatenate([points, 0.475 * ends + 0.05 * inside, middles])
+    points = np.concatenate([points, 0.475 * ends + 0.05 * aside, middles])
     sides = np.flatnonzero(np.repeat(cut, 3))
     halves = sides[on[sides] >= 0]
     fans = np.column_stack([start, np.where(on < 0, end, on), np.repeat(centres, 3)])[sides]
