@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,6 +28,7 @@ from langsplat_core.io.scenes import (
     save_scene,
 )
 from langsplat_core.io.sidecar import rematch_language
+from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
@@ -78,13 +80,17 @@ class Export:
         print(f"{self.out}: {report.gaussians:,} Gaussians, {report.bytes / 1e6:.2f} MB; {asked}")
 
 
+SpzAxes = Literal["rub", "rdf"]
+
+
 @dataclass(frozen=True)
 class Convert:
     """Write any readable scene in another format, with its language field and cameras beside it.
 
     A .ply (INRIA's) keeps everything, .spz is ten times smaller and rounded, .splat is without view
-    dependence. Checkpoints of LangSplat, LangSplatV2, Occam's LGS, OpenGaussian, Feature-3DGS and 3D Gaussian
-    Splatting become such a scene (see docs/files.md for what to give), and a scene becomes checkpoints.
+    dependence; what is lost is printed. Checkpoints of LangSplat, LangSplatV2, Occam's LGS, OpenGaussian,
+    Feature-3DGS and 3D Gaussian Splatting become such a scene (see docs/files.md for what to give), and a
+    scene becomes checkpoints.
     """
 
     source: tyro.conf.Positional[Path]
@@ -105,6 +111,12 @@ class Convert:
     """Levels of the checkpoints with features, in their order, where files and folders do not tell."""
     phrases: tuple[str, ...] = ()
     """Stored encoded in a scene made of checkpoints: they can be asked without any encoder."""
+    spz_version: Literal[3, 4] = 3
+    """Of a written .spz. Spark reads up to 3, PlayCanvas's engine 4 alone, most programs both."""
+    axes: Annotated[tuple[SpzAxes, ...], tyro.conf.arg(metavar="rub|rdf [rub|rdf]")] = ()
+    """Of an .spz: rub, y up as its README says, or rdf, y down as splat-transform and gsply read and write.
+    Of one that is read and does not say itself, and of one that is written, which says; two words where
+    they differ."""
     codec: CodecConfig = CodecConfig()  # noqa: RUF009  (frozen)
     """How the Gaussians of checkpoints with whole vectors keep them."""
 
@@ -126,10 +138,24 @@ class Convert:
             self._export()
             return
         rematched = () if self.rematch is None else (self.rematch,)
-        check_writable(self.out, *self.sources, *rematched)  # before minutes are spent on reading
+        row = check_writable(self.out, *self.sources, *rematched)  # before minutes are spent on reading
+        if row.suffix != ".spz" and (self.spz_version != 3 or len(self.axes) > 1):
+            raise InputError(
+                "--spz-version and a second word of --axes are for a written .spz; leave them out"
+            )
+        if self.axes and ".spz" not in (row.suffix, self.source.suffix.lower()):
+            raise InputError("--axes are of an .spz, and none is read or written; leave them out")
         scene = self._read()
-        save_scene(self.out, replace(scene, path=self.out))
+        write, axes = None, (self.axes or ("rub",))[-1]
         described = "with a language field" if scene.language else "without a language field"
+        if row.suffix == ".spz":
+            write = partial(write_spz, version=self.spz_version, axes=axes)
+            described += f"; version {self.spz_version}, axes {axes.upper()}, recorded"
+        save_scene(self.out, replace(scene, path=self.out), write=write)
+        if row.rounds:
+            print(f"{self.out}: rounds {row.rounds}")
+        if self.out.name.lower().endswith(".compressed.ply"):
+            print(f"{self.out}: written as a plain PLY; SuperSplat's compressed ones are only read")
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {described}")
 
     def _read(self) -> Scene:
@@ -146,9 +172,12 @@ class Convert:
             raise InputError(
                 "--levels, --phrases and --codec are for checkpoints; leave them out for a scene"
             )
+        read = None
+        if self.source.suffix.lower() == ".spz":
+            read = partial(read_spz_scene, axes=(self.axes or ("",))[0], note=print)
         if self.rematch is None:
-            return load_scene(self.source)
-        scene = load_without_language(self.source)
+            return load_scene(self.source, read)
+        scene = load_without_language(self.source, read)
         return replace(scene, language=rematch_language(self.rematch, scene.in_world(scene.gaussians.means)))
 
     def _importer(self) -> Importer | None:

@@ -6,9 +6,12 @@ left, up, front where the PLY is right, down, front: half a turn about z, which 
 place primitives; all Gaussians of the default scene are read, in the order of its nodes. A primitive may hold
 an .spz file instead (KHR_gaussian_splatting_compression_spz and _spz_2).
 
+In a file of ours the node stands the scene upright, y up, in metres where the scale is known. Its extras
+say what is needed to take that back, which is done as long as nobody has moved the node.
+
 Drafts of the extension stored SCALE as logarithms: a file with a negative scale is taken for such a one. What
 of a file is none of this is passed over, which is said.
-Source: Khronos' public specification of the extension, release candidate of 2026.
+Source: Khronos' public specification of the extension, as ratified in 2026.
 """
 
 import base64
@@ -21,17 +24,26 @@ from typing import Annotated, Any
 from urllib.parse import unquote
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, ValidationError, convert, to_builtins
 
-from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
+from langsplat_core.arrays import Array, linear_light, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError, malformed, quoted, report_losses, unread
 from langsplat_core.io import hostile
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.quantised import mirrored, to_bytes
+from langsplat_core.io.quantised import mirrored
 from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene, about_origin
 from langsplat_core.scene.gaussians import join_gaussians
-from langsplat_core.scene.transform import C0, moving, similarity, transform_gaussians
+from langsplat_core.scene.transform import (
+    AXES,
+    C0,
+    moving,
+    scaling,
+    similarity,
+    transform_gaussians,
+    turned_origin,
+    turning,
+)
 
 EXTENSION = "KHR_gaussian_splatting"
 PACKED = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
@@ -46,6 +58,7 @@ MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 JSON_LIMIT = 16 << 20  # bytes; ours has 10 kB
 MOST_NODES = 1 << 16
 SIGNS = np.array([-1, -1, 1], np.float32)  # left up front to right down front, and back
+OWN = "langsplat"  # among the extras of a node
 SRGB = "srgb_rec709_display"
 HOW = ("ellipse", "cameraDistance", "perspective")  # are Gaussians drawn here: kernel, order, projection
 
@@ -102,6 +115,16 @@ class _Node(Struct):
     scale: tuple[Number, Number, Number] = (1, 1, 1)
     translation: tuple[Number, Number, Number] = (0, 0, 0)
     extensions: dict[str, Any] = {}
+    extras: Any = None  # anything
+
+
+class _Kept(Struct):
+    """What the extras of a node keep of a scene, beside the node's own matrix as it was written."""
+
+    matrix: list[Number] | None = None
+    origin: tuple[Number, Number, Number] = (0, 0, 0)
+    metres_per_unit: Annotated[float, Meta(gt=0, le=1e12)] | None = None
+    antialiased: bool = False
 
 
 class _Scene(Struct):
@@ -148,8 +171,11 @@ def read_gltf_scene(path: Path | str) -> Scene:
     if not parts and EXTENSION not in file.content.extensions_used:
         raise malformed(path, f"holds no Gaussians ({EXTENSION}); meshes are not read")
     report_losses(path, file.losses())
-    gaussians = mirrored(join_gaussians(parts), SIGNS)
+    gaussians, kept = mirrored(join_gaussians(parts), SIGNS), file.kept
     scene = Scene(gaussians, antialiased=file.antialiased == {True})
+    if kept is not None:
+        scene = replace(scene, antialiased=kept.antialiased, metres_per_unit=kept.metres_per_unit)
+        return replace(scene, origin=np.array(kept.origin, np.float64))
     if not middle.any():
         return scene
     means, origin = about_origin(gaussians.means + SIGNS * middle)
@@ -201,6 +227,8 @@ def _placed(file: "_File") -> Iterator[tuple[Array, _Primitive]]:
         seen.add(number)
         node = content.nodes[number]
         matrix = above @ _matrix(node)
+        if len(content.nodes) == 1 and (kept := _kept(node)) is not None and kept.matrix == node.matrix:
+            file.kept, matrix = kept, np.eye(4)
         file.others.update(map(quoted, node.extensions))
         if node.mesh is not None:
             file.shown.add(node.mesh)
@@ -217,6 +245,13 @@ def _matrix(node: _Node) -> Array:
     matrix[:3, :3] = rotation_matrices(np.array([w, x, y, z])) * np.array(node.scale)
     matrix[:3, 3] = node.translation
     return matrix
+
+
+def _kept(node: _Node) -> _Kept | None:
+    try:
+        return convert(node.extras[OWN], _Kept)
+    except (LookupError, TypeError, ValidationError):
+        return None
 
 
 def _gaussians(file: "_File", attributes: dict[str, int]) -> Gaussians:
@@ -254,6 +289,7 @@ class _File:
         self.bare = 0  # placed primitives without Gaussians
         self.shown: set[int] = set()  # meshes that nodes place
         self.antialiased: set[bool] = set()  # what primitives say
+        self.kept: _Kept | None = None  # of a scene of ours, where its node is as it was
         text = memoryview(hostile.read_file(path, 2**32))
         self._binary = text[:0]
         # Numbers as they are stored, which an honest file shows once or a few times; Gaussians packed in it
@@ -344,11 +380,9 @@ class _File:
 def write_gltf(path: Path | str, scene: Scene) -> None:
     """Write a .glb, or a .gltf with its buffer inside, atomically; rows keep their order.
 
-    The origin of a scene is the translation of its node.
-
     Positions and colours are exact, scales, quaternions (normalised) and opacities to float32. COLOR_0 shows
-    points of the base colour in programs that do not know the extension. A row that cannot be drawn is
-    written with opacity 0. Raises InputError for more than a .glb can hold, 4 GiB.
+    points of the base colour, as light, in programs that do not know the extension. A row that cannot be
+    drawn is written with opacity 0. Raises InputError for more than a .glb can hold, 4 GiB.
     """
     file, gaussians = GltfWriter(EXTENSION), scene.gaussians
     if len(gaussians):
@@ -357,9 +391,24 @@ def write_gltf(path: Path | str, scene: Scene) -> None:
         columns = _columns(gaussians).items()
         attributes = {name: file.add(values, name == "POSITION") for name, values in columns}
         primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: says}}
-        moved = {"translation": (SIGNS * scene.origin).tolist()} if scene.origin.any() else {}
-        file.add_mesh(primitive, **moved)
+        file.add_mesh(primitive, **node_of(scene))
     file.write(Path(path))
+
+
+def node_of(scene: Scene) -> dict[str, Any]:
+    """Return the entries of the node of what lies in a scene, with the `SIGNS` of glTF, about its origin.
+
+    Its matrix turns the scene's up to y, and makes metres of units where the scale is known; extras keep
+    what this program needs to take that back.
+    """
+    half = similarity(np.diag([*SIGNS, 1.0]))
+    upright = half.then(turning(half.points(scene.up()), AXES["y"]))
+    there = upright.then(moving(turned_origin(upright.rotation, scene.origin)))
+    there = half.then(there.then(scaling(scene.metres_per_unit or 1.0)))  # half a turn is its own inverse
+    matrix = None if there.is_identity else there.matrix.T.reshape(-1).tolist()
+    kept = _Kept(matrix, tuple(scene.origin.tolist()), scene.metres_per_unit, scene.antialiased)
+    said = {"matrix": matrix} if matrix else {}
+    return said if kept == _Kept() else {**said, "extras": {OWN: to_builtins(kept)}}
 
 
 class GltfWriter:
@@ -433,10 +482,11 @@ def _columns(gaussians: Gaussians) -> dict[str, Array]:
     quats = unit(np.where(keep, turned.quats_wxyz, [1, 0, 0, 0]).astype(np.float64), 1e-30)
     opacity = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
     sh = np.where(keep[..., None], turned.sh, 0)
-    base = np.concatenate([0.5 + C0 * sh[:, 0], opacity[:, None]], axis=1)
+    light = linear_light(np.clip(0.5 + C0 * sh[:, 0], 0, 1))
+    base = np.concatenate([light, opacity[:, None]], axis=1)
     columns = {
         "POSITION": np.where(keep, turned.means, 0).astype("<f4"),
-        "COLOR_0": to_bytes(255 * base),
+        "COLOR_0": np.rint(65_535 * base).astype("<u2"),
         f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]].astype("<f4"),
         f"{EXTENSION}:SCALE": np.exp(np.where(keep, turned.log_scales, 0).astype(np.float64)).astype("<f4"),
         f"{EXTENSION}:OPACITY": opacity.astype("<f4"),

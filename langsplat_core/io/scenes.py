@@ -15,9 +15,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from langsplat_core import registry
 from langsplat_core.arrays import Array
@@ -37,8 +38,8 @@ from langsplat_core.scene import Gaussians, Scene, about_origin
 
 log = logging.getLogger("langsplat")
 
-# What a scene may have and a format no room for: it is said. That numbers are rounded is not, and the origin
-# goes into a companion.
+# What a scene may have and a format no room for: each is said in a line. Where there is none for the origin a
+# companion keeps it and metres per unit. How numbers are rounded is said where a person converts a scene.
 PARTS: Mapping[str, Callable[[Scene], object]] = MappingProxyType({
     "view dependence": lambda scene: scene.gaussians.sh[:, 1:].any(),
     "antialiasing": lambda scene: scene.antialiased,
@@ -47,8 +48,12 @@ PARTS: Mapping[str, Callable[[Scene], object]] = MappingProxyType({
     "cameras": lambda scene: scene.cameras,
     "taught words": lambda scene: scene.language is not None and scene.language.taught,
 })  # fmt: skip
-LOSSES = ("precision", "view dependence", "antialiasing", "metres per unit", "extra properties", "origin")
-ORIGIN_SUFFIX = ".origin.json"  # of the companion with the origin of a scene whose format has no room for it
+LOSSES = ("precision", "view dependence", "antialiasing", "extra properties", "origin")
+ORIGIN_SUFFIX = ".origin.json"  # of the companion with the origin and scale for formats without room for them
+
+
+Reader = Callable[[Path], Scene]
+Writer = Callable[[Path, Scene], None]
 
 
 @dataclass(frozen=True)
@@ -56,21 +61,29 @@ class SceneFormat:
     """A format of scenes: one row of `formats()`."""
 
     suffix: str  # of its files, lower case; its name for people too
-    read: Callable[[Path], Scene]
-    write: Callable[[Path, Scene], None] | None = None  # None: read only
+    read: Reader
+    write: Writer | None = None  # None: read only
     loses: tuple[str, ...] = ()  # what a written file cannot hold, of `LOSSES` or `PARTS`
+    rounds: str = ""  # numbers, and to what, for people
     own_companions: bool = False  # companions keep the suffix: `a.spz.langsplat.safetensors`
     folder_file: str = ""  # a folder with this file in it is a scene too, and so is the file
     mime: str = "model/x-gaussian-splat"
 
 
-SMALL = ("precision", "metres per unit", "extra properties", "origin")
-GLTF = ("precision", "antialiasing", "metres per unit", "extra properties")
+SMALL = ("precision", "extra properties", "origin")
+GLTF = ("precision", "extra properties")
+ROUNDS = MappingProxyType({
+    ".spz": "positions to 1/4096 unit or finer, sizes to 3 %, rotations to 0.1 degrees, colours to 1/255",
+    ".splat": "rotations to half a degree, colours and opacities to 1/255",
+    ".sog": "positions to 1/65535 of the extent, rotations to half a degree, all else to 256 values each",
+})  # fmt: skip
 CORE_FORMATS = (
     SceneFormat(".ply", read_ply_scene, write_ply, mime="model/x-ply"),  # plain and compressed
-    SceneFormat(".spz", read_spz_scene, write_spz, SMALL, own_companions=True),
-    SceneFormat(".splat", read_splat_scene, write_splat, LOSSES, own_companions=True),
-    SceneFormat(".sog", read_sog_scene, write_sog, SMALL, own_companions=True, folder_file=META_NAME),
+    SceneFormat(".spz", read_spz_scene, write_spz, SMALL, ROUNDS[".spz"], own_companions=True),
+    SceneFormat(".splat", read_splat_scene, write_splat, LOSSES, ROUNDS[".splat"], own_companions=True),
+    SceneFormat(
+        ".sog", read_sog_scene, write_sog, SMALL, ROUNDS[".sog"], own_companions=True, folder_file=META_NAME
+    ),
     SceneFormat(".glb", read_gltf_scene, write_gltf, GLTF, own_companions=True, mime="model/gltf-binary"),
     SceneFormat(".gltf", read_gltf_scene, write_gltf, GLTF, own_companions=True, mime="model/gltf+json"),
 )
@@ -102,17 +115,19 @@ def format_of(path: Path) -> SceneFormat | None:
 
 class _Origin(Struct):
     origin: tuple[camera_files.Coordinate, camera_files.Coordinate, camera_files.Coordinate]
+    metres_per_unit: Annotated[float, Meta(gt=0, le=1e12)] | None = None
 
 
-def load_scene(path: Path | str) -> Scene:
+def load_scene(path: Path | str, read: Reader | None = None) -> Scene:
     """Return a scene with its language field and cameras, where they lie beside it.
 
     Cameras are `<scene>.cameras.json`, or for a PLY in the folder structure of the INRIA code
     (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. A companion that is unusable or
     made for other Gaussians is left out, with the reason in `Scene.unread`. Raises InputError for what cannot
-    be opened or is of no supported kind, FormatError for what breaks the rules of its format.
+    be opened or is of no supported kind, FormatError for what breaks the rules of its format. `read` takes
+    the place of the reader of its format.
     """
-    scene = load_without_language(path)
+    scene = load_without_language(path, read)
     sidecar = companion_path(path, language_files.SUFFIX)
     if not exists(sidecar):
         return scene
@@ -126,21 +141,21 @@ def load_scene(path: Path | str) -> Scene:
         return replace(scene, unread=(*scene.unread, str(error)))
 
 
-def load_without_language(path: Path | str) -> Scene:
+def load_without_language(path: Path | str, read: Reader | None = None) -> Scene:
     """Return a scene as `load_scene` does, but without the language field, which is not even looked at."""
     path = Path(path)
-    scene, cameras = replace(_read(path), path=path), _cameras_path(path)
+    scene, cameras = replace(_read(path, read), path=path), _cameras_path(path)
     if not exists(cameras):
         return scene
     try:
-        read = camera_files.read_cameras(cameras)
-        return replace(scene, cameras=tuple(camera.moved(-scene.origin) for camera in read))
+        found = camera_files.read_cameras(cameras)
+        return replace(scene, cameras=tuple(camera.moved(-scene.origin) for camera in found))
     except InputError as error:
         report_loss("opened without its cameras: %s", error)
         return replace(scene, unread=(*scene.unread, str(error)))
 
 
-def _read(path: Path) -> Scene:
+def _read(path: Path, read: Reader | None = None) -> Scene:
     """Read the scene's own file; say what of it cannot be drawn."""
     if not exists(path):
         raise InputError(f"{path}: no such file; check the spelling and the folder")
@@ -152,7 +167,7 @@ def _read(path: Path) -> Scene:
     if row is None:
         kinds = ", ".join(row.suffix for row in formats())
         raise InputError(f"{path}: not a scene of a known kind; supported: {kinds}, {META_NAME}")
-    scene = _about_origin(path, row.read(path))
+    scene = _about_origin(path, (read or row.read)(path))
     log.debug("%s: %d Gaussians", path, len(scene.gaussians))
     warn_of_undrawable(path, scene.gaussians)
     return scene
@@ -164,12 +179,13 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
     Logs a warning where positions were rounded to float32 far from zero before they were written.
     """
     try:
-        named = read_origin(path)
+        named = _read_origin(path)
     except InputError as error:
         report_loss("opened without its origin: %s", error)
         return replace(scene, unread=(str(error),))
     if named is not None:
-        return replace(scene, origin=named)
+        metres = named.metres_per_unit or scene.metres_per_unit
+        return replace(scene, origin=np.array(named.origin), metres_per_unit=metres)
     if not scene.origin.any():
         means, origin = about_origin(scene.gaussians.means)
         if not origin.any():
@@ -188,17 +204,21 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
     return scene
 
 
+def _read_origin(path: Path) -> _Origin | None:
+    beside = companion_path(path, ORIGIN_SUFFIX)
+    return decode_json(read_file(beside, 1 << 16), _Origin, beside) if exists(beside) else None
+
+
 def read_origin(path: Path) -> Array | None:
     """Return the origin (3,) that the companion of a file names; None without one. InputError if damaged."""
-    beside = companion_path(path, ORIGIN_SUFFIX)
-    if not exists(beside):
-        return None
-    return np.array(decode_json(read_file(beside, 1 << 16), _Origin, beside).origin)
+    named = _read_origin(path)
+    return None if named is None else np.array(named.origin)
 
 
-def write_origin(path: Path, origin: Array) -> None:
-    """Write an origin (3,) as the companion `path` of a file whose format has no room for it."""
-    write_json(path, {"origin": origin.tolist()})
+def write_origin(path: Path, origin: Array, metres_per_unit: float | None = None) -> None:
+    """Write an origin (3,) and scale as the companion `path` of a file whose format has no room for them."""
+    scale = {} if metres_per_unit is None else {"metres_per_unit": metres_per_unit}
+    write_json(path, {"origin": origin.tolist(), **scale})
 
 
 def warn_of_undrawable(path: Path, gaussians: Gaussians) -> None:
@@ -238,15 +258,18 @@ def check_keeps(out: Path, *sources: Path) -> None:
 
 
 def report_left_out(path: Path, scene: Scene, kind: str, loses: Sequence[str], keeper: str) -> None:
-    """Report what files of a `kind` have no room for, and warn where the origin lies in the file `keeper`."""
-    if lost := [what for what in loses if what in PARTS and PARTS[what](scene)]:
-        report_loss("%s: %s have no room for %s", shown(path), kind, ", ".join(lost))
-    if "origin" in loses and scene.origin.any():
-        where = " ".join(f"{value:.10g}" for value in scene.origin)
-        log.warning("%s: %s have no room for the origin %s, which %s keeps", shown(path), kind, where, keeper)
+    """Report what files of a `kind` have no room for, each in a line, and what the file `keeper` keeps."""
+    kept = [f"the origin {' '.join(f'{value:.10g}' for value in scene.origin)}"] if scene.origin.any() else []
+    if "metres per unit" not in loses and scene.metres_per_unit is not None:
+        kept.append(f"{scene.metres_per_unit:g} metres per unit")
+    for what in kept if "origin" in loses else ():
+        log.warning("%s: %s have no room for %s, which %s keeps", shown(path), kind, what, keeper)
+    for what in loses:
+        if what in PARTS and PARTS[what](scene):
+            report_loss("%s: %s have no room for %s", shown(path), kind, what)
 
 
-def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
+def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer | None = None) -> None:
     """Write `scene` in the format of its name, with its companions; those it lacks are removed.
 
     Only the PLY keeps everything: see `SceneFormat.loses`. All formats keep the rows' order. All files are
@@ -254,13 +277,14 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
     into place, and last the new companions. Interrupted anywhere, there is the old scene or the new one,
     perhaps without companions, but never a scene beside companions of another. A scene with companions that
     could not be read is not written: that would remove them. Raises InputError then, and as `check_writable`.
-    `tell`: say what the format has no room for, see `report_left_out`.
+    `tell`: say what the format has no room for, see `report_left_out`. `write` takes the place of its writer.
     """
     path = Path(path)
     if scene.unread:
         raise InputError(f"not written without what lies beside it; mend or remove that: {scene.unread[0]}")
     row = check_writable(path)
-    assert row.write is not None
+    write = write or row.write
+    assert write is not None
     sidecar, cameras, origin = _companions(path)
     if tell:
         report_left_out(path, scene, f"{row.suffix} files", row.loses, origin.name)
@@ -269,11 +293,12 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True) -> None:
         if scene.cameras:
             in_world = tuple(camera.moved(scene.origin) for camera in scene.cameras)
             camera_files.write_cameras(renames.enter_context(atomic_path(cameras)), in_world)
-        if beside := "origin" in row.loses and bool(scene.origin.any()):
-            write_origin(renames.enter_context(atomic_path(origin)), scene.origin)
+        known = bool(scene.origin.any()) or scene.metres_per_unit is not None
+        if beside := "origin" in row.loses and known:
+            write_origin(renames.enter_context(atomic_path(origin)), scene.origin, scene.metres_per_unit)
         new_sidecar = None if scene.language is None else renames.enter_context(atomic_path(sidecar))
         new_file = renames.enter_context(atomic_path(path))
-        row.write(new_file, scene)
+        write(new_file, scene)
         if scene.language is not None and new_sidecar is not None:
             # The sidecar belongs to the positions as a reader finds them: rounded, or about another origin.
             again = row.read(new_file) if "precision" in row.loses or scene.origin.any() else scene

@@ -4,9 +4,10 @@ Versions 1 to 3 are one gzip stream (a few tools write it without gzip) of a 16-
 in the order of `_Header.widths`. Version 4 is a header of 32 bytes, extension records up to the byte that the
 header names, a table of (compressed, whole) sizes as uint64, and one Zstandard frame per block. In
 versions 2 and 3 extension records lie behind the last block. A record is a uint32 type, a uint32 length
-and so many bytes; the only one that is read is the axes', an index into
-LDB RDB LUB RUB LDF RDF LUF RUF (left or right, down or up, back or forward), from 1. Without it a file is
-RUB: x to the right, y up, z backwards.
+and so many bytes; the only one that is read is the axes' (SPZ_ADOBE_coordinate_system), an index into
+LDB RDB LUB RUB LDF RDF LUF RUF (left or right, down or up, back or forward), from 1, and from 9 the same
+with y and z exchanged: LBD RBD LBU RBU LFD RFD LFU RFU. Without it a file should be RUB (x to the right,
+y up, z backwards), but splat-transform, gsply and Niantic's ply_to_spz leave a PLY's RDF as it is.
 
 Source of the layout: README, extensions and loader of nianticlabs/spz; the code here is our own.
 """
@@ -15,22 +16,26 @@ import gzip
 import io
 import struct
 import zlib
-from dataclasses import astuple, dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from langsplat_core.arrays import Array, logit, sigmoid
+from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid
 from langsplat_core.errors import InputError, Tell, malformed, report_loss, report_losses, unread
+from langsplat_core.io.cameras import SUFFIX, read_cameras
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import SMALL_RATIO, Allowance, open_for_reading
 from langsplat_core.io.quantised import check_steps, mirrored, smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+from langsplat_core.scene.surface import surface_areas
+from langsplat_core.scene.transform import rotating, transform_gaussians
 
 MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 ANTIALIASED, EXTENDED = 0x1, 0x2  # flags
-AXES_RECORD, AXES_RUB = 0xADBE0003, 4
+AXES_RECORD, AXES = 0xADBE0003, {"rub": 4, "rdf": 6}
 SPZ_SH_COUNTS = (1, 4, 9, 16, 25)  # of degree 0 to 4, the base colour included
 SLACK = 1024 * 1024  # bytes of records behind the Gaussians
 _HEADER = struct.Struct("<4sIIBBBB")
@@ -66,7 +71,7 @@ class _Packed:
     """The content of a .spz file, unpacked but still quantised."""
 
     header: _Header
-    axes: int  # 1 to 8, see above
+    axes: int  # 1 to 16, see above; 0 where the file does not say
     blocks: dict[str, Array]  # attribute -> (N, bytes of one Gaussian) uint8
 
 
@@ -145,23 +150,23 @@ def _unpacked(data: bytes, size: int, path: Path) -> bytes:
 
 
 def _axes(records: bytes, path: Path, tell: Tell) -> int:
-    """Return the axes that the first such extension record names, 1 to 8; old layouts end the search."""
+    """Return the axes that the first such extension record names, 0 without; old layouts end the search."""
     at, axes, others = 0, 0, set[str]()
     while at + 8 <= len(records):
         kind, length = struct.unpack_from("<II", records, at)
         if at + 8 + length > len(records):
             break
         if kind == AXES_RECORD and length == 4 and not axes:
-            axes = int(struct.unpack_from("<I", records, at + 8)[0]) or AXES_RUB
+            axes = int(struct.unpack_from("<I", records, at + 8)[0]) or AXES["rub"]
         else:
             others.add(f"{kind:#010x}")
         at += 8 + length
-    if axes > 8:
+    if axes > 16:
         raise malformed(path, f"its axes are of kind {axes}", "export the scene with axes RUB")
     tell(unread("extension records", others))
     if at < len(records):
         tell(f"{len(records) - at} bytes of extension records not understood")
-    return axes or AXES_RUB
+    return axes
 
 
 # ---- quantised Gaussians, about ten times smaller than the PLY ----
@@ -176,26 +181,38 @@ def _axes(records: bytes, path: Path, tell: Tell) -> int:
 #                 bits over [-1, 1] each (w is positive)
 #     sh          128 + 128 times the coefficient, red green blue of one coefficient after the other
 #
-# The axes are right, up, back (RUB), unless the file says otherwise: half a turn about x from the axes of
-# the PLY, which changes signs of positions, of quaternions and of coefficients. What is read are versions 1
-# to 4; degree 4, which nothing here can draw, is left out, and that is said.
+# What is read are versions 1 to 4; degree 4, which nothing here can draw, is left out, and that is said.
 #
-# Version 3 is written. Its rotations are exact to 0.1 degrees where those of version 2 err by up to a degree,
-# and every program that reads the newer version 4 reads it too, while many that read it do not know 4, which
-# differs in the container alone. Source: nianticlabs/spz; the code here is our own.
+# Version 3 is written unless told otherwise. Its rotations are exact to 0.1 degrees where those of version 2
+# err by up to a degree. What reads the newer version 4, which differs in the container alone, reads 3 too,
+# but for PlayCanvas's engine, and many that read 3 do not know 4. Both hold the record of the axes. Source:
+# nianticlabs/spz; the code here is our own.
 
 COLOUR_SCALE = 0.15
 SMALLEST, LARGEST = -10, 255 / 16 - 10  # logarithms of sizes
 FRACTIONAL_BITS = 12  # what other writers use: steps of 1/4096, up to 2048
 
 
-def read_spz_scene(path: Path | str) -> Scene:
-    """Return the scene of a .spz file; InputError where it cannot be opened, else FormatError."""
+def read_spz_scene(path: Path | str, axes: str = "", note: Tell = lambda line: None) -> Scene:
+    """Return the scene of a .spz file; InputError where it cannot be opened, else FormatError.
+
+    axes: of `AXES`, of a file that does not say; "" takes it for RUB, and says where it looks upside down so.
+    note: is told what was taken for granted.
+    """
     path = Path(path)
     file, size = open_for_reading(path)
     with file:
         told, room = list[str](), Allowance(path, size, SMALL_RATIO)
-        scene = _scene(_read_packed(file, size, path, room, told.append), told.append)
+        packed = _read_packed(file, size, path, room, told.append)
+        scene = _scene(packed, AXES[axes or "rub"], told.append)
+    if packed.axes and axes and packed.axes != AXES[axes]:
+        told.append(f"its own record of its axes is followed, not --axes {axes}")
+    if not packed.axes:
+        note(
+            f"{path}: names no axes; read as {axes.upper() or 'RUB, --axes rdf if it comes out upside down'}"
+        )
+    if not packed.axes and not axes and _floor_is_above(path, scene):
+        told.append("taken for RUB, as no record names its axes, but its floor is above; try --axes rdf")
     report_losses(path, told)
     return scene
 
@@ -205,10 +222,31 @@ def decode_spz(data: bytes, path: Path, room: Allowance, tell: Tell) -> Scene:
 
     path: for messages; room: of the file that it is a part of. Raises FormatError.
     """
-    return _scene(_read_packed(io.BytesIO(data), len(data), path, room, tell), tell)
+    return _scene(_read_packed(io.BytesIO(data), len(data), path, room, tell), AXES["rub"], tell)
 
 
-def _scene(packed: _Packed, tell: Tell) -> Scene:
+def _floor_is_above(path: Path, scene: Scene) -> bool:
+    """Return whether a height near the top has twice the level surface of any near the bottom.
+
+    Up is as cameras beside the file have it, or those of its .ply. In real scenes the right way up the floor
+    has 3 to 200 times what any height near the top has.
+    """
+    for beside in (path.with_suffix(SUFFIX), path.with_name(path.name + SUFFIX)):
+        with suppress(InputError):  # told of by who needs them
+            scene = replace(scene, cameras=read_cameras(beside)) if beside.exists() else scene
+    some, up = scene.gaussians.take(scene.gaussians.valid()), scene.up()
+    normals = np.einsum("i,nij->nj", up, rotation_matrices(some.quats_wxyz.astype(np.float64)))
+    level = np.take_along_axis(np.abs(normals), some.log_scales.argmin(axis=1)[:, None], axis=1)[:, 0] > 0.9
+    heights = some.means @ up
+    if len(some) < 1000:  # too few for a floor
+        return False
+    low, high = np.quantile(heights, [0.02, 0.98])
+    counts, _ = np.histogram(heights, 32, (low, high), weights=surface_areas(some) * level)
+    return bool(counts[-10:].max() > max(2 * counts[:10].max(), 0.05 * counts.sum()))
+
+
+def _scene(packed: _Packed, axes: int, tell: Tell) -> Scene:
+    """axes: of a file that does not say."""
     blocks, degree = packed.blocks, min(packed.header.sh_degree, 3)
     if degree < packed.header.sh_degree:
         tell(f"its spherical harmonics of degree {packed.header.sh_degree} are cut to {degree}")
@@ -222,12 +260,16 @@ def _scene(packed: _Packed, tell: Tell) -> Scene:
         opacity_logits=logit(blocks["alphas"][:, 0] / 255),
         sh=np.concatenate([base[:, None], (rest.astype(np.float32) - 128) / 128], axis=1),
     )
-    turned = mirrored(gaussians, _signs_to_rdf(packed.axes))
+    axes = packed.axes or axes
+    if axes > 8:  # a quarter turn about x makes y of z, and what was forward in y backward in z
+        gaussians = transform_gaussians(gaussians, rotating(np.eye(3)[0], -90))
+        axes = (axes - 9 ^ 4) + 1
+    turned = mirrored(gaussians, _signs_to_rdf(axes))
     return Scene(turned, antialiased=bool(packed.header.flags & ANTIALIASED))
 
 
-def write_spz(path: Path | str, scene: Scene) -> None:
-    """Write .spz version 3, atomically; rows keep their order.
+def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub") -> None:
+    """Write .spz version 3 or 4 along axes of `AXES`, which it records, atomically; rows keep their order.
 
     Positions are rounded to 1/4096 world unit, or finer where the Gaussians are smaller than that; scales
     to 1/16 in the logarithm, within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1 (other
@@ -236,7 +278,7 @@ def write_spz(path: Path | str, scene: Scene) -> None:
     scene so large that 24 bits cannot tell its positions apart, or whose sizes it cannot say.
     """
     gaussians, valid = scene.gaussians, scene.gaussians.valid()
-    drawn = mirrored(gaussians.take(valid), _signs_to_rdf(AXES_RUB))  # half a turn, its own inverse
+    drawn = mirrored(gaussians.take(valid), _signs_to_rdf(AXES[axes]))  # its own inverse
     bits = _fractional_bits(drawn, Path(path))
     sizes = drawn.log_scales.max(axis=1, initial=-np.inf)
     cut = (sizes > LARGEST + 0.1) | (sizes < SMALLEST - 0.1)  # tenths are rounding
@@ -255,15 +297,28 @@ def write_spz(path: Path | str, scene: Scene) -> None:
         "rotations": _rotation_codes(drawn.quats_wxyz),
         "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128),
     }
-    flags = ANTIALIASED if scene.antialiased else 0
-    header = _Header(MAGIC, 3, len(valid), gaussians.sh_degree, bits, flags, 0)
-    content = [_HEADER.pack(*astuple(header))]
-    for name, width in header.widths.items():
+    flags = EXTENDED | (ANTIALIASED if scene.antialiased else 0)
+    widths = _Header(MAGIC, version, 0, gaussians.sh_degree, 0, 0, 0).widths
+    blocks = []
+    for name, width in widths.items():
         block = np.zeros((len(valid), width), np.uint8)
         block[valid] = coded[name]
-        content.append(block.tobytes())
-    with atomic_path(path) as temporary:  # without a time: the same scene, the same bytes
-        temporary.write_bytes(gzip.compress(b"".join(content), mtime=0))
+        blocks += [block.tobytes()] if block.size else []
+    streams = 0 if version == 3 else len(blocks)
+    head = _HEADER.pack(MAGIC, version, len(valid), gaussians.sh_degree, bits, flags, streams)
+    record = struct.pack("<III", AXES_RECORD, 4, AXES[axes])
+    if version == 3:  # without a time: the same scene, the same bytes
+        content = gzip.compress(b"".join([head, *blocks, record]), mtime=0)
+    else:
+        import zstandard
+
+        frames = [zstandard.ZstdCompressor(12).compress(block) for block in blocks]
+        table = [
+            struct.pack("<QQ", len(frame), len(block)) for frame, block in zip(frames, blocks, strict=True)
+        ]
+        content = b"".join([head, struct.pack("<I12x", 32 + len(record)), record, *table, *frames])
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def _fractional_bits(drawn: Gaussians, path: Path) -> int:

@@ -142,6 +142,16 @@ def similarity(matrix: Array) -> Similarity:
     return Similarity(rotation, matrix[:3, 3].copy(), scale)
 
 
+def turned_origin(rotation: Array, origin: Array) -> Array:
+    """Return where the `origin` (3,) of a scene comes by a `rotation` (3, 3) that stands it upright.
+
+    Where that is nearly one of the world's axes onto others, by less than 0.1, it is taken for it: estimated
+    from a floor or cameras, it is a hair aslant, and about zero would move a far scene by metres.
+    """
+    near = np.rint(rotation)
+    return np.asarray((near if np.abs(rotation - near).max() < 0.1 else rotation) @ origin)
+
+
 def rotation_quaternion(rotation: Array) -> Array:
     """(3, 3) -> (4,) unit quaternion wxyz with w >= 0."""
     from scipy.spatial.transform import Rotation  # here, since every program that opens a scene comes by

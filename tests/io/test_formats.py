@@ -19,14 +19,22 @@ from langsplat_core.arrays import rotation_matrices, sigmoid, unit
 from langsplat_core.errors import STRICTNESS, InputError
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
-from langsplat_core.io.quantised import read_splat_scene, write_splat
+from langsplat_core.io.quantised import mirrored, read_splat_scene, write_splat
 from langsplat_core.io.scenes import load_scene, save_scene, writable_suffixes
 from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.sog import write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.raster.reference import colours
-from langsplat_core.scene import Camera, Gaussians, Scene
-from langsplat_core.scene.transform import moving, rotating, scaling, transform_gaussians
+from langsplat_core.scene import Camera, Gaussians, Scene, look_at
+from langsplat_core.scene.transform import AXES as UP
+from langsplat_core.scene.transform import (
+    moving,
+    rotating,
+    scaling,
+    similarity,
+    transform_gaussians,
+    turning,
+)
 from tests.support.file_samples import (
     C0,
     assert_refused,
@@ -44,6 +52,7 @@ from tests.support.file_samples import (
     write_folder,
     zipped,
 )
+from tests.support.file_samples import HALF_TURN as RUB
 from tests.support.scenes import covariances, random_camera, random_gaussians
 
 # ---- .splat ----
@@ -109,6 +118,28 @@ def check_spz(got: Gaussians, want: Gaussians, version: int) -> None:
     assert rotation_error(got, want) <= ROTATION[version]
 
 
+# The order of Niantic's enumeration, and what its letters are along the axes of a PLY.
+AXES = [
+    "LDB",
+    "RDB",
+    "LUB",
+    "RUB",
+    "LDF",
+    "RDF",
+    "LUF",
+    "RUF",
+    "LBD",
+    "RBD",
+    "LBU",
+    "RBU",
+    "LFD",
+    "RFD",
+    "LFU",
+    "RFU",
+]
+LETTERS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+
+
 @pytest.mark.parametrize("version", [1, 2, 3, 4])
 @pytest.mark.parametrize("degree", range(4))
 def test_spz_is_exact_to_the_quantisation(put, version, degree):
@@ -121,11 +152,15 @@ def test_spz_is_exact_to_the_quantisation(put, version, degree):
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_spz_is_written_as_by_another_encoder(tmp_path, degree, antialiased):
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize(("axes", "turn"), [("rub", RUB), ("rdf", np.eye(3))])
+def test_spz_is_written_as_by_another_encoder(tmp_path, degree, antialiased, version, axes, turn):
     want = random_gaussians(150, sh_degree=degree)
-    write_spz(tmp_path / "a.spz", Scene(want, antialiased=antialiased))
-    content = gzip.decompress((tmp_path / "a.spz").read_bytes())
-    assert content == gzip.decompress(spz_bytes(want, 3, flags=int(antialiased)))  # as of another encoder
+    write_spz(tmp_path / "a.spz", Scene(want, antialiased=antialiased), version, axes)
+    record = struct.pack("<III", 0xADBE0003, 4, AXES.index(axes.upper()) + 1)
+    theirs = spz_bytes(want, version, flags=antialiased + 2, records=record, turn=turn)
+    unzipped = gzip.decompress if version == 3 else bytes
+    assert unzipped((tmp_path / "a.spz").read_bytes()) == unzipped(theirs)
     once = read_spz_scene(tmp_path / "a.spz").gaussians
     write_spz(tmp_path / "b.spz", Scene(once, antialiased=antialiased))  # a second turn loses nothing more
     again = read_spz_scene(tmp_path / "b.spz").gaussians
@@ -133,14 +168,11 @@ def test_spz_is_written_as_by_another_encoder(tmp_path, degree, antialiased):
     np.testing.assert_allclose(again.sh, once.sh, atol=1e-6)
 
 
-AXES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
-
-
 @pytest.mark.parametrize("axes", AXES)
 @pytest.mark.parametrize("version", [3, 4])
 def test_spz_along_other_axes_is_turned(put, axes, version):
     """Other axes, two or none of them mirrored; a record of another kind stands in front."""
-    turn = np.diag([1.0 if letter in "RDF" else -1.0 for letter in axes])
+    turn = np.array([LETTERS[letter] for letter in axes], float)
     records = struct.pack("<IIxxx", 0x12340001, 3) + struct.pack("<III", 0xADBE0003, 4, AXES.index(axes) + 1)
     want = random_gaussians(60, sh_degree=3)
     got = read_spz_scene(put(spz_bytes(want, version, flags=2, records=records, turn=turn))).gaussians
@@ -154,6 +186,33 @@ def test_spz_along_other_axes_is_turned(put, axes, version):
     largest = np.exp(2 * want.log_scales.max(axis=1).astype(float))[:, None, None]
     off = np.abs(covariances(got) - covariances(want)) / largest
     assert off.max() <= np.expm1(1 / 16) + 2 * ROTATION[3]
+
+
+@pytest.mark.parametrize("up", ["-y", "z"])
+def test_spz_that_looks_upside_down_is_told(tmp_path, caplog, up):
+    """A floor with a little above it, without a record, as Niantic's library has it and splat-transform."""
+    rng = np.random.default_rng(0)
+    means = rng.uniform(-2, 2, (1500, 3))
+    means[:1000, 1] = 2.0  # y down
+    shape = np.tile(np.log([0.1, 0.002, 0.1]), (1500, 1))
+    gaussians = Gaussians(means, shape, np.tile([1.0, 0, 0, 0], (1500, 1)), np.zeros(1500), means[:, None])
+    want = transform_gaussians(gaussians, turning(UP["-y"], UP[up]))
+    if up == "z":
+        eyes = [np.array([x, y, 1.0]) for x in (-3, 3) for y in (-3, 3)]
+        cameras = [look_at(eye, np.zeros(3), UP["z"], (9, 9)) for eye in eyes]
+        write_cameras(tmp_path / "a.cameras.json", cameras)
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz_bytes(want, 3))
+    np.testing.assert_allclose(read_spz_scene(path).gaussians.means, want.means, atol=2e-4)
+    assert not caplog.messages
+    path.write_bytes(spz_bytes(want, 3, turn=np.eye(3)))
+    read_spz_scene(path)
+    assert ["--axes rdf" in message for message in caplog.messages] == [True]
+    np.testing.assert_allclose(read_spz_scene(path, "rdf").gaussians.means, want.means, atol=2e-4)
+    assert len(caplog.messages) == 1
+    write_spz(path, Scene(mirrored(want, np.array([1, -1, -1]))))
+    read_spz_scene(path)  # says what it is
+    assert len(caplog.messages) == 1
 
 
 def test_spz_of_degree_four_is_read_to_degree_three(put):
@@ -255,7 +314,7 @@ def meta_with(**entries: object) -> dict[str, bytes]:
 
 
 SPZ, SPZ_4 = gzip.decompress(spz_bytes(WANT, 3)), spz_bytes(WANT, 4)
-AXES_9 = spz_bytes(WANT, 4, flags=2, records=struct.pack("<III", 0xADBE0003, 4, 9))
+AXES_17 = spz_bytes(WANT, 4, flags=2, records=struct.pack("<III", 0xADBE0003, 4, 17))
 MOST = 2**32 - 1
 MALFORMED = {  # what a file with this ending holds
     "a.splat": (b"", SPLAT[:-1], SPLAT + b"\0", np.random.default_rng(0).bytes(3200)),
@@ -264,7 +323,7 @@ MALFORMED = {  # what a file with this ending holds
         *(patched(SPZ, *change) for change in ((4, "<I", 0), (4, "<I", 5), (12, "B", 5))),
         *(gzip.compress(patched(SPZ, 8, "<I", count)) for count in (31, MOST)),
         *(spz_bytes(WANT, 3)[:300], spz_bytes(WANT, 3)[:-8] + bytes(8), gzip.compress(SPZ + bytes(2**21))),
-        *(SPZ_4[:30], SPZ_4[:60], patched(SPZ_4, 8, "<I", MOST), AXES_9),
+        *(SPZ_4[:30], SPZ_4[:60], patched(SPZ_4, 8, "<I", MOST), AXES_17),
     ),
     "a.sog": tuple(
         zipped(files)
@@ -433,6 +492,27 @@ def test_nodes_place_their_primitives(tmp_path):
     there = scaling(2).then(turn).then(moving(np.array([5.0, 6, 7])))
     want = transform_gaussians(scene, HALF_TURN.then(there).then(HALF_TURN))
     assert_alike(load_gaussians(changed(tmp_path / "a.glb", scene, place)), want, 1e-4)
+
+
+def test_a_scene_comes_back_about_its_own_axes_unless_moved(tmp_path):
+    scene = replace(
+        Scene(random_gaussians(40, sh_degree=3), cameras=(random_camera(1),)),
+        metres_per_unit=0.25,
+        antialiased=True,
+    )
+    write_gltf(tmp_path / "a.glb", scene)
+    got = load_scene(tmp_path / "a.glb")
+    np.testing.assert_array_equal(got.gaussians.means, scene.gaussians.means)
+    assert (got.metres_per_unit, got.antialiased) == (0.25, True)
+    content, binary = parts((tmp_path / "a.glb").read_bytes())
+    node = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T
+    np.testing.assert_allclose(
+        node @ [*np.diag(HALF_TURN.rotation) * scene.up(), 1], [0, 0.25, 0, 1], atol=1e-9
+    )
+    content["nodes"][0]["matrix"][12] += 3.0
+    (tmp_path / "b.glb").write_bytes(glb(content, binary))
+    moved = HALF_TURN.then(similarity(node)).then(moving(np.array([3.0, 0, 0]))).then(HALF_TURN)
+    assert_alike(load_gaussians(tmp_path / "b.glb"), transform_gaussians(scene.gaussians, moved), 1e-4)
 
 
 def one_mesh(attributes: dict[str, int], extension: dict, size: int, **buffer: str) -> dict:

@@ -18,15 +18,14 @@ from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array, linear_light, rotation_matrices, unit
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.geometry.planes import cloud, turned_origin
-from langsplat_core.io.gltf import GltfWriter
+from langsplat_core.extensions.geometry.planes import cloud
+from langsplat_core.io.gltf import SIGNS, GltfWriter, node_of
 from langsplat_core.io.ply import CHANNELS, POSITION, write_table
 from langsplat_core.io.quantised import to_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import Camera, Gaussians, Scene
-from langsplat_core.scene.transform import AXES, moving, scaling, turning
 
 SIDE, MOST = 640, 160  # pixels of the longer side of an image, and images, at most
 FINEST = 100  # voxels in the radius of what is fused, unless pixels are larger
@@ -316,7 +315,7 @@ def check_suffix(path: Path | str) -> Path:
 def write_mesh(path: Path | str, mesh: Mesh, scene: Scene) -> None:
     """Write a mesh of a scene, in the world, as .ply or .glb, atomically. InputError for another suffix.
 
-    A .glb is y up, in metres where the scale is known.
+    A .glb has the axes and the node of the scene's Gaussians as `write_gltf` writes these.
     """
     path = check_suffix(path)
     if path.suffix.lower() == ".ply":
@@ -330,17 +329,10 @@ def write_mesh(path: Path | str, mesh: Mesh, scene: Scene) -> None:
     file = GltfWriter("KHR_materials_unlit")
     light = np.column_stack([linear_light(mesh.colour), np.ones(len(mesh.vertices))])
     attributes = {
-        "POSITION": file.add(mesh.vertices.astype("<f4"), bounded=True),
+        "POSITION": file.add((SIGNS * mesh.vertices).astype("<f4"), bounded=True),
         "COLOR_0": file.add(np.rint(65_535 * light).astype("<u2")),
     }
     corners = file.add(mesh.triangles.reshape(-1).astype("<u4"))
     primitive = {"attributes": attributes, "indices": corners, "material": 0}
-    file.add_mesh(primitive, name=mesh.name, matrix=gltf_axes(scene).T.reshape(-1).tolist())
+    file.add_mesh(primitive, name=mesh.name, **node_of(scene))
     file.write(path, materials=[{"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}])
-
-
-def gltf_axes(scene: Scene) -> Array:
-    """Return (4, 4) from the scene to the axes of glTF: y up, in metres where the scale is known."""
-    upright = turning(scene.up(), AXES["y"])
-    place = moving(turned_origin(upright.rotation, scene.origin))
-    return upright.then(place).then(scaling(scene.metres_per_unit or 1.0)).matrix

@@ -14,10 +14,11 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.geometry.mesh import watertight
-from langsplat_core.extensions.geometry.planes import Room, turned_origin
+from langsplat_core.extensions.geometry.planes import Room
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import NO_ORIGIN, Scene
+from langsplat_core.scene.transform import turned_origin
 
 MOST_CELLS = 60_000_000  # of a grid
 SIDE = 240  # pixels of the longer side of the depth images

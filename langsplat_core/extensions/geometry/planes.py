@@ -19,7 +19,6 @@ NEAR = 0.02  # of the scene's radius: how far from a plane its points lie
 LEAST = 0.02  # of the surface: what is less is no plane of a room
 LEVEL = 0.9  # cosine with up of the normals of a floor, at least
 BELOW = 0.05  # of the surface, that may lie below the floor: what shines through it, and floaters
-ASLANT = 0.1  # sine of an angle: axes nearer to the world's are taken for these
 
 
 def sample_surface(gaussians: Gaussians, count: int, seed: int = 0) -> tuple[Array, Array]:
@@ -108,13 +107,3 @@ def find_room(scene: Scene, seed: int = 0) -> Room:
         if (floor.heights(points) < -2 * near).mean() <= BELOW:
             return Room(floor.normal, floor.offset, floor)
     return Room(up, float(np.quantile(points @ up, BELOW)), None)
-
-
-def turned_origin(rotation: Array, origin: Array) -> Array:
-    """Return where the `origin` (3,) of a scene comes by a `rotation` (3, 3) that stands it upright.
-
-    Where that is nearly one of the world's axes onto others it is taken for it: estimated from a floor, it is
-    a hair aslant, and about zero would move a far scene by metres.
-    """
-    near = np.rint(rotation)
-    return np.asarray((near if np.abs(rotation - near).max() < ASLANT else rotation) @ origin)
