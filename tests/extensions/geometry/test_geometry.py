@@ -3,6 +3,7 @@ along rays, the map of the floor, poses in front of things."""
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 from PIL import Image
 from plyfile import PlyData
 from scipy import ndimage
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array, unit
@@ -645,15 +647,52 @@ def test_a_ply_holds_a_mesh(tmp_path):
     assert data["vertex"]["red"].tolist() == [255, 0, 0, 0]
 
 
-def test_a_glb_mesh_has_linear_colours_and_y_up(tmp_path):
-    scene = Scene(random_gaussians(3), metres_per_unit=2.0)
-    write_mesh(tmp_path / "a.glb", TETRAHEDRON, scene)
-    data = (tmp_path / "a.glb").read_bytes()
+def glb_parts(path: Path) -> tuple[dict[str, Any], Callable[[str], Array]]:
+    """The node of a file with one, and its primitive's attributes, as glTF says they are stored."""
+    data = path.read_bytes()
     size = int.from_bytes(data[12:16], "little")
     content, binary = json.loads(data[20 : 20 + size]), data[28 + size :]
-    assert content["buffers"][0]["byteLength"] == len(binary)
-    np.testing.assert_array_equal(np.frombuffer(binary[:48], "<f4").reshape(4, 3), TETRAHEDRON.vertices)
-    colours = np.frombuffer(binary[48:80], "<u2").reshape(4, 4) / 65_535
-    np.testing.assert_allclose(colours[:, :3].sum(1), [1, 0.2140, 0, 1], atol=1e-4)
-    matrix = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T
-    np.testing.assert_allclose(matrix @ [*scene.up(), 1], [0, 2, 0, 1], atol=1e-6)  # up, metres
+
+    def column(name: str) -> Array:
+        about = content["accessors"][content["meshes"][0]["primitives"][0]["attributes"][name]]
+        start = content["bufferViews"][about["bufferView"]]["byteOffset"]
+        kind = {5123: "<u2", 5126: "<f4"}[about["componentType"]]
+        shape = about["count"], int(about["type"][-1])
+        return np.frombuffer(binary, kind, shape[0] * shape[1], start).reshape(shape)
+
+    return content["nodes"][0], column
+
+
+def test_a_glb_mesh_has_linear_colours(tmp_path):
+    write_mesh(tmp_path / "a.glb", TETRAHEDRON, Scene(random_gaussians(3)))
+    node, column = glb_parts(tmp_path / "a.glb")
+    assert "matrix" not in node
+    np.testing.assert_array_equal(column("POSITION"), TETRAHEDRON.vertices * [-1, -1, 1])
+    np.testing.assert_allclose(column("COLOR_0")[:, :3].sum(1) / 65_535, [1, 0.2140, 0, 1], atol=1e-4)
+
+
+ASIDE = np.array([2.0, 1.0, -1.5])
+EYES = [ASIDE + 6 * np.array([np.cos(angle), np.sin(angle), 0.3]) for angle in range(14)]
+RING = tuple(look_at(eye, ASIDE, AXES["z"], (320, 320)) for eye in EYES)
+
+
+@pytest.mark.parametrize(("cameras", "metres"), [((), None), (RING, 0.25)])
+def test_splats_and_surface_of_a_glb_overlap(tmp_path, cameras, metres):
+    """As another program loads both: attributes, and the matrices of their nodes."""
+    scene = replace(place_scene(ball(2.0), moving(ASIDE)), cameras=cameras, metres_per_unit=metres)
+    save_scene(tmp_path / "splats.glb", scene)
+    write_mesh(tmp_path / "mesh.glb", fuse(scene, resolution=0.05)[0], scene)
+    places, colours = [], []
+    for name in ("splats", "mesh"):
+        node, column = glb_parts(tmp_path / f"{name}.glb")
+        matrix = np.reshape(node.get("matrix", np.eye(4).ravel()), (4, 4)).T
+        places.append(column("POSITION") @ matrix[:3, :3].T + matrix[:3, 3])
+        colours.append(np.median(column("COLOR_0")[:, :3], axis=0) / 65_535)
+    size = 4 * (metres or 1.0)
+    np.testing.assert_allclose(np.ptp(places[0], axis=0), size, rtol=0.02)
+    gaps = cKDTree(places[0]).query(places[1])[0]
+    assert np.median(gaps) < 0.02 * size  # the splats lie 0.04 apart
+    assert gaps.max() < 0.05 * size
+    np.testing.assert_allclose(colours[1], colours[0], atol=0.02)
+    up = scene.up() * [-1, -1, 1]
+    np.testing.assert_allclose(matrix[:3, :3] @ up, [0, metres or 1.0, 0], atol=1e-6)
