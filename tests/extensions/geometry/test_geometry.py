@@ -139,44 +139,19 @@ def assert_watertight(points: Array, triangles: Array) -> None:
 
 
 ROUGH = {  # triangles between corners 0 to 5 of an octahedron, 6 in its middle and 7 where 6 is
-    "two solids on an edge": [
-        [0, 6, 2],
-        [0, 2, 4],
-        [0, 4, 6],
-        [2, 6, 4],
-        [1, 2, 6],
-        [1, 4, 2],
-        [1, 6, 4],
-        [2, 4, 6],
-    ],
-    "two solids on a corner": [
-        [0, 2, 6],
-        [0, 4, 2],
-        [0, 6, 4],
-        [2, 4, 6],
-        [1, 3, 7],
-        [1, 5, 3],
-        [1, 7, 5],
-        [3, 5, 7],
-    ],
-    "a hole": [[0, 2, 6], [0, 4, 2], [0, 6, 4]],
-    "a solid twice": 2 * [[0, 2, 6], [0, 4, 2], [0, 6, 4], [2, 4, 6]],
-    "a flat one, and a pair back to back": [
-        [0, 2, 6],
-        [0, 4, 2],
-        [0, 6, 4],
-        [2, 4, 6],
-        [6, 7, 0],
-        [1, 3, 5],
-        [1, 5, 3],
-    ],
+    "two solids on an edge": "062 024 046 264 126 142 164 246",
+    "two solids on a corner": "026 042 064 246 137 153 175 357",
+    "a hole": "026 042 064",
+    "a solid twice": "026 042 064 246 026 042 064 246",
+    "a flat one, and a pair back to back": "026 042 064 246 670 135 153",
 }
 
 
 @pytest.mark.parametrize("name", ROUGH)
 def test_rough_triangles_become_watertight(name):
-    places = np.array([*np.eye(3).repeat(2, axis=0) * np.tile([[1], [-1]], (3, 1)), [0, 0, 0], [0, 0, 1e-9]])
-    points, triangles = watertight(np.column_stack([places, places]), np.array(ROUGH[name]), 1e-4)
+    places = np.array([*np.kron(np.eye(3), [[1], [-1]]), [0, 0, 0], [0, 0, 1e-9]])
+    rough = np.array([[*map(int, one)] for one in ROUGH[name].split()])
+    points, triangles = watertight(np.tile(places, 2), rough, 1e-4)
     assert_watertight(points[:, :3], triangles)
     assert np.abs(points[:, :3] - points[:, 3:]).max() <= 0.05
 
@@ -206,8 +181,7 @@ def test_a_ball_is_closed_and_coloured_without_cameras(monkeypatch, capfd):
     monkeypatch.undo()
     assert_watertight(closed.vertices, closed.triangles)
     assert closed.hollows() == 0
-    inside_out = Mesh(closed.vertices, closed.triangles[:, ::-1], closed.colour)
-    assert inside_out.hollows() == 1
+    assert replace(closed, triangles=closed.triangles[:, ::-1]).hollows() == 1
     assert 0.1 < made / closed.areas().sum() < 0.6
     _, nothing = close_holes(mesh, side)
     assert nothing < 0.02 * mesh.areas().sum()
@@ -576,9 +550,6 @@ def test_a_collider_is_closed_around_what_is_occupied(share):
     assert_watertight(corners, triangles)
     a, b, c = (corners[triangles[:, k]] for k in range(3))
     assert (np.cross(a, b) * c).sum() / 6 == pytest.approx(0.125 * hits.sum(), rel=0.06)
-    ends = np.argwhere(hits)
-    want = [-1 + 0.5 * ends.min(0), -0.5 + 0.5 * ends.max(0)]
-    np.testing.assert_allclose([corners.min(0), corners.max(0)], want, atol=0.03)
 
 
 def nav2_map(folder: Path) -> tuple[Array, Array, dict[str, str]]:
@@ -661,14 +632,6 @@ def glb_parts(path: Path) -> tuple[dict[str, Any], Callable[[str], Array]]:
         return np.frombuffer(binary, kind, shape[0] * shape[1], start).reshape(shape)
 
     return content["nodes"][0], column
-
-
-def test_a_glb_mesh_has_linear_colours(tmp_path):
-    write_mesh(tmp_path / "a.glb", TETRAHEDRON, Scene(random_gaussians(3)))
-    node, column = glb_parts(tmp_path / "a.glb")
-    assert "matrix" not in node
-    np.testing.assert_array_equal(column("POSITION"), TETRAHEDRON.vertices * [-1, -1, 1])
-    np.testing.assert_allclose(column("COLOR_0")[:, :3].sum(1) / 65_535, [1, 0.2140, 0, 1], atol=1e-4)
 
 
 ASIDE = np.array([2.0, 1.0, -1.5])
