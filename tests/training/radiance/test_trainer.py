@@ -65,13 +65,16 @@ def test_the_full_budget_is_the_inria_schedule() -> None:
     assert schedule.coarse_until == 0
 
 
-def test_a_small_budget_moves_geometry_faster() -> None:
-    full, short = (schedule_for(RadianceConfig(steps=n), 2.0).learning_rates(n) for n in (30_000, 300))
+def test_a_small_budget_moves_geometry_faster_and_cools() -> None:
+    full, short, last = (
+        schedule_for(RadianceConfig(steps=n), 2.0).learning_rates(step)
+        for n, step in ((30_000, 15_000), (300, 150), (300, 300))
+    )
     for name in ("means", "log_scales", "quats_wxyz"):
         assert short[name] == pytest.approx(10 * full[name])  # the root of 100
     for name in ("opacity_logits", "sh_dc", "sh_rest"):
-        assert short[name] == full[name]
-    longer = schedule_for(RadianceConfig(steps=60_000), 2.0).learning_rates(60_000)
+        assert short[name] == full[name] == pytest.approx(20 * last[name])
+    longer = schedule_for(RadianceConfig(steps=60_000), 2.0).learning_rates(30_000)
     assert longer == full
 
 
