@@ -87,10 +87,10 @@ SpzAxes = Literal["rub", "rdf"]
 class Convert:
     """Write any readable scene in another format, with its language field and cameras beside it.
 
-    A .ply (INRIA's) keeps everything, .spz is ten times smaller and rounded, .splat is without view
-    dependence; what is lost is printed. Checkpoints of LangSplat, LangSplatV2, Occam's LGS, OpenGaussian,
-    Feature-3DGS and 3D Gaussian Splatting become such a scene (see docs/files.md for what to give), and a
-    scene becomes checkpoints.
+    A .ply (INRIA's) keeps everything. Rounded are .spz (Niantic's) and .sog (PlayCanvas's), a tenth of it,
+    and .glb and .gltf (KHR_gaussian_splatting); .splat is without view dependence; what is lost is printed.
+    Checkpoints of LangSplat, LangSplatV2, Occam's LGS, OpenGaussian, Feature-3DGS and 3D Gaussian Splatting
+    become such a scene (see docs/files.md for what to give), and a scene becomes checkpoints.
     """
 
     source: tyro.conf.Positional[Path]
