@@ -66,13 +66,13 @@ def draw(scene: Scene, size: tuple[int, int] = (960, 540), answer: QueryResult |
         drawn = render(scene, camera)
         return Image.fromarray(compose(Channels(drawn.colours, drawn.alpha), PictureConfig()))
     if answer.place is not None:
-        camera = min(fitted, key=partial(_away, place=answer.place), default=camera)
+        camera = min(fitted, key=partial(view_distance, place=answer.place), default=camera)
     drawn = render(scene, camera, heats(Subject(len(scene.gaussians), answers=[answer])))
     heat = Channels(drawn.colours, drawn.alpha, drawn.values)
     return Image.fromarray(compose(heat, PictureConfig(display="relevancy"), heat_ranges([answer])))
 
 
-def _away(camera: Camera, place: Array) -> float:
+def view_distance(camera: Camera, place: Array) -> float:
     """Return the distance of a place (3,) from a camera; far more where it is not well within its image."""
     pixels, depth = camera.project(place[None])
     inside = (np.abs(pixels[0] / (camera.width, camera.height) - 0.5) < 0.4).all() and depth[0] > 0

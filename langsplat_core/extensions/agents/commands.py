@@ -7,7 +7,7 @@ import os
 from collections.abc import AsyncIterator, Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from inspect import cleandoc
 from pathlib import Path
 from threading import Lock
@@ -26,6 +26,7 @@ from langsplat_core.errors import InputError, LangSplatError, optional_imports, 
 from langsplat_core.extensions.library.index import scenes_in
 from langsplat_core.interrupts import end, handled
 from langsplat_core.io.scenes import format_of
+from langsplat_core.pipeline.notebook import view_distance
 from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import count_things, run_phrase
@@ -54,7 +55,6 @@ NO_JSON, INVALID = -32700, -32600  # codes of JSON-RPC
 P = ParamSpec("P")
 T = TypeVar("T")
 PROGRESS = ContextVar("PROGRESS", default=silent)  # of the call that runs here
-NEWS = 0.02  # of a stage: what is less is no message
 
 
 @dataclass(frozen=True)
@@ -218,26 +218,14 @@ def _places(values: Array | None, unit: Unit) -> Any:
 
 
 def towards(scene: Scene, answer: QueryResult) -> Camera:
-    """Return the camera that shows the best answer's box whole and large; a new one where there are none."""
+    """Return the nearest camera that has the best answer in its image; a new one where there are none."""
+    assert answer.place is not None
     assert answer.box is not None
-    low, high = answer.box
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-    if not scene.cameras:
-        middle, reach = (low + high) / 2, BACK * float(np.linalg.norm(high - low)) / 2
-        away = scene.framing_camera(SIZE).position - middle
-        return look_at(
-            middle + reach * away / max(float(np.linalg.norm(away)), 1e-300), middle, scene.up(), SIZE
-        )
-
-    def seen(camera: Camera) -> float:
-        pixels, depths = camera.project(corners)
-        if (depths <= 0).any():
-            return 0.0
-        inside = np.ptp(np.clip(pixels, 0, (camera.width, camera.height)), axis=0).prod()
-        whole = max(np.ptp(pixels, axis=0).prod(), 1e-9)
-        return float(inside / (camera.width * camera.height) * inside / whole)
-
-    return max(scene.cameras, key=seen)
+    if scene.cameras:
+        return min(scene.cameras, key=partial(view_distance, place=answer.place))
+    middle, reach = answer.box.mean(0), BACK * float(np.linalg.norm(np.ptp(answer.box, axis=0))) / 2
+    away = scene.framing_camera(SIZE).position - middle
+    return look_at(middle + reach * away / max(float(np.linalg.norm(away)), 1e-300), middle, scene.up(), SIZE)
 
 
 class _Wire:
@@ -303,7 +291,7 @@ def _told(send: Callable[..., Any]) -> Progress:
 
     def show(report: Report) -> None:
         done = stages.setdefault(report.stage, len(stages)) + report.fraction
-        if done >= sent[-1] + NEWS:
+        if done >= sent[-1] + 0.02:  # what is less is no news
             sent.append(done)
             run(send, done, None, report.text)
 

@@ -6,7 +6,7 @@ Features of surface points are matched by RANSAC and refined by ICP (Open3D); re
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_matrix, diags
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
@@ -31,7 +31,7 @@ ALIKE = 0.05  # of the depth: surfaces that are no farther apart are the same
 TRUSTED = 0.7  # of the pixels that both scenes fill, from which two scenes are one place
 OVERLAP = 0.2  # of an image that both scenes fill, below which a camera says nothing
 NEAR = 0.02  # of the first scene's radius: surfaces no farther apart may be of one thing
-SAME = 0.3, 0.5  # of the surface of one of two things, and of the other, that are one if it is near
+SAME = 0.4  # of the surface of each of two things that are one
 
 STAGE = "registering"
 
@@ -194,9 +194,9 @@ def merge(first: Scene, second: Scene) -> Scene:
 def once(both: Scene, count: int, near: float) -> tuple[Scene, int]:
     """Return a merged scene with the things that both scenes show kept once, and how many there are.
 
-    count: Gaussians of the first scene, which come first. Two wholes are one thing if the surface of each has
-    the other's at most `near` units away, on `SAME` of it. The one that more photographs show stays, else the
-    one of more Gaussians; of the other stays what is farther than `near` from it, as a part of it.
+    count: Gaussians of the first scene, which come first. Two wholes are one if `SAME` of the surface of each
+    has the other's at most `near` units away. The one that more photographs show stays, else the one of more
+    Gaussians; of the other stays what is farther than `near` from it, as a part of it.
     """
     tree = None if both.language is None else both.language.tree
     if both.language is None or tree is None:
@@ -204,28 +204,24 @@ def once(both: Scene, count: int, near: float) -> tuple[Scene, int]:
     nodes, means, areas = tree.at(len(LEVELS) - 1), both.gaussians.means, surface_areas(both.gaussians)
     solid = (nodes != NO_NODE) & (areas > 0)
     sides = [np.flatnonzero(solid[:count]), count + np.flatnonzero(solid[count:])]
-    shared = []  # by nodes of the first and the second scene: how much of one has the other near
+    shares = []  # by nodes of the first and the second scene, of what has the other scene's near
     for mine, theirs in (sides, sides[::-1]):
         gaps, nearest = cKDTree(means[theirs]).query(means[mine], distance_upper_bound=near, workers=-1)
-        there = np.isfinite(gaps)
+        there, of_whole = np.isfinite(gaps), areas[mine] / np.bincount(nodes[mine], areas[mine])[nodes[mine]]
         pairs = nodes[mine[there]], nodes[theirs[nearest[there]]]
-        sums = csr_matrix((areas[mine[there]], pairs), (tree.count, tree.count))
-        whole = np.bincount(nodes[mine], areas[mine], tree.count)
-        shared.append(diags(1 / np.maximum(whole, 1e-300)) @ sums)
-    least, most = shared[0].minimum(shared[1].T).tocoo(), shared[0].maximum(shared[1].T).tocsr()
-    leaves, keep, paired = tree.leaves.copy(), np.ones(len(nodes), bool), set[int]()
-    seen, things = tree.votes.sum(1), 0
-    for row in np.argsort(-least.data):
-        pair = int(least.row[row]), int(least.col[row])
-        if least.data[row] < SAME[0] or most[pair] < SAME[1] or paired & {*pair}:
-            continue
-        paired |= {*pair}
-        members = [np.flatnonzero(nodes == node) for node in pair]
-        better = max((0, 1), key=lambda i: (seen[pair[i]], len(members[i])))
-        kept, other = members[better], members[1 - better]
-        gaps, nearest = cKDTree(means[kept]).query(means[other], workers=-1)
-        keep[other], leaves[other] = gaps > near, tree.leaves[kept[nearest]]
-        things += bool(tree.votes[pair[better], 0])
+        shares.append(csr_matrix((of_whole[there], pairs), (tree.count, tree.count)))
+    alike = shares[0].minimum(shares[1].T).tocoo()
+    leaves, keep, paired, things = tree.leaves.copy(), np.ones(len(nodes), bool), set[int](), 0
+    for row in np.argsort(-alike.data):
+        pair = int(alike.row[row]), int(alike.col[row])
+        if alike.data[row] >= SAME and not paired & {*pair}:
+            paired |= {*pair}
+            sizes = [np.count_nonzero(nodes == node) for node in pair]
+            lesser, better = sorted(pair, key=lambda node: (tree.votes[node].sum(), sizes[pair.index(node)]))
+            other, kept = np.flatnonzero(nodes == lesser), np.flatnonzero(nodes == better)
+            gaps, nearest = cKDTree(means[kept]).query(means[other], workers=-1)
+            keep[other], leaves[other] = gaps > near, tree.leaves[kept[nearest]]
+            things += bool(tree.votes[better, 0])
     language = replace(both.language, tree=replace(tree, leaves=leaves))
     return replace(both, language=language).take(keep), things
 
