@@ -7,11 +7,10 @@ import os
 from collections.abc import AsyncIterator, Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import partial, wraps
+from functools import partial
 from inspect import cleandoc
 from pathlib import Path
-from threading import Lock
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
@@ -52,8 +51,6 @@ BACK = 2.2  # half diagonals of a thing's box: how far from it such a camera sta
 LONGEST_LINE = 1 << 20  # characters of a message
 NO_JSON, INVALID = -32700, -32600  # codes of JSON-RPC
 
-P = ParamSpec("P")
-T = TypeVar("T")
 PROGRESS = ContextVar("PROGRESS", default=silent)  # of the call that runs here
 
 
@@ -308,33 +305,27 @@ def build_server(door: Door) -> "MCPServer[Any]":
     from pydantic import ValidationError
 
     class Server(MCPServer[Any]):
+        turn = asyncio.Lock()  # one question at a time
+
         async def call_tool(
             self, name: str, arguments: dict[str, Any], context: Context[Any, Any] | None = None
         ) -> Any:
+            given = {key: value for key, value in arguments.items() if value is not None}
             if context is not None:
                 PROGRESS.set(_told(context.report_progress))
             try:
-                given = {key: value for key, value in arguments.items() if value is not None}
-                return await super().call_tool(name, given, context)
-            except ToolError as error:  # of wrong types the SDK says several lines
-                wrong = error.__cause__.errors() if isinstance(error.__cause__, ValidationError) else ()
-                said = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in wrong)
-                said = said or str(error).removeprefix(f"Error executing tool {name}: ")
+                async with self.turn:
+                    return await super().call_tool(name, given, context)
+            except ToolError as error:
+                said, cause = str(error), error.__cause__
+                if isinstance(cause, ValidationError):  # of which the SDK says several lines
+                    wrong = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in cause.errors()]
+                    said = "; ".join(wrong)
+                elif isinstance(cause, LangSplatError | OSError | MemoryError):
+                    said = str(cause)
                 raise ToolError(printable_line(said, 300)) from None
 
     server = Server("langsplat", instructions=INSTRUCTIONS, version=__version__, log_level="CRITICAL")
-    turn = Lock()
-
-    def guarded(ask: Callable[P, T]) -> Callable[P, T]:
-        @wraps(ask)
-        def asked(*args: P.args, **kwargs: P.kwargs) -> T:
-            try:
-                with turn:
-                    return ask(*args, **kwargs)
-            except (LangSplatError, OSError, MemoryError) as error:
-                raise ToolError(str(error)) from None
-
-        return asked
 
     def look(phrase: str = "", camera: int | None = None, scene: str = "") -> list[Picture | str]:
         encoded, (drawn, said) = io.BytesIO(), door.look(phrase, camera, scene)
@@ -344,5 +335,5 @@ def build_server(door: Door) -> "MCPServer[Any]":
     look.__doc__ = (Door.look.__doc__ or "").replace("(H, W, 3) uint8 image", "image")
     hints = ToolAnnotations(read_only_hint=True, destructive_hint=False, open_world_hint=False)
     for ask in (door.scenes, door.find, door.count, door.distance, door.describe, look):
-        server.tool(description=cleandoc(ask.__doc__ or ""), annotations=hints)(guarded(ask))
+        server.tool(description=cleandoc(ask.__doc__ or ""), annotations=hints)(ask)
     return server
