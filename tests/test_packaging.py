@@ -166,6 +166,15 @@ def test_gpu_requirements_follow_the_constraints() -> None:
     assert "\ngsplat==1.5.3 " in (GPU / "beside_torch.txt").read_text()
 
 
+def test_container_has_what_the_makefile_installs_and_no_rights(monkeypatch):
+    text = (PACKAGING / "Dockerfile").read_text()
+    libraries = script("system_libraries", monkeypatch)
+    wanted = {*libraries.NEEDED.values(), "libegl-mesa0", libraries.DRI_PACKAGE} - {"libusb-1.0-0"}
+    assert set(re.findall(r" (lib\S+)", text.split("pip install")[0])) >= wanted  # libusb is open3d's alone
+    assert "--constraint /source/packaging/constraints.txt /source" in text
+    assert text.index("\nUSER viewer\n") < text.index('\nENTRYPOINT ["langsplat"]\n')
+
+
 # The wheel without extras, in an environment that holds what it declares and nothing else: it opens, draws,
 # searches and selects, and what needs an optional package ends with the line that installs it.
 
