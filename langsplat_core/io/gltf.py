@@ -388,7 +388,7 @@ def write_gltf(path: Path | str, scene: Scene) -> None:
     if len(gaussians):
         says = {"kernel": "ellipse", "colorSpace": SRGB}
         says |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
-        columns = _columns(gaussians).items()
+        columns = attributes_of(gaussians).items()
         attributes = {name: file.add(values, name == "POSITION") for name, values in columns}
         primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: says}}
         file.add_mesh(primitive, **node_of(scene))
@@ -474,7 +474,7 @@ class GltfWriter:
             file.writelines(self._blocks)
 
 
-def _columns(gaussians: Gaussians) -> dict[str, Array]:
+def attributes_of(gaussians: Gaussians) -> dict[str, Array]:
     """Attribute -> (N, ...) values along glTF's axes; rows that cannot be drawn are harmless."""
     valid = gaussians.valid()
     keep = valid[:, None]
