@@ -80,9 +80,6 @@ class Export:
         print(f"{self.out}: {report.gaussians:,} Gaussians, {report.bytes / 1e6:.2f} MB; {asked}")
 
 
-SpzAxes = Literal["rub", "rdf"]
-
-
 @dataclass(frozen=True)
 class Convert:
     """Write any readable scene in another format, with its language field and cameras beside it.
@@ -113,10 +110,9 @@ class Convert:
     """Stored encoded in a scene made of checkpoints: they can be asked without any encoder."""
     spz_version: Literal[3, 4] = 3
     """Of a written .spz. Spark reads up to 3, PlayCanvas's engine 4 alone, most programs both."""
-    axes: Annotated[tuple[SpzAxes, ...], tyro.conf.arg(metavar="rub|rdf [rub|rdf]")] = ()
-    """Of an .spz: rub, y up as its README says, or rdf, y down as splat-transform and gsply read and write.
-    Of one that is read and does not say itself, and of one that is written, which says; two words where
-    they differ."""
+    axes: Annotated[tuple[Literal["rub", "rdf"], ...], tyro.conf.arg(metavar="RUB|RDF ...")] = ()
+    """Of an .spz: rub, y up as its README says, or rdf, y down as splat-transform and gsply read and write;
+    of one that is read and does not say, and of one that is written, the last word."""
     codec: CodecConfig = CodecConfig()  # noqa: RUF009  (frozen)
     """How the Gaussians of checkpoints with whole vectors keep them."""
 
@@ -130,6 +126,10 @@ class Convert:
         """The file or folder that is written."""
         return self.rest[-1]
 
+    @property
+    def _reads_spz(self) -> bool:
+        return self.source.suffix.lower() == ".spz"
+
     def run(self) -> None:
         """Read, and write a scene or what an exporter makes of it."""
         if not self.rest:
@@ -139,12 +139,9 @@ class Convert:
             return
         rematched = () if self.rematch is None else (self.rematch,)
         row = check_writable(self.out, *self.sources, *rematched)  # before minutes are spent on reading
-        if row.suffix != ".spz" and (self.spz_version != 3 or len(self.axes) > 1):
-            raise InputError(
-                "--spz-version and a second word of --axes are for a written .spz; leave them out"
-            )
-        if self.axes and ".spz" not in (row.suffix, self.source.suffix.lower()):
-            raise InputError("--axes are of an .spz, and none is read or written; leave them out")
+        files = self._reads_spz + (row.suffix == ".spz")
+        if len(self.axes) > files or (self.spz_version != 3 and row.suffix != ".spz"):
+            raise InputError("--axes, a word for each, and --spz-version are of an .spz; leave them out")
         scene = self._read()
         write, axes = None, (self.axes or ("rub",))[-1]
         described = "with a language field" if scene.language else "without a language field"
@@ -172,9 +169,8 @@ class Convert:
             raise InputError(
                 "--levels, --phrases and --codec are for checkpoints; leave them out for a scene"
             )
-        read = None
-        if self.source.suffix.lower() == ".spz":
-            read = partial(read_spz_scene, axes=(self.axes or ("",))[0], note=print)
+        spz = partial(read_spz_scene, axes=(self.axes or ("",))[0], note=print)
+        read = spz if self._reads_spz else None
         if self.rematch is None:
             return load_scene(self.source, read)
         scene = load_without_language(self.source, read)

@@ -18,6 +18,7 @@ import base64
 import json
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -227,8 +228,10 @@ def _placed(file: "_File") -> Iterator[tuple[Array, _Primitive]]:
         seen.add(number)
         node = content.nodes[number]
         matrix = above @ _matrix(node)
-        if len(content.nodes) == 1 and (kept := _kept(node)) is not None and kept.matrix == node.matrix:
-            file.kept, matrix = kept, np.eye(4)
+        with suppress(LookupError, TypeError, ValidationError):  # extras may be anything
+            kept = convert(node.extras[OWN], _Kept)
+            if len(content.nodes) == 1 and kept.matrix == node.matrix:
+                file.kept, matrix = kept, np.eye(4)
         file.others.update(map(quoted, node.extensions))
         if node.mesh is not None:
             file.shown.add(node.mesh)
@@ -245,13 +248,6 @@ def _matrix(node: _Node) -> Array:
     matrix[:3, :3] = rotation_matrices(np.array([w, x, y, z])) * np.array(node.scale)
     matrix[:3, 3] = node.translation
     return matrix
-
-
-def _kept(node: _Node) -> _Kept | None:
-    try:
-        return convert(node.extras[OWN], _Kept)
-    except (LookupError, TypeError, ValidationError):
-        return None
 
 
 def _gaussians(file: "_File", attributes: dict[str, int]) -> Gaussians:

@@ -500,7 +500,7 @@ def write_metres(path: Path | str, metres_per_unit: float) -> None:
     """
     path = Path(path)
     if path.suffix.lower() != ".ply":
-        raise InputError(f"{path}: only a .ply keeps a scale; make one with 'langsplat convert'")
+        raise InputError(f"{path}: a scale is given to a .ply; make one with 'langsplat convert'")
     if not 0 < metres_per_unit < math.inf:
         raise InputError(f"{metres_per_unit:g} metres per unit: must be above 0 and finite")
     with open_ply(path) as ply:

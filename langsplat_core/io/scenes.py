@@ -73,9 +73,9 @@ class SceneFormat:
 SMALL = ("precision", "extra properties", "origin")
 GLTF = ("precision", "extra properties")
 ROUNDS = MappingProxyType({
-    ".spz": "positions to 1/4096 unit or finer, sizes to 3 %, rotations to 0.1 degrees, colours to 1/255",
-    ".splat": "rotations to half a degree, colours and opacities to 1/255",
-    ".sog": "positions to 1/65535 of the extent, rotations to half a degree, all else to 256 values each",
+    ".spz": "positions to 1/4096 unit or finer, sizes to 3 %, rotations to 0.2 degrees, colours to 1/255",
+    ".splat": "rotations to a degree, colours and opacities to 1/255",
+    ".sog": "positions to 1/65535 of the extent, rotations to a degree, all else to 256 values each",
 })  # fmt: skip
 CORE_FORMATS = (
     SceneFormat(".ply", read_ply_scene, write_ply, mime="model/x-ply"),  # plain and compressed
@@ -113,7 +113,9 @@ def format_of(path: Path) -> SceneFormat | None:
 # ---- reading ----
 
 
-class _Origin(Struct):
+class PlacedOrigin(Struct):
+    """What the companion of a file without room for them keeps."""
+
     origin: tuple[camera_files.Coordinate, camera_files.Coordinate, camera_files.Coordinate]
     metres_per_unit: Annotated[float, Meta(gt=0, le=1e12)] | None = None
 
@@ -179,7 +181,7 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
     Logs a warning where positions were rounded to float32 far from zero before they were written.
     """
     try:
-        named = _read_origin(path)
+        named = read_origin(path)
     except InputError as error:
         report_loss("opened without its origin: %s", error)
         return replace(scene, unread=(str(error),))
@@ -204,15 +206,10 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
     return scene
 
 
-def _read_origin(path: Path) -> _Origin | None:
+def read_origin(path: Path) -> PlacedOrigin | None:
+    """Return the origin that the companion of a file names; None without one. InputError if damaged."""
     beside = companion_path(path, ORIGIN_SUFFIX)
-    return decode_json(read_file(beside, 1 << 16), _Origin, beside) if exists(beside) else None
-
-
-def read_origin(path: Path) -> Array | None:
-    """Return the origin (3,) that the companion of a file names; None without one. InputError if damaged."""
-    named = _read_origin(path)
-    return None if named is None else np.array(named.origin)
+    return decode_json(read_file(beside, 1 << 16), PlacedOrigin, beside) if exists(beside) else None
 
 
 def write_origin(path: Path, origin: Array, metres_per_unit: float | None = None) -> None:

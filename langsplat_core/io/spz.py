@@ -208,9 +208,7 @@ def read_spz_scene(path: Path | str, axes: str = "", note: Tell = lambda line: N
     if packed.axes and axes and packed.axes != AXES[axes]:
         told.append(f"its own record of its axes is followed, not --axes {axes}")
     if not packed.axes:
-        note(
-            f"{path}: names no axes; read as {axes.upper() or 'RUB, --axes rdf if it comes out upside down'}"
-        )
+        note(f"{path}: names no axes; read as {(axes or 'rub').upper()}")
     if not packed.axes and not axes and _floor_is_above(path, scene):
         told.append("taken for RUB, as no record names its axes, but its floor is above; try --axes rdf")
     report_losses(path, told)
@@ -313,10 +311,9 @@ def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub
         import zstandard
 
         frames = [zstandard.ZstdCompressor(12).compress(block) for block in blocks]
-        table = [
-            struct.pack("<QQ", len(frame), len(block)) for frame, block in zip(frames, blocks, strict=True)
-        ]
-        content = b"".join([head, struct.pack("<I12x", 32 + len(record)), record, *table, *frames])
+        sizes = [len(part) for pair in zip(frames, blocks, strict=True) for part in pair]
+        head += struct.pack("<I12x", 32 + len(record)) + record
+        content = b"".join([head, struct.pack(f"<{len(sizes)}Q", *sizes), *frames])
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 

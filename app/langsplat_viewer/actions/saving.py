@@ -228,7 +228,7 @@ OPTIONS: dict[str, tuple[str, float, tuple[float, float]]] = {  # label, default
     UNIT: ("Metres of a unit", 1.0, (0.001, 1000.0)),  # where the scene has none
 }
 SCENES = {
-    ".ply": (0, 56, 12), ".spz": (0, 14, 2), ".sog": (0, 20, 0.5), ".glb": (0, 48, 12), ".gltf": (0, 64, 16),
+    ".ply": (0, 56, 12), ".spz": (0, 14, 2), ".sog": (0, 20, 0.5), ".glb": (0, 52, 12), ".gltf": (0, 70, 16),
     ".splat": (0, 32, 0),
 }  # fmt: skip
 PAGE, SCENE = "web page", "scene"

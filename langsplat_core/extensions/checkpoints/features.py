@@ -232,8 +232,8 @@ def _from_torch(content: Any, path: Path) -> Part:
         ignored = [index for index, element in enumerate(elements) if isinstance(element, IgnoredArray)]
         told.append(unread("arrays of NumPy, elements", ignored))
         report_losses(path, told)
-        origin = read_origin(path)
-        scene = Scene(gaussians, origin=NO_ORIGIN if origin is None else origin)
+        beside = read_origin(path)
+        scene = Scene(gaussians, origin=NO_ORIGIN if beside is None else np.array(beside.origin))
         return Carrier(path, method, scene, features)
     mapping = plain_mapping(content)
     named = {"": content} if mapping is None else mapping

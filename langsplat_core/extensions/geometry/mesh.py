@@ -197,11 +197,6 @@ def _distinct(rows: Array) -> tuple[Array, Array]:
     return rows[first], kind
 
 
-def _means(values: Array, groups: Array) -> Array:
-    """(G, D) means of (N, D) values by their group, 0 to G - 1."""
-    return np.stack([np.bincount(groups, column) for column in values.T], 1) / np.bincount(groups)[:, None]
-
-
 def _rims(triangles: Array) -> tuple[Array, Array]:
     """(R, 2) directed edges that no triangle runs back, and (R,) the number of their loop."""
     sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
@@ -228,36 +223,31 @@ def watertight(points: Array, triangles: Array, near: float) -> tuple[Array, Arr
     turns = np.sign(triangles - np.roll(triangles, 1, axis=1)).prod(axis=1)  # 0: without an area
     faces, which = _distinct(np.sort(triangles, axis=1))
     net = np.bincount(which, -turns)
-    used, triangles = np.unique(
-        np.where(net[:, None] > 0, faces, faces[:, ::-1])[net != 0], return_inverse=True
-    )
+    kept = np.where(net[:, None] > 0, faces, faces[:, ::-1])[net != 0]
+    used, triangles = np.unique(kept, return_inverse=True)
     points, triangles = points[used], triangles.reshape(-1, 3)
     rims, loops = _rims(triangles)
     triangles = np.concatenate([triangles, np.column_stack([rims[:, ::-1], len(points) + loops])])
-    points = np.concatenate([points, _means(points[rims[:, 0]], loops)])
+    middle = [points[rims[loops == loop, 0]].mean(0) for loop in range(loops.max(initial=-1) + 1)]
+    points = np.concatenate([points, np.reshape(middle, (-1, points.shape[1]))])
     a, b, c = (points[triangles[:, corner], :3] for corner in range(3))
-    flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) < 1e-2 * near * np.linalg.norm(
-        b - a + c - a, axis=1
-    )
-    bent = _means(np.repeat((a + b + c) / 3, 3, axis=0), triangles.reshape(-1))[triangles[flat]]
-    points[triangles[flat], :3] += 0.05 * (bent - points[triangles[flat], :3])
+    areas, sides = np.linalg.norm(np.cross(b - a, c - a), axis=1), np.linalg.norm([b - a, c - a], axis=2)
+    flat = triangles[areas < 1e-2 * near * sides.sum(0), 2]
+    points[flat, :3] += near * np.random.default_rng(0).normal(size=(len(flat), 3))
 
     start, end, third = (np.roll(triangles, -step, axis=1).reshape(-1) for step in range(3))
     edge = _distinct(np.sort(np.column_stack([start, end]), axis=1))[1]
     many = np.flatnonzero(np.bincount(edge)[edge] > 2)
     many = many[np.argsort(edge[many], kind="stable")]
     pairs = np.column_stack([many[start[many] > end[many]], many[start[many] < end[many]]])
-    ends, aside = points[start[pairs[:, 0]]] + points[end[pairs[:, 0]]], points[third[pairs]].mean(1)
+    added = 0.475 * points[start[pairs]].sum(1) + 0.05 * points[third[pairs]].mean(1)
     on, cut = np.full(triangles.size, -1), np.zeros(len(triangles), bool)
     on[pairs], cut[pairs // 3] = (len(points) + np.arange(len(pairs)))[:, None], True
     centres = len(points) + len(pairs) + np.cumsum(cut) - 1
-    middles = points[triangles[cut]].mean(1)
-    points = np.concatenate([points, 0.475 * ends + 0.05 * aside, middles])
-    sides = np.flatnonzero(np.repeat(cut, 3))
-    halves = sides[on[sides] >= 0]
-    fans = np.column_stack([start, np.where(on < 0, end, on), np.repeat(centres, 3)])[sides]
-    more = np.column_stack([on, end, np.repeat(centres, 3)])[halves]
-    return points, np.concatenate([triangles[~cut], fans, more])
+    points = np.concatenate([points, added, points[triangles[cut]].mean(1)])
+    fans = np.column_stack([start, np.where(on < 0, end, on), np.repeat(centres, 3)])[np.repeat(cut, 3)]
+    halves = np.column_stack([on, end, np.repeat(centres, 3)])[on >= 0]
+    return points, np.concatenate([triangles[~cut], fans, halves])
 
 
 def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
