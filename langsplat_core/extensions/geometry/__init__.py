@@ -1,4 +1,4 @@
-"""Meshes, planes, registration, merging and maps for robots."""
+"""Meshes, planes, registration, merging, maps for robots and OpenUSD stages."""
 
 from langsplat_core.registry import Extension
 
@@ -9,5 +9,6 @@ EXTENSION = Extension(
         "mesh": f"{_COMMANDS}:WriteMesh",
         "register": f"{_COMMANDS}:Register",
         "merge": f"{_COMMANDS}:Merge",
+        "usd": "langsplat_core.extensions.geometry.usd:Usd",
     }
 )

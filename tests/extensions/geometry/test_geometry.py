@@ -19,7 +19,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from langsplat_core.arrays import Array, unit
+from langsplat_core.arrays import Array, rotation_matrices, unit
+from langsplat_core.cli.app import parse
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.geometry.commands import read_transform
 from langsplat_core.extensions.geometry.mesh import (
@@ -62,7 +63,7 @@ from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, named_scene
 from tests.support.file_kinds import FileKind, drawable_share, few_and_many, in_json
 from tests.support.file_samples import random_field
 from tests.support.processes import refusal, run
-from tests.support.scenes import FLOOR, WALL, box_room, random_camera, random_gaussians
+from tests.support.scenes import DEMO, FLOOR, WALL, box_room, random_camera, random_gaussians
 
 pytest.importorskip("open3d")
 
@@ -650,3 +651,44 @@ def test_splats_and_surface_of_a_glb_overlap(tmp_path, cameras, metres):
     np.testing.assert_allclose(colours[1], colours[0], atol=0.02)
     up = scene.up() * [-1, -1, 1]
     np.testing.assert_allclose(matrix[:3, :3] @ up, [0, metres or 1.0, 0], atol=1e-6)
+
+
+# Stages of OpenUSD, as usd-core reads and judges them.
+
+
+@pytest.mark.parametrize("suffix", [".usda", ".usdc"])
+def test_stage_is_valid_and_stands_upright_in_metres(tmp_path, capsys, suffix):
+    usd, geom, validation = (
+        pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdValidation")
+    )
+
+    scene = load_scene(DEMO).take(np.arange(0, 80_000, 40))
+    at = np.array([500_123.25, 5_412_345.5, 30.0])  # UTM
+    save_scene(tmp_path / "far.ply", place_scene(scene, moving(at)))
+    out = tmp_path / f"far{suffix}"
+    parse(["usd", str(tmp_path / "far.ply"), str(out)]).run()
+    assert "2,000 Gaussians, and the numbers of its things" in capsys.readouterr().out
+    stage = usd.Stage.Open(str(out))
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert validation.ValidationContext(validators).Validate(stage) == []
+    prim = stage.GetDefaultPrim()
+    assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
+
+    def get(name: str) -> np.ndarray:
+        return np.array(prim.GetAttribute(name).Get())
+
+    matrix = np.array(geom.Xformable(prim).ComputeLocalToWorldTransform(0.0))
+    world = get("positions") @ matrix[:3, :3] + matrix[3, :3]
+    given = load_scene(tmp_path / "far.ply")
+    heights = given.in_world(given.gaussians.means) @ given.up()
+    np.testing.assert_allclose(np.diff(world[:, 1]), np.diff(heights), atol=1e-6)
+    np.testing.assert_allclose(np.exp(given.gaussians.log_scales), get("scales"), rtol=1e-6)
+    quats = get("orientations")[:, [3, 0, 1, 2]]  # i, j, k, r in memory
+    axes = np.swapaxes(rotation_matrices(quats), 1, 2) @ matrix[:3, :3]
+    upright = (
+        np.abs(axes[..., 1]),
+        np.abs(np.swapaxes(rotation_matrices(given.gaussians.quats_wxyz), 1, 2) @ given.up()),
+    )
+    np.testing.assert_allclose(*upright, atol=1e-5)
+    assert get("radiance:sphericalHarmonicsCoefficients").shape == (2000 * given.gaussians.sh.shape[1], 3)
+    np.testing.assert_array_equal(get("primvars:whole"), given.language.tree.at(2))

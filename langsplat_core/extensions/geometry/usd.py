@@ -17,7 +17,6 @@ from langsplat_core.io.files import atomic_path, check_output_file
 from langsplat_core.io.gltf import COEFFICIENTS, attributes_of, node_of
 from langsplat_core.io.gltf import EXTENSION as KHR
 from langsplat_core.io.scenes import load_scene, report_left_out
-from langsplat_core.registry import Extension
 from langsplat_core.scene import LEVELS, Scene
 
 SUFFIXES = (".usd", ".usda", ".usdc")
@@ -84,6 +83,3 @@ def write_usd(path: Path, scene: Scene) -> None:
     with atomic_path(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise OSError(f"{path}: could not be written")
-
-
-EXTENSION = Extension(commands={"usd": "langsplat_core.extensions.usd:Usd"})
