@@ -291,7 +291,7 @@ def _measured(
     learnt = evaluate_views(gaussians, capture, train)
     scene = Scene(gaussians, cameras=tuple(capture.cameras[i] for i in train))
     means = [
-        np.mean([found for score in scores if (found := getattr(score, name)) is not None] or [np.nan])
+        np.mean([one for score in scores if (one := getattr(score, name)) is not None] or [np.nan])
         for name in ("psnr", "psnr_exposed", "psnr_small")
     ]
     windows = [
