@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 
 from langsplat_core import registry
@@ -66,7 +67,11 @@ class Command:
     is_on: Callable[[Viewer], bool] | None = None  # for a check mark in the menu
     apart: bool = False  # a line is above it in the menu
     now: Callable[[Viewer], str] = lambda viewer: ""  # words for the menu in place of `does`
-    icon: str = ""  # on the toolbar, a name of Font Awesome 6 without its "ICON_FA_"
+
+    @property
+    def icon(self) -> str:
+        """Name of the icon on the toolbar, of Font Awesome 6 without its "ICON_FA_"; "" for none."""
+        return ICONS.get(self.does, "")
 
 
 def is_shown(state: ViewerState, button: Button) -> bool:
@@ -75,13 +80,18 @@ def is_shown(state: ViewerState, button: Button) -> bool:
     return session.picture.display == button.display and button.latent_level in (None, session.latent_level)
 
 
+def _is(path: str, *values: object) -> Callable[[Viewer], bool]:
+    """Return the check that what `path` names in the state is one of the values; of none, that it is true."""
+    of = attrgetter(path)
+    return lambda v: of(v.state) in values if values else bool(of(v.state))
+
+
 def _display(button: Button, number: int) -> Command:
     return Command(
         f"show {button.name.lower()}",
-        lambda viewer: settings.set_display(viewer, button.display, button.latent_level),
+        lambda v: settings.set_display(v, button.display, button.latent_level),
         (str(number),) if number < 10 else (),
-        is_on=lambda viewer: is_shown(viewer.state, button),
-        icon="" if button.latent_level in (0, 1) else DISPLAY_ICONS.get(button.display, ""),
+        is_on=lambda v: is_shown(v.state, button),
     )
 
 
@@ -90,25 +100,20 @@ def _recent(path: Path) -> Command:
 
 
 def _panel(title: str) -> Command:
-    return Command(f"panel: {title}", lambda viewer: settings.open_panel(viewer, title))
+    return Command(f"panel: {title}", lambda v: settings.open_panel(v, title))
 
 
 def _overlay(name: Overlay, title: str) -> Command:
     return Command(
         f"show or hide the {title}",
-        lambda viewer: settings.toggle_overlay(viewer, name),
+        lambda v: settings.toggle_overlay(v, name),
         ("B",) if name == "things" else (),
-        is_on=lambda viewer: name in viewer.state.session.overlays,
+        is_on=lambda v: name in v.state.session.overlays,
     )
 
 
 def _tool(tool: Tool) -> Command:
-    return Command(
-        f"select: {tool}",
-        lambda viewer: editing.use_tool(viewer, tool),
-        is_on=lambda viewer: viewer.state.tools.tool == tool,
-        icon=TOOL_ICONS[tool],
-    )
+    return Command(f"select: {tool}", lambda v: editing.use_tool(v, tool), is_on=_is("tools.tool", tool))
 
 
 def _step(step: editing.Step, act: editing.Action, *keys: str) -> Command:
@@ -125,7 +130,7 @@ def _export_as(title: str) -> Command:
 
 def _side(side: Side, key: str) -> Command:
     where = {"top": "above", "bottom": "below"}.get(side, f"the {side}")
-    return Command(f"look from {where}", lambda viewer: viewpoint.look_from(viewer, side), (key,))
+    return Command(f"look from {where}", lambda v: viewpoint.look_from(v, side), (key,))
 
 
 OVERLAY_TITLES: dict[Overlay, str] = {
@@ -147,29 +152,25 @@ PANEL_TITLES = (
     *("Notes", "Scene", "Train", "Timeline", "Messages"),
     *registry.references("panels"),
 )
-TOOL_ICONS: dict[Tool, str] = {
-    "thing": "HAND_POINTER",
-    "rectangle": "VECTOR_SQUARE",
-    "lasso": "DRAW_POLYGON",
-    "brush": "BRUSH",
-    "sphere": "CIRCLE",
-    "box": "CUBE",
-}
-DISPLAY_ICONS: dict[Display, str] = {
-    "rgb": "IMAGE",
-    "relevancy": "FIRE",
-    "segmentation": "HIGHLIGHTER",
-    "latent": "PALETTE",
-    "tree": "SITEMAP",
-    "depth": "MOUNTAIN",
-}
+ICONS = {  # by what a command does
+    "show colours": "IMAGE", "show relevancy": "FIRE", "show segmentation": "HIGHLIGHTER",
+    "show latent, whole": "PALETTE", "show tree, whole": "SITEMAP", "show depth": "MOUNTAIN",
+    "select with no tool: the left button turns the view": "HAND", "select: thing": "HAND_POINTER",
+    "select: rectangle": "VECTOR_SQUARE", "select: lasso": "DRAW_POLYGON", "select: brush": "BRUSH",
+    "select: sphere": "CIRCLE", "select: box": "CUBE", "save a picture": "CAMERA",
+    "gizmo: move, rotate, scale, box, off": "UP_DOWN_LEFT_RIGHT", "measure a distance": "RULER",
+    "say what is under the cursor": "COMMENT_DOTS", "compare two displays": "TABLE_COLUMNS",
+    "three levels side by side": "LAYER_GROUP", "pin a note to what is clicked": "NOTE_STICKY",
+    "return to the opening view": "HOUSE", "frame everything": "EXPAND",
+    "focus on the latest result found": "CROSSHAIRS",
+}  # fmt: skip
 OTHER_THEME = {"dark": "light", "light": "dark"}
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list of commands alone
     "File": (
         Command("open a scene ...", opening.ask_for_file, ("Ctrl+O",), "Open a scene ..."),
-        Command("start page", settings.toggle_start, is_on=lambda viewer: viewer.state.show_start),
+        Command("start page", settings.toggle_start, is_on=_is("show_start")),
         Command("reload the scene", opening.reload, ("F5",), apart=True),
         Command("next scene of the list", lambda v: opening.step_scene(v, 1), ("Ctrl+PageDown",)),
         Command("previous scene of the list", lambda v: opening.step_scene(v, -1), ("Ctrl+PageUp",)),
@@ -186,10 +187,10 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             ("Ctrl+S",),
             "Save project",
             apart=True,
-            now=lambda viewer: "save the project (changed)" if viewer.state.is_changed else "",
+            now=lambda v: "save the project (changed)" if v.state.is_changed else "",
         ),
         Command("save the project as ...", saving.save_as, ("Ctrl+Shift+S",)),
-        Command("save a picture", saving.save_picture, ("P",), "Save picture", icon="CAMERA", apart=True),
+        Command("save a picture", saving.save_picture, ("P",), "Save picture", apart=True),
         Command("save the view", saving.save_view, (), "Save view"),
         Command("save a picture of the film's size", saving.save_sized_picture, (), "Picture of this size"),
         Command("save a film of the path", saving.save_film, (), "Save film"),
@@ -205,8 +206,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             "gizmo: move, rotate, scale, box, off",
             editing.next_gizmo,
             ("G",),
-            is_on=lambda viewer: viewer.state.edit_form.gizmo != "off",
-            icon="UP_DOWN_LEFT_RIGHT",
+            is_on=lambda v: v.state.edit_form.gizmo != "off",
             apart=True,
         ),
     ),
@@ -220,9 +220,8 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("shrink the selection", editing.shrink_selection, (), "Shrink"),
         Command(
             "select with no tool: the left button turns the view",
-            lambda viewer: editing.use_tool(viewer, None),
-            is_on=lambda viewer: viewer.state.tools.tool is None,
-            icon="HAND",
+            lambda v: editing.use_tool(v, None),
+            is_on=_is("tools.tool", None),
             apart=True,
         ),
         *(_tool(tool) for tool in TOOLS),
@@ -243,22 +242,14 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             "say what is under the cursor",
             viewpoint.toggle_pointing,
             ("I",),
-            is_on=lambda viewer: viewer.state.pointing,
-            icon="COMMENT_DOTS",
+            is_on=_is("pointing"),
             apart=True,
         ),
         Command(
-            "compare two displays",
-            settings.toggle_wipe,
-            ("V",),
-            is_on=lambda viewer: viewer.state.session.split.mode == "wipe",
-            icon="TABLE_COLUMNS",
+            "compare two displays", settings.toggle_wipe, ("V",), is_on=_is("session.split.mode", "wipe")
         ),
         Command(
-            "three levels side by side",
-            settings.toggle_levels,
-            is_on=lambda viewer: viewer.state.session.split.mode == "levels",
-            icon="LAYER_GROUP",
+            "three levels side by side", settings.toggle_levels, is_on=_is("session.split.mode", "levels")
         ),
         Command("compare with another scene ...", opening.ask_for_beside),
         *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
@@ -266,24 +257,15 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             "measure a distance",
             settings.toggle_measuring,
             ("M",),
-            is_on=lambda viewer: viewer.state.session.ruler.measures,
-            icon="RULER",
+            is_on=_is("session.ruler.measures"),
             apart=True,
         ),
-        Command(
-            "pin a note to what is clicked",
-            settings.toggle_pinning,
-            ("N",),
-            is_on=lambda viewer: viewer.state.pins_notes,
-            icon="NOTE_STICKY",
-        ),
+        Command("pin a note to what is clicked", settings.toggle_pinning, ("N",), is_on=_is("pins_notes")),
     ),
     "Camera": (
-        Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Reset", icon="HOUSE"),
-        Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Frame all", icon="EXPAND"),
-        Command(
-            "focus on the latest result found", viewpoint.focus_result, ("F",), "Focus", icon="CROSSHAIRS"
-        ),
+        Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Reset"),
+        Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Frame all"),
+        Command("focus on the latest result found", viewpoint.focus_result, ("F",), "Focus"),
         Command(
             "previous training camera", lambda v: viewpoint.step_camera(v, -1), (",",), "", True, apart=True
         ),
@@ -309,7 +291,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command(
             "light theme, or dark again",
             lambda v: settings.prefer(v, theme=OTHER_THEME[v.state.preferences.theme]),
-            is_on=lambda viewer: viewer.state.preferences.theme == "light",
+            is_on=_is("preferences.theme", "light"),
         ),
         Command("larger text", lambda v: settings.scale_text(v, 0.25), apart=True),
         Command("smaller text", lambda v: settings.scale_text(v, -0.25)),

@@ -23,7 +23,7 @@ from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import extent_of, frame_of
 from langsplat_viewer.camera.overlays import PlacedText, placed
-from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
+from langsplat_viewer.commands import COMMANDS, ICONS, PANEL_TITLES, SYNONYMS, matching
 from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.navigation import chord
@@ -108,6 +108,7 @@ LOOKED_FOR = {
 def test_palette_finds_commands_by_other_words():
     words = [(word, does) for does, many in LOOKED_FOR.items() for word in many.split()]
     assert len(words) >= 50
+    assert not {*ICONS, *SYNONYMS} - {command.does for command in COMMANDS}
     missed = [pair for pair in words if pair[1] not in [command.does for command in matching(pair[0])]]
     assert missed == []
     assert matching("full screen")[0].act is settings.toggle_panels
