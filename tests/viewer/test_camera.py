@@ -368,7 +368,11 @@ def test_a_bookmark_leads_back_and_is_undone(opened):
     settings.take_off(opened, "bookmarks", opened.state.session.bookmarks[0])
     assert names(opened) == ["view 2"]
     editing.undo(opened)
-    go(viewpoint.go_to_bookmark, opened, opened.state.session.bookmarks[0])
+    go(
+        viewpoint.glide_to,
+        opened,
+        viewpoint.bookmarked_view(opened.state.session.bookmarks[0], opened.state.extent),
+    )
     assert_same(opened.state.view, marked)
     open_scene(opened, "plain.ply")
     assert names(opened) == []

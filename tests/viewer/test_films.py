@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -313,11 +314,13 @@ def test_turntable_comes_back_and_is_undone(opened):
 def test_keyframes_are_changed_and_changes_undone(opened):
     record_three(opened)
     first, second, third = opened.state.session.keyframes
-    viewpoint.move_keyframe(opened, second, 5.0)
+    viewpoint.put_keyframe(opened, second, replace(second, seconds=5.0))
     assert times(opened) == [0, 4, 5]
-    viewpoint.move_keyframe(opened, opened.state.session.keyframes[2], 4.0)  # there is one
+    viewpoint.put_keyframe(
+        opened, opened.state.session.keyframes[2], replace(second, seconds=4.0)
+    )  # is there
     assert times(opened) == [0, 4, 4.01]
-    viewpoint.delete_keyframe(opened, first)
+    viewpoint.put_keyframe(opened, first)
     assert times(opened) == [4, 4.01]
     for expected in ([0, 4, 4.01], [0, 4, 5], [0, 2, 4], [0, 2]):
         editing.undo(opened)
@@ -325,11 +328,11 @@ def test_keyframes_are_changed_and_changes_undone(opened):
     assert opened.state.session.keyframes == (first, second)
     editing.redo(opened)
     assert opened.state.session.keyframes == (first, second, third)
-    viewpoint.replace_keyframe(opened, first)
+    viewpoint.put_keyframe(opened, first, replace(first, pose=pose_of(opened.state.view)))
     assert_allclose(opened.state.session.keyframes[0].pose.position, opened.state.view.eye)
     viewpoint.set_path_seconds(opened, 8)
     assert times(opened) == [0, 4, 8]
-    viewpoint.clear_path(opened)
+    viewpoint.set_path(opened, ())
     assert times(opened) == []
     editing.undo(opened)
     assert times(opened) == [0, 4, 8]
@@ -340,7 +343,7 @@ def test_a_path_is_saved_loaded_and_dropped(opened, tmp_path, frames):
     path = saving.save_path(opened, tmp_path)
     assert path.name == "blobs-001.path.json"
     assert len(read_flight(path).keyframes) == 3
-    viewpoint.clear_path(opened)
+    viewpoint.set_path(opened, ())
     opening.open_dropped(opened, [path])
     assert times(opened) == [0, 2, 4]
     assert opened.state.wanted_panel == "Record"

@@ -160,7 +160,7 @@ def test_name_finds_what_was_given_it_and_others_on_request(opened):
     np.testing.assert_array_equal(result(opened).members, half)
     assert result(opened).found
     assert_allclose(result(opened).place, CENTRES[0], atol=0.3)
-    act(queries.show_alike, opened, opened.state.session.queries[0])
+    act(queries.answer, opened, "bruno", ["bruno"], alike=True)
     np.testing.assert_array_equal(result(opened).members, blob("mug"))
     assert answer(opened).like is None
 

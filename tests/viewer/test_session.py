@@ -482,7 +482,7 @@ def opened_again(path: Path) -> float:
             raise InputError(max(problems, key=len))
         shown = [made.state.request((32, 24))]
         for bookmark in made.state.session.bookmarks:
-            go(viewpoint.go_to_bookmark, made, bookmark)
+            go(viewpoint.glide_to, made, viewpoint.bookmarked_view(bookmark, made.state.extent))
             shown.append(made.state.request((32, 24)))
         if made.state.session.keyframes:
             viewpoint.scrub(made, viewpoint.path_seconds(made) / 3)

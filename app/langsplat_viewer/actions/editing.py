@@ -16,8 +16,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.instances import Instance
-from langsplat_core.query.selection import at_point, grow, in_box, of_rows, shrink
+from langsplat_core.query.selection import at_point, grow, in_box, shrink
 from langsplat_core.scene import LEVELS
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
 from langsplat_viewer import marks
@@ -173,12 +172,6 @@ def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None =
         viewer.state.say(f"'{query.phrase}' is not here: nothing to select")
     else:
         take(viewer, result.members, mode)
-
-
-def select_thing(viewer: Viewer, thing: Instance, mode: Mode | None = None) -> None:
-    """Select one instance of an answer."""
-    if has_scene(viewer):
-        take(viewer, of_rows(thing.members, len(viewer.state.marks.selected)), mode)
 
 
 # Tools of the mouse: a stroke begins, goes on and ends; (u, v) are fractions of the scene's area.

@@ -121,11 +121,6 @@ def _alone(like: QueryResult, members: Array) -> QueryResult:
     return replace(like, members=members, place=place, box=box, judgement=judgement)
 
 
-def show_alike(viewer: Viewer, query: Query) -> None:
-    """Show of a name, which finds what was given it, all that is like that."""
-    answer(viewer, query.phrase, shown_with=[query.phrase], alike=True)
-
-
 def _tell_apart(viewer: Viewer, engine: QueryEngine, phrase: str, result: QueryResult) -> None:
     answers = viewer.state.answers
 

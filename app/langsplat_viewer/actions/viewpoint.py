@@ -281,7 +281,7 @@ def add_keyframe(viewer: Viewer) -> None:
         viewer.say_error(f"a path has at most {MOST_KEYFRAMES} keyframes and {flight.LONGEST:.0f} seconds")
         return
     added = Keyframe(last, flight.pose_of(state.view))
-    _set_path(viewer, (*keyframes, added), added)
+    set_path(viewer, (*keyframes, added), added)
     state.say(f"keyframe {len(keyframes) + 1} at {added.seconds:.1f} s")
 
 
@@ -289,7 +289,7 @@ def turn_around(viewer: Viewer) -> None:
     """Have the path go once around what the view turns around, in place of the keyframes that were there."""
     if viewer.has_scene("turn around in it") and viewer.state.view is not None:
         seconds = path_seconds(viewer) or TURN_SECONDS
-        _set_path(viewer, flight.turntable(viewer.state.view, seconds).keyframes, None)
+        set_path(viewer, flight.turntable(viewer.state.view, seconds).keyframes, None)
         viewer.state.record.at = 0.0
 
 
@@ -322,41 +322,26 @@ def thumbnails(viewer: Viewer) -> Array:
     return record.thumbnails[1]
 
 
-def delete_keyframe(viewer: Viewer, key: Keyframe) -> None:
-    """Take a keyframe off the path; the others keep their times."""
-    _set_path(viewer, tuple(other for other in viewer.state.session.keyframes if other is not key), None)
-
-
-def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
-    """Move a keyframe to another time, or beside a keyframe that has that time."""
-    others = tuple(other for other in viewer.state.session.keyframes if other is not key)
-    seconds = min(max(seconds, 0.0), flight.LONGEST)
-    while any(abs(other.seconds - seconds) < flight.SAME_TIME for other in others):
-        seconds += 0.01
-    moved = replace(key, seconds=seconds)
-    _set_path(viewer, flight.with_keyframe(others, moved), moved)
-
-
-def replace_keyframe(viewer: Viewer, key: Keyframe) -> None:
-    """Put the current view in the place of a keyframe."""
-    if viewer.state.view is not None:
-        new = replace(key, pose=flight.pose_of(viewer.state.view))
-        _set_path(viewer, flight.with_keyframe(viewer.state.session.keyframes, new), new)
+def put_keyframe(viewer: Viewer, key: Keyframe, new: Keyframe | None = None) -> None:
+    """Have another in the place of a keyframe, or beside one that has its time; without one take it off."""
+    kept = tuple(other for other in viewer.state.session.keyframes if other is not key)
+    if new is not None:
+        seconds = min(max(new.seconds, 0.0), flight.LONGEST)
+        while any(abs(other.seconds - seconds) < flight.SAME_TIME for other in kept):
+            seconds += 0.01
+        new = replace(new, seconds=seconds)
+        kept = flight.with_keyframe(kept, new)
+    set_path(viewer, kept, new)
 
 
 def set_path_seconds(viewer: Viewer, seconds: float) -> None:
     """Set how long the path takes."""
     keyframes, seconds = viewer.state.session.keyframes, min(max(seconds, 0.1), flight.LONGEST)
-    _set_path(viewer, flight.stretched(keyframes, max(seconds, len(keyframes) * flight.SAME_TIME)), None)
+    set_path(viewer, flight.stretched(keyframes, max(seconds, len(keyframes) * flight.SAME_TIME)), None)
 
 
-def clear_path(viewer: Viewer) -> None:
-    """Take all keyframes off the path."""
-    if viewer.state.session.keyframes:
-        _set_path(viewer, (), None)
-
-
-def _set_path(viewer: Viewer, keyframes: tuple[Keyframe, ...], chosen: Keyframe | None) -> None:
+def set_path(viewer: Viewer, keyframes: tuple[Keyframe, ...], chosen: Keyframe | None = None) -> None:
+    """Take other keyframes, one of them as chosen."""
     viewer.change(keyframes=keyframes)
     record = viewer.state.record
     record.began, record.chosen = None, chosen
@@ -370,7 +355,7 @@ def load_path(viewer: Viewer, path: Path) -> None:
     except LangSplatError as error:
         viewer.say_error(str(error))
         return
-    _set_path(viewer, found.keyframes, None)
+    set_path(viewer, found.keyframes, None)
     viewer.state.record.at = 0.0
     open_panel(viewer, "Record")
     viewer.state.say(f"{path.name}: {len(found.keyframes)} keyframes, {found.seconds:.1f} s")
@@ -439,12 +424,6 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
         return
     viewer.change(bookmarks=(*others, added))
     state.say(f"bookmark '{added.name}'")
-
-
-def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
-    """Stand where a bookmark was made, turning around the same point."""
-    if viewer.state.extent is not None:
-        glide_to(viewer, bookmarked_view(bookmark, viewer.state.extent))
 
 
 def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:

@@ -208,7 +208,7 @@ def _details(viewer: Viewer, query: Query) -> None:
     ):
         queries.explain(viewer, query)
     if answer.like is not None and ui.next_button("Like it", "Find what is like it, too"):
-        queries.show_alike(viewer, query)
+        queries.answer(viewer, query.phrase, shown_with=[query.phrase], alike=True)
     _uncover(viewer, answer)
     if imgui.tree_node_ex("Threshold, scores, place", imgui.TreeNodeFlags_.no_tree_push_on_open):
         _figures(viewer, query, answer, result)

@@ -10,6 +10,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui, imguizmo
 from langsplat_core.arrays import Array
 from langsplat_core.display.displays import SELECTED
 from langsplat_core.errors import LangSplatError
+from langsplat_core.query.selection import of_rows
 from langsplat_core.scene import Camera
 from langsplat_core.scene.transform import Similarity, moving, scaling, similarity
 from langsplat_viewer import marks
@@ -87,7 +88,7 @@ def _found(viewer: Viewer) -> None:
             f"{number}##thing",
             f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}",
         ):
-            editing.select_thing(viewer, thing)
+            editing.take(viewer, of_rows(thing.members, len(viewer.state.marks.selected)))
 
 
 def _name(viewer: Viewer) -> None:

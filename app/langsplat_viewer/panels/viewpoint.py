@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from imgui_bundle import ImVec2, hello_imgui, imgui, imgui_ctx
 
@@ -10,7 +11,7 @@ from langsplat_core.scene import Camera
 from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.actions.viewpoint import THUMBNAIL
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, with_fov
-from langsplat_viewer.camera.flight import Keyframe
+from langsplat_viewer.camera.flight import Keyframe, pose_of
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.options import MAX_SIDE
 from langsplat_viewer.panels import theme, ui
@@ -114,7 +115,7 @@ def _keyframes(viewer: Viewer) -> None:
     record, keyframes = viewer.state.record, viewer.state.session.keyframes
     ui.verbs(viewer, "Add keyframe", "Turntable", "Save path")
     if ui.next_button("Clear", enabled=bool(keyframes)):
-        viewpoint.clear_path(viewer)
+        viewpoint.set_path(viewer, ())
     _chosen(viewer, record.chosen)
     flags = imgui.WindowFlags_.horizontal_scrollbar
     if imgui.begin_child("keyframes", ImVec2(0, 0), 0, flags):
@@ -159,11 +160,12 @@ def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
     ui.beside("Time", hello_imgui.em_size(NUMBER_EM))
     seconds = _number("Time", key.seconds, 0.5)
     if seconds is not None:
-        viewpoint.move_keyframe(viewer, key, seconds)
-    if ui.next_button("Set to this view", "Put the current view in its place"):
-        viewpoint.replace_keyframe(viewer, key)
+        viewpoint.put_keyframe(viewer, key, replace(key, seconds=seconds))
+    view = viewer.state.view
+    if ui.next_button("Set to this view", "Put the current view in its place") and view is not None:
+        viewpoint.put_keyframe(viewer, key, replace(key, pose=pose_of(view)))
     if ui.next_button("Remove", "Take it off the path"):
-        viewpoint.delete_keyframe(viewer, key)
+        viewpoint.put_keyframe(viewer, key)
 
 
 # The panel "Record": films of the path.
@@ -206,7 +208,7 @@ def draw_bookmarks(viewer: Viewer) -> None:
     bookmarks, words = viewer.state.session.bookmarks, "views that you keep are listed here"
     rows = [ui.Row(bookmark.name) for bookmark in bookmarks]
     clicked, gone = ui.listed("bookmarks", rows, with_key(words, viewpoint.add_bookmark))
-    if clicked is not None:
-        viewpoint.go_to_bookmark(viewer, bookmarks[clicked])
+    if clicked is not None and viewer.state.extent is not None:
+        viewpoint.glide_to(viewer, viewpoint.bookmarked_view(bookmarks[clicked], viewer.state.extent))
     if gone is not None:
         settings.take_off(viewer, "bookmarks", bookmarks[gone])
