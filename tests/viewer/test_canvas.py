@@ -376,13 +376,6 @@ def test_merged_gaussians_stand_in_for_the_full_image(gl, asked, gated):
     renderer.release()
 
 
-def test_closing_does_not_wait_for_the_other_thread(begun, gated):
-    begun.close()
-    assert begun.is_running
-    gated.gate.set()
-    until(lambda: not begun.is_running and not gated.threads[0].is_alive())
-
-
 def test_the_other_thread_wakes_the_window(asked, begun, gated):
     woken = Event()
     begun.wake_with(woken.set)
