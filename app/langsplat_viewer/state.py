@@ -6,7 +6,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, unmarked
-from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes
+from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes, widget
 from langsplat_viewer.session import OF_PROJECT, Move, Note, Point, Preferences, Query, Session
 
 # Camera path and film: the panel "Record".
@@ -169,11 +169,15 @@ class Hover:
 class TrainingForm:
     """Fields of the panel that trains scenes."""
 
-    dataset: str = ""
-    out: str = ""
+    dataset: Annotated[str, widget("Train", "Photographs", "a folder, a COLMAP project, transforms.json")] = (
+        ""
+    )
+    gaussians: Annotated[
+        str, widget("Train", "Gaussians", "a trained scene; empty: they are trained, too")
+    ] = ""  # of the scene that gets a language field
+    out: Annotated[str, widget("Train", "Scene", "scene.ply")] = ""
+    encoder: Annotated[str, widget("Train", "Encoder", '"demo", or a folder or hub id of CLIP')] = "demo"
     preset: TrainPreset = "good"
-    encoder: str = "demo"
-    gaussians: str = ""  # a scene that gets a language field; empty: its Gaussians are trained, too
 
 
 @dataclass(frozen=True)

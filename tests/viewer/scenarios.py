@@ -125,7 +125,7 @@ def begin_at_the_start_page(s: Any) -> None:
     assert not s.ctx.item_exists("//**/##phrase")
     s.click("//start/Train from photographs ...")
     assert not s.state.show_start
-    assert s.ctx.item_exists("//**/##Photographs to train")
+    assert s.ctx.item_exists("//**/##Photographs")
     settings.prefer(s.viewer, recent=(str(blobs), str(s.folder / "gone.ply")))
     s.menu("File", "Start page")
     assert not s.ctx.item_exists("//start/2/###card")  # after the bundled scene and the one that is there

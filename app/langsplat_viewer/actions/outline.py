@@ -134,10 +134,9 @@ def in_view(viewer: Viewer) -> list[Outline]:
 # What can be done with a thing.
 
 
-@of_thing
-def select(viewer: Viewer, members: Array) -> None:
-    """Select the Gaussians of a thing in place of what is selected."""
-    take(viewer, members, "replace")
+def _hidden(viewer: Viewer, hidden: Array) -> None:
+    marks = viewer.state.marks
+    mark(viewer, replace(marks, selected=marks.selected & ~hidden, hidden=hidden))
 
 
 @of_thing
@@ -157,18 +156,10 @@ def find_alike(viewer: Viewer, members: Array) -> None:
     select_alike(viewer)
 
 
-@of_thing
-def hide(viewer: Viewer, members: Array) -> None:
-    """Hide a thing; what is selected stays so."""
-    marks = viewer.state.marks
-    hidden = marks.hidden | members
-    mark(viewer, replace(marks, selected=marks.selected & ~hidden, hidden=hidden))
-
-
-@of_thing
-def show(viewer: Viewer, members: Array) -> None:
-    """Show a thing that is hidden."""
-    mark(viewer, replace(viewer.state.marks, hidden=viewer.state.marks.hidden & ~members))
+# Selected in place of what is selected; hidden, where what else is selected stays so; shown again.
+select = of_thing(lambda viewer, members: take(viewer, members, "replace"))
+hide = of_thing(lambda viewer, members: _hidden(viewer, viewer.state.marks.hidden | members))
+show = of_thing(lambda viewer, members: _hidden(viewer, viewer.state.marks.hidden & ~members))
 
 
 def give_name(viewer: Viewer, target: Target, name: str) -> None:

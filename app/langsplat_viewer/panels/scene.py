@@ -182,29 +182,18 @@ def draw_training(viewer: Viewer) -> None:
     state, form = viewer.state, viewer.state.training_form
     if form.gaussians and not form.dataset:
         ui.small_wrapped(f"Which photographs was {Path(form.gaussians).name} made of?", ui.good())
-    dataset = _text_box("Photographs", "a folder, a COLMAP project, transforms.json", form.dataset)
-    form = replace(form, dataset=dataset)
-    if imgui.button("Browse ..."):
-        opening.ask_for_dataset(viewer)
-    hint = "a trained scene; empty: they are trained, too"
-    form = replace(form, gaussians=_text_box("Gaussians", hint, form.gaussians))
-    form = replace(form, out=_text_box("Scene", "scene.ply", form.out))
-    form = replace(form, encoder=_text_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
+    form = replace(form, **ui.draw_fields(form, "Train"))
     preset = ui.choice({name: name.capitalize() for name in PRESETS}, form.preset, PRESETS)
     settings.put(state, training_form=replace(form, preset=preset))
     if imgui.button("Train"):
         opening.start_training(viewer)
+    if ui.next_button("Photographs ...", "Choose their folder"):
+        opening.ask_for_dataset(viewer)
     ui.small_wrapped("An interrupted training continues where it stopped.", ui.muted())
     if state.warnings and state.path is not None:
         imgui.separator_text(f"What speaks against {state.path.name}")
         for warning in state.warnings:
             ui.small_wrapped(warning, ui.bad())
-
-
-def _text_box(label: str, hint: str, text: str) -> str:
-    imgui.text(label)
-    imgui.set_next_item_width(-1)
-    return str(imgui.input_text_with_hint(f"##{label} to train", hint, text)[1])
 
 
 def _running(viewer: Viewer, process: Training) -> None:

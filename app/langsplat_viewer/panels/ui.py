@@ -230,7 +230,7 @@ def _titled(kind: Any, panel: str) -> list[tuple[str, Any, Meta]]:
 def draw_fields(holder: Any, panel: str) -> dict[str, Any]:
     """Draw a widget for every field of a dataclass that has a title and names the panel.
 
-    Return their values: a check box for a bool, a slider for a number, a list for a `Literal`.
+    Return their values: a check box for a bool, a slider for a number, a box for a text, else a list.
     """
     values: dict[str, Any] = {}
     holders: Any = type(holder)
@@ -238,6 +238,10 @@ def draw_fields(holder: Any, panel: str) -> dict[str, Any]:
         value, title = getattr(holder, name), meta.title or name
         if kind is bool:
             value = imgui.checkbox(title, value)[1]
+        elif kind is str:
+            imgui.text(title)
+            imgui.set_next_item_width(-1)
+            value = imgui.input_text_with_hint(f"##{title}", meta.description or "", value)[1]
         elif kind is float:
             low, high = float(meta.ge or 0), float(meta.le or 1)
             value = slider(title, value, (low, high), logarithmic=low > 0)
@@ -394,11 +398,9 @@ def listed(
 
 
 class Picture:
-    """An image of an action's result as a texture, uploaded where it is another than in the last frame."""
+    """An image that is drawn smaller than it is, as a texture, uploaded where it is another than before."""
 
-    def __init__(self, *, shrinks: bool = True) -> None:
-        """shrinks: it is drawn smaller than it is."""
-        self._shrinks = shrinks
+    def __init__(self) -> None:
         self._image: Array | None = None  # what the texture has
         self._texture: moderngl.Texture | None = None
 
@@ -409,9 +411,8 @@ class Picture:
                 self._texture.release()
             size = (image.shape[1], image.shape[0])
             texture = moderngl.get_context().texture(size, 3, image.tobytes(), alignment=1)
-            if self._shrinks:
-                texture.build_mipmaps()
-                texture.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
+            texture.build_mipmaps()
+            texture.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
             texture.repeat_x = texture.repeat_y = False
             self._texture, self._image = texture, image
         return self._texture

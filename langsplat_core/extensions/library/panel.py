@@ -92,7 +92,7 @@ def _show_hits(viewer: Viewer, view: LibraryView, hits: Sequence[Hit]) -> None:
     viewer.state.extension_panels[TITLE] = replace(view, hits=listed, thumbnails=image)
 
 
-_thumbnails = ui.Picture(shrinks=False)  # all of the list, one below the other
+_thumbnails = ui.Picture()  # all of the list, one below the other
 
 
 def draw_library(viewer: Viewer) -> None:
