@@ -266,7 +266,7 @@ def _show(viewer: Viewer, seconds: float) -> None:
 # Keyframes of the path.
 
 THUMBNAIL, MOST_THUMBNAILS = (144, 90), 64  # pixels
-TURN_SECONDS = 8.0  # of a turn where there was no path
+TURN_SECONDS = 8.0  # of a turn, until another duration is set
 SLOW = 250.0  # milliseconds of an image of the window: where one takes longer there are no thumbnails
 
 
@@ -288,8 +288,7 @@ def add_keyframe(viewer: Viewer) -> None:
 def turn_around(viewer: Viewer) -> None:
     """Have the path go once around what the view turns around, in place of the keyframes that were there."""
     if viewer.has_scene("turn around in it") and viewer.state.view is not None:
-        seconds = path_seconds(viewer) or TURN_SECONDS
-        set_path(viewer, flight.turntable(viewer.state.view, seconds).keyframes, None)
+        set_path(viewer, flight.turntable(viewer.state.view, TURN_SECONDS).keyframes)
         viewer.state.record.at = 0.0
 
 

@@ -71,7 +71,7 @@ class StartPage:
         imgui.push_font(imgui.get_font(), TITLE * theme.FONT_SIZE)
         imgui.text_unformatted("LangSplat viewer")
         imgui.pop_font()
-        ui.small_wrapped("Look around in 3D Gaussian scenes, and search them with words.", ui.muted())
+        ui.small_wrapped("Look around in 3D Gaussian scenes, and search them with words.")
         imgui.dummy(ImVec2(0, hello_imgui.em_size(0.4)))
         with theme.styled(frame_padding=hello_imgui.em_to_vec2(0.8, 0.45)):
             ui.verbs(viewer, "Open a scene ...", "Train from photographs ...", "First steps")
@@ -104,7 +104,7 @@ def _card(path: Path, texture: moderngl.Texture | None, width: float) -> bool:
             clicked = imgui.image_button("###card", imgui.ImTextureRef(texture.glo), inside)
         ui.tip(str(path))
         imgui.text_unformatted(ui.elided(name, width))
-        imgui.text_colored(ui.muted(), ui.elided(where, width))
+        ui.coloured(ui.elided(where, width))
     return bool(clicked)
 
 
@@ -145,7 +145,7 @@ class Toasts:
                     self._shown = []
 
     def _toast(self, viewer: Viewer, message: Message) -> None:
-        imgui.text_colored(theme.colour("bad" if message.is_error else "ink"), message.text)
+        ui.coloured(message.text, "bad" if message.is_error else "ink")
         if message.file is not None and imgui.small_button("Show in folder"):
             saving.show_in_folder(viewer, message.file)
         is_last = message.undoes is not None and [message.undoes] == viewer.history.past[-1:]
@@ -159,7 +159,10 @@ class Toasts:
 
 def _begin_modal(title: str, is_wanted: bool, width: float) -> bool:
     """Begin a dialog so many widths of an m wide while it `is_wanted`; return whether it is drawn."""
-    ui.ask_for_popup(title, is_wanted)
+    if is_wanted and not imgui.is_popup_open(title):
+        imgui.open_popup(title)
+    centre = imgui.get_main_viewport().get_center()
+    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
     imgui.set_next_window_size(ImVec2(ui.fitting(width, 1).x, 0))
     flags = imgui.WindowFlags_.no_saved_settings | imgui.WindowFlags_.no_resize
     return bool(imgui.begin_popup_modal(title, None, flags)[0])
@@ -258,7 +261,7 @@ def _path_box(viewer: Viewer, choice: FileChoice) -> None:
     """Draw a box for a path, and what the disk has that begins so."""
     saves, drafts = choice.kind == "save", viewer.state.drafts
     folder = choice.start.parent if saves else choice.start
-    imgui.text_colored(ui.muted(), ui.elided(f"in {folder}", imgui.get_content_region_avail().x))
+    ui.coloured(ui.elided(f"in {folder}", imgui.get_content_region_avail().x))
     if imgui.is_window_appearing():
         imgui.set_keyboard_focus_here()
     hint = "path of a folder" if choice.kind == "folder" else "path; or drop a file onto the window"
@@ -295,7 +298,7 @@ def _export(viewer: Viewer, form: ExportForm) -> None:
         saving.ask_export(viewer, titles[chosen])
         return
     row, values = saving.EXPORTS[form.title], dict(form.values)
-    ui.small_wrapped(row.about, ui.muted())
+    ui.small_wrapped(row.about)
     suffix, only = form.suffix, form.only_selected
     if len(row.sizes) > 1:
         suffix = ui.choice({name: name for name in row.sizes}, suffix)

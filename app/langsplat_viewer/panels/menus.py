@@ -118,7 +118,7 @@ def draw_status(viewer: Viewer) -> None:
     for text, about in _figures(viewer):
         if imgui.get_cursor_pos_x() + ui.width_of(text) > right:
             break
-        imgui.text_colored(ui.muted(), text)
+        ui.coloured(text)
         ui.tip(about)
         imgui.same_line(0, hello_imgui.em_size(1.4))
     imgui.same_line(right)
@@ -184,14 +184,14 @@ def _clicked(found: list[Command], typing: bool) -> Command | None:
     chosen = None
     if imgui.begin_child("found", child_flags=imgui.ChildFlags_.nav_flattened):
         if not found:
-            imgui.text_colored(ui.muted(), "no command has these words")
+            ui.coloured("no command has these words")
         right = imgui.get_content_region_avail().x - hello_imgui.em_size(0.6)  # to the scrollbar
         for place, command in enumerate(found):  # Enter does the one that is lit
             if imgui.selectable(command.does, place == 0 and typing)[0]:
                 chosen = command
             keys = ", ".join(command.keys)
             imgui.same_line(right - ui.width_of(keys))
-            imgui.text_colored(ui.muted(), keys)
+            ui.coloured(keys)
     imgui.end_child()
     return chosen
 
@@ -246,5 +246,5 @@ def _table(rows: Sequence[tuple[str, str]], examples: str) -> None:
             imgui.table_next_column()
             imgui.text_unformatted(what)
             imgui.table_next_column()
-            ui.small_wrapped(does.replace("{examples}", examples), ui.muted())
+            ui.small_wrapped(does.replace("{examples}", examples))
         imgui.end_table()

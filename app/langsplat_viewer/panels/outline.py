@@ -22,7 +22,7 @@ def draw(viewer: Viewer) -> None:
     """Draw the panel "Outline": a box that filters, and the tree."""
     view = outline.wanted(viewer)
     if view is None or view.problem:
-        ui.small_wrapped(view.problem if view else "open a scene with a language field", ui.muted())
+        ui.small_wrapped(view.problem if view else "open a scene with a language field")
         return
     imgui.set_next_item_width(-1)
     drafts = viewer.state.drafts
@@ -64,7 +64,7 @@ def _row(viewer: Viewer, row: Outline) -> None:
         said = next((text for text in texts if ui.width_of(text) < left), "")
         if said:
             imgui.same_line(right - taken - ui.width_of(said))
-            imgui.text_colored(ui.muted(), said)
+            ui.coloured(said)
         if colour is not None:
             imgui.same_line(right - 2 * side - spacing)
             _swatch(colour, side)

@@ -28,7 +28,7 @@ from langsplat_viewer.viewer import Viewer
 
 TOOLS_EM = 3.8  # of the left edge that the tools take
 GRIP = 12.0  # width of what can be taken hold of, window units
-WHITE, SHADE = 0xFFFFFFFF, 0xA0000000
+WHITE, SHADE, SHADE_EM = 0xFFFFFFFF, 0xA0000000, 0.2  # margin of a shade around its text
 UNMOVED = ui.OVER | ui.FIXED | imgui.WindowFlags_.no_background | imgui.WindowFlags_.no_nav
 
 
@@ -67,14 +67,13 @@ def parts_of(area: ui.Area, split: Split) -> list[ui.Area]:
     return [replace(area, width=at), replace(area, left=area.left + at, width=area.width - at)]
 
 
-def shade_edge() -> float:
-    """Return the margin of the shade of `text_on_shade` around its text, window units."""
-    return float(hello_imgui.em_size(0.2))
-
-
 def text_on_shade(text: str, x: float, y: float, area: ui.Area) -> None:
     """Write text on a shade, nowhere outside the area."""
-    paint, size, edge = imgui.get_background_draw_list(), imgui.calc_text_size(text), shade_edge()
+    paint, size, edge = (
+        imgui.get_background_draw_list(),
+        imgui.calc_text_size(text),
+        hello_imgui.em_size(SHADE_EM),
+    )
     paint.push_clip_rect(*area.corners)
     paint.add_rect_filled(
         ImVec2(x - edge, y - edge), ImVec2(x + size.x + edge, y + size.y + edge), SHADE, 3.0
@@ -289,7 +288,11 @@ def _things(viewer: Viewer, pen: Pen) -> None:
 
 def _names(named: list[Named], area: ui.Area) -> None:
     """Write the phrases above the highest corners of their boxes, with a line to those that made room."""
-    line, edge, paint = imgui.get_text_line_height(), shade_edge(), imgui.get_background_draw_list()
+    line, edge, paint = (
+        imgui.get_text_line_height(),
+        hello_imgui.em_size(SHADE_EM),
+        imgui.get_background_draw_list(),
+    )
     wanted = []
     for name in named:
         (x, y), size = name.corner - (area.left, area.top), imgui.calc_text_size(name.text)
@@ -452,11 +455,11 @@ def draw_pointing(viewer: Viewer) -> None:
     with imgui_ctx.push_text_wrap_pos(hello_imgui.em_size(24)):
         sure = viewer.engine is not None and viewer.engine.basis.calibration is not None
         for name, words in zip(LEVELS, hover.found.words, strict=True):
-            imgui.text_colored(ui.muted(), name)
+            ui.coloured(name)
             imgui.same_line(hello_imgui.em_size(4.5))
             imgui.text_unformatted(said(words, sure))
         for line in pointed_figures(hover, viewer.state.origin):
-            imgui.text_colored(ui.muted(), line)
+            ui.coloured(line)
     imgui.end_tooltip()
 
 
@@ -493,7 +496,7 @@ def draw_notes(viewer: Viewer) -> None:
         settings.toggle_pinning(viewer)
     ui.verbs(viewer, "Save project")
     if not state.session.notes:
-        ui.small_wrapped("notes are listed here", ui.muted())
+        ui.small_wrapped("notes are listed here")
     for number, note in enumerate(state.session.notes):
         with imgui_ctx.push_id(str(number)):
             imgui.set_next_item_width(-side - imgui.get_style().item_spacing.x)

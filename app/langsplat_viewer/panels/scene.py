@@ -28,9 +28,9 @@ def draw_scene(viewer: Viewer) -> None:
         figures = f"{len(scene.gaussians):,} Gaussians, SH {scene.gaussians.sh_degree}"
         figures += f", {len(scene.cameras)} cameras" if scene.cameras else ""
         figures += ", no language field" if scene.language is None else ", searchable"
-        ui.small_wrapped(figures, ui.muted())
+        ui.small_wrapped(figures)
         for warning in state.warnings:
-            ui.small_wrapped(warning.partition(":")[0], ui.bad())
+            ui.small_wrapped(warning.partition(":")[0], "bad")
             ui.tip(warning)
     ui.verbs(viewer, "Open a scene ...", "Save picture", "Save view", "First steps")
     if len(state.scenes) > 1:
@@ -77,7 +77,7 @@ def draw_display(viewer: Viewer) -> None:
     picture = viewer.state.session.picture
     needs_query = DISPLAYS[picture.display].needs_query
     if needs_query and not viewer.state.shown():
-        ui.small_wrapped("search for something to see where it is", ui.muted())
+        ui.small_wrapped("search for something to see where it is")
     if any(pane.row.drawing is Drawing.HEAT for pane in viewer.state.panes()):
         ui.row("Heat")
         heats = {of: of.capitalize() for of in HEAT_TIPS}
@@ -181,7 +181,7 @@ def draw_training(viewer: Viewer) -> None:
         return
     state, form = viewer.state, viewer.state.training_form
     if form.gaussians and not form.dataset:
-        ui.small_wrapped(f"Which photographs was {Path(form.gaussians).name} made of?", ui.good())
+        ui.small_wrapped(f"Which photographs was {Path(form.gaussians).name} made of?", "good")
     form = replace(form, **ui.draw_fields(form, "Train"))
     preset = ui.choice({name: name.capitalize() for name in PRESETS}, form.preset, PRESETS)
     settings.put(state, training_form=replace(form, preset=preset))
@@ -189,20 +189,20 @@ def draw_training(viewer: Viewer) -> None:
         opening.start_training(viewer)
     if ui.next_button("Photographs ...", "Choose their folder"):
         opening.ask_for_dataset(viewer)
-    ui.small_wrapped("An interrupted training continues where it stopped.", ui.muted())
+    ui.small_wrapped("An interrupted training continues where it stopped.")
     if state.warnings and state.path is not None:
         imgui.separator_text(f"What speaks against {state.path.name}")
         for warning in state.warnings:
-            ui.small_wrapped(warning, ui.bad())
+            ui.small_wrapped(warning, "bad")
 
 
 def _running(viewer: Viewer, process: Training) -> None:
     progress = process.progress
     imgui.text_unformatted(process.out.name)
     if not progress.stages:
-        imgui.text_colored(ui.muted(), "starting")
+        ui.coloured("starting")
     for label, fraction in list(progress.stages.items()):
-        ui.small_wrapped(f"{label}: done" if fraction >= 1 else label, ui.muted())
+        ui.small_wrapped(f"{label}: done" if fraction >= 1 else label)
         if fraction < 1:
             imgui.progress_bar(fraction, ImVec2(-1, 0))
     if len(progress.losses) > 1:
@@ -210,14 +210,14 @@ def _running(viewer: Viewer, process: Training) -> None:
         size = ImVec2(-1, hello_imgui.em_size(LOSS_EM))
         imgui.plot_lines("##loss", values, scale_min=0.0, graph_size=size)
         ui.tip("How far the pictures are from the photographs, on average: lower is better")
-        imgui.text_colored(ui.muted(), f"loss {values[-1]:.4f}, at first {values[0]:.4f}")
+        ui.coloured(f"loss {values[-1]:.4f}, at first {values[0]:.4f}")
     imgui.separator()
     if imgui.button("Stop"):
         process.interrupt()
     if ui.next_button("Look at it so far"):
         opening.look_at_training(viewer)
     for line in progress.said[-3:]:
-        ui.small_wrapped(line, ui.muted())
+        ui.small_wrapped(line)
 
 
 # Messages.
@@ -227,5 +227,5 @@ def draw_messages(viewer: Viewer) -> None:
     """Draw the panel "Messages", the latest first."""
     if imgui.begin_child("messages"):
         for message in reversed(viewer.state.messages):
-            ui.small_wrapped(message.text, ui.bad() if message.is_error else ui.muted())
+            ui.small_wrapped(message.text, "bad" if message.is_error else "soft")
     imgui.end_child()

@@ -74,7 +74,7 @@ def hint(viewer: Viewer) -> str:
 
 def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None:
     if title:
-        imgui.text_colored(ui.muted(), title)
+        ui.coloured(title)
     for number, phrase in enumerate(phrases):
         if title or number:
             ui.beside(phrase)
@@ -113,7 +113,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
         imgui.same_line()
         if imgui.button("Auto"):
             queries.set_cut(viewer, query.phrase, None)
-    imgui.text_colored(ui.muted(), f"{np.count_nonzero(result.members):,} Gaussians")
+    ui.coloured(f"{np.count_nonzero(result.members):,} Gaussians")
 
 
 @lru_cache(maxsize=1)  # of the answer that is shown; what is kept holds all arrays of its scene
@@ -184,11 +184,11 @@ def _swatch(viewer: Viewer, query: Query, side: float) -> None:
 def _verdict(viewer: Viewer, query: Query, width: float) -> None:
     answer, result = viewer.state.answer(query), viewer.state.result(query)
     if answer.pending:
-        imgui.text_colored(ui.muted(), "...")
+        ui.coloured("...")
     elif answer.problem:
-        imgui.text_colored(ui.bad(), "unknown")
+        ui.coloured("unknown", "bad")
     elif result is not None:
-        imgui.text_colored(ui.good() if result.found else ui.muted(), ui.elided(result.said, width))
+        ui.coloured(ui.elided(result.said, width), "good" if result.found else "soft")
         ui.tip(f"{result.phrase}: {result.said}")
 
 
@@ -196,9 +196,9 @@ def _details(viewer: Viewer, query: Query) -> None:
     """Draw how a query was read or why it was not answered; of what may be here what can be done with it."""
     answer, result = viewer.state.answer(query), viewer.state.result(query)
     if answer.problem:
-        ui.small_wrapped(answer.problem, ui.bad())
+        ui.small_wrapped(answer.problem, "bad")
     if answer.reading:
-        ui.small_wrapped(f"read as: {answer.reading}", ui.muted())
+        ui.small_wrapped(f"read as: {answer.reading}")
     if result is None or result.verdict == "not here":
         return
     if ui.button("Focus", enabled=result.place is not None):
@@ -218,10 +218,10 @@ def _figures(viewer: Viewer, query: Query, answer: QueryAnswer, result: QueryRes
     _cut(viewer, query, result)
     _scores(result)
     if result.place is not None:
-        imgui.text_colored(ui.muted(), "at " + length_text(result.place, "  ", 2, viewer.state.origin))
+        ui.coloured("at " + length_text(result.place, "  ", 2, viewer.state.origin))
         ui.tip("Where it is relevant most; world units")
     if not answer.has_evidence:
-        ui.small_wrapped(NO_EVIDENCE, ui.muted())
+        ui.small_wrapped(NO_EVIDENCE)
 
 
 def _uncover(viewer: Viewer, answer: QueryAnswer) -> None:
@@ -242,15 +242,14 @@ def _uncover(viewer: Viewer, answer: QueryAnswer) -> None:
         if is_new and not imgui.is_any_mouse_down():
             viewpoint.move_aside(viewer, corners, (low.x - gap) / area.width, (high.x + gap) / area.width)
         else:
-            ui.small_wrapped("It lies below a panel: Focus goes there", theme.colour("weak"))
+            ui.small_wrapped("It lies below a panel: Focus goes there", "weak")
 
 
 def _scores(result: QueryResult) -> None:
     for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
         if index:
             imgui.same_line()
-        plain = imgui.get_style_color_vec4(imgui.Col_.text)
-        imgui.text_colored(plain if index == result.level else ui.muted(), f"{name} {score:.2f}")
+        ui.coloured(f"{name} {score:.2f}", "ink" if index == result.level else "soft")
         ui.tip(f"The best relevancy at the level '{name}'; the brighter one answers")
 
 
@@ -272,7 +271,7 @@ def draw(viewer: Viewer) -> None:
     """Draw the search box, the level and the list of queries."""
     scene = viewer.state.scene
     if scene is not None and scene.language is None:
-        ui.small_wrapped(no_field(scene), ui.muted())
+        ui.small_wrapped(no_field(scene))
         if ui.button("Train a language field ...", "From the photographs of this scene; it stays as it is"):
             opening.train_language(viewer)
         return
@@ -282,7 +281,7 @@ def draw(viewer: Viewer) -> None:
     _answers(viewer)
     if viewer.engine is not None:
         basis = viewer.engine.basis
-        ui.small_wrapped(basis.short, ui.bad() if basis.guesses else ui.muted())
+        ui.small_wrapped(basis.short, "bad" if basis.guesses else "soft")
         ui.tip(basis.long)
 
 

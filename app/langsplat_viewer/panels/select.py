@@ -30,7 +30,7 @@ OF_SELECTED = (
 
 def draw(viewer: Viewer) -> None:
     """Draw the panel "Selection": counts, tools, the search, verbs, files."""
-    ui.small_wrapped(counts(viewer.state.marks), ui.muted())
+    ui.small_wrapped(counts(viewer.state.marks))
     disabled = () if viewer.state.marks.selected.any() else OF_SELECTED
     _tools(viewer)
     _found(viewer)
@@ -198,7 +198,7 @@ def draw_transform(viewer: Viewer) -> None:
     state = viewer.state
     chosen = np.count_nonzero(state.marks.selected)
     what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
-    ui.small_wrapped(what, ui.muted())
+    ui.small_wrapped(what)
     kind = ui.choice(GIZMOS, state.edit_form.gizmo)
     if kind != state.edit_form.gizmo:
         editing.set_gizmo(viewer, kind)

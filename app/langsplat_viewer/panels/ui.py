@@ -11,7 +11,7 @@ from textwrap import fill
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import moderngl
-from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui, imgui_ctx
+from imgui_bundle import ImVec2, hello_imgui, imgui, imgui_ctx
 from msgspec import Meta
 
 from langsplat_core.arrays import Array
@@ -88,23 +88,13 @@ LABEL_EM = 5.2  # width of what is written before a row of choices
 MOST_OVER = 0.94  # of the window that something which lies over it may take
 
 
-def good() -> ImVec4:
-    """Return the colour of what is found."""
-    return theme.colour("good")
+def coloured(text: str, colour: str = "soft") -> None:
+    """Write a text in a colour of the theme, by default that of what matters less."""
+    imgui.text_colored(theme.colour(colour), text)
 
 
-def bad() -> ImVec4:
-    """Return the colour of errors."""
-    return theme.colour("bad")
-
-
-def muted() -> ImVec4:
-    """Return the colour of what matters less."""
-    return theme.colour("soft")
-
-
-def small_wrapped(text: str, colour: ImVec4) -> None:
-    """Text of any length, wrapped at the panel's edge."""
+def small_wrapped(text: str, colour: str = "soft") -> None:
+    """Write a text of any length, wrapped at the panel's edge."""
     with theme.styled(text=colour):
         imgui.text_wrapped(text)
 
@@ -288,7 +278,7 @@ def floating(
 def row(label: str) -> None:
     """Begin a row with a label, in a column with those above and below."""
     imgui.align_text_to_frame_padding()
-    imgui.text_colored(muted(), label)
+    coloured(label)
     imgui.same_line(
         max(hello_imgui.em_size(LABEL_EM), width_of(label) + 2 * imgui.get_style().item_spacing.x)
     )
@@ -380,7 +370,7 @@ def listed(
     clicked = gone = None
     if begin_list(name):
         if not rows:
-            small_wrapped(empty, muted())
+            small_wrapped(empty)
         side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x
         room = right - side - imgui.get_style().item_spacing.x
         for number, row in enumerate(rows):
@@ -429,14 +419,6 @@ def fitting(width_em: float, height_em: float) -> ImVec2:
     """Return a size for what lies over the scene, in widths of an m, as far as the window has room for it."""
     size, room = hello_imgui.em_to_vec2(width_em, height_em), imgui.get_main_viewport().work_size
     return ImVec2(min(size.x, MOST_OVER * room.x), min(size.y, MOST_OVER * room.y))
-
-
-def ask_for_popup(title: str, is_wanted: bool) -> None:
-    """Have the popup `title` opened in the middle of the window, if it `is_wanted` and not open."""
-    if is_wanted and not imgui.is_popup_open(title):
-        imgui.open_popup(title)
-    centre = imgui.get_main_viewport().get_center()
-    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
 
 
 def elided(text: str, room: float, width_of: Callable[[str], float] = width_of) -> str:

@@ -121,7 +121,7 @@ def _keyframes(viewer: Viewer) -> None:
     if imgui.begin_child("keyframes", ImVec2(0, 0), 0, flags):
         if not keyframes:
             empty = "Add the current view; the path goes smoothly from one keyframe to the next"
-            ui.small_wrapped(empty, ui.muted())
+            ui.small_wrapped(empty)
         images = viewpoint.thumbnails(viewer)
         drawn = viewer.state.record.thumbnails[0]
         for number, key in enumerate(keyframes):
@@ -148,7 +148,7 @@ def _card(viewer: Viewer, number: int, key: Keyframe, place: int | None, images:
                 clicked = imgui.image_button("##keyframe", texture, size, *ends)
             else:
                 clicked = imgui.button(f"{number + 1}##keyframe", size)
-        imgui.text_colored(ui.muted(), f"{number + 1}   {key.seconds:.2f} s")
+        ui.coloured(f"{number + 1}   {key.seconds:.2f} s")
     if clicked:
         viewpoint.choose_keyframe(viewer, key)
 

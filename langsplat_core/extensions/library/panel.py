@@ -107,14 +107,14 @@ def draw_library(viewer: Viewer) -> None:
     imgui.same_line()
     imgui.align_text_to_frame_padding()
     name = str(view.library.folder)
-    imgui.text_colored(ui.muted(), ui.elided(name, imgui.get_content_region_avail().x))
+    ui.coloured(ui.elided(name, imgui.get_content_region_avail().x))
     ui.tip(name)
     hint = "what to look for in all of them"
     entered, typed = ui.box("##library", hint, view.typed)
     viewer.state.extension_panels[TITLE] = view = replace(view, typed=typed)
     if entered:
         ask_library(viewer, typed)
-    ui.small_wrapped(view.said, ui.muted())
+    ui.small_wrapped(view.said)
     if ui.begin_list("library"):
         for row, hit in enumerate(view.hits):
             imgui.push_id(row)
@@ -141,7 +141,7 @@ def _hit(viewer: Viewer, view: LibraryView, row: int, hit: Hit) -> None:
     room = imgui.get_content_region_avail().x
     imgui.text(ui.elided(hit.path.relative_to(view.library.folder).as_posix(), room))
     if view.phrase:
-        imgui.text_colored(ui.good() if hit.verdict == "found" else ui.muted(), hit.said)
+        ui.coloured(hit.said, "good" if hit.verdict == "found" else "soft")
     imgui.end_group()
 
 
