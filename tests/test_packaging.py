@@ -74,7 +74,7 @@ def test_desktop_entry_and_mime_types_cover_every_format():
 
 
 def test_frozen_viewer_trains_by_the_program_beside_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    request = TrainingForm(str(tmp_path / "photographs"), str(tmp_path / "scene.ply"))
+    request = TrainingForm(str(tmp_path / "photographs"), out=str(tmp_path / "scene.ply"))
     plain = command(request)
     monkeypatch.setattr("sys.frozen", True, raising=False)
     monkeypatch.setattr("sys.executable", str(tmp_path / "langsplat-viewer"))

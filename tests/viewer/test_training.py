@@ -141,7 +141,7 @@ def test_folder_without_photographs_is_refused(viewer, tmp_path, monkeypatch, da
 
 
 def test_training_command_is_parsed_by_the_program():
-    words = command(TrainingForm("photos", "s.ply", "quick", "demo", "trained.ply"))
+    words = command(TrainingForm("photos", "trained.ply", "s.ply", "demo", "quick"))
     assert words[1:3] == ["-m", "langsplat_core"]
     parsed = parse(words[3:])
     assert (parsed.dataset, parsed.out) == (Path("photos"), Path("s.ply"))

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from os.path import isdir
 from pathlib import Path
 
 import numpy as np
@@ -256,13 +257,6 @@ def unlist_scene(viewer: Viewer, path: Path) -> None:
 # Files that were chosen, dropped onto the window, or open lately.
 
 
-def _is_plain_folder(path: Path) -> bool:
-    try:
-        return path.is_dir() and format_of(path) is None
-    except OSError:  # a name that no file system takes: opening it says so
-        return False
-
-
 def open_file(viewer: Viewer, path: Path) -> None:
     """Open a scene or a project, or take a camera path."""
     if path.name.endswith(PROJECTS):
@@ -279,7 +273,8 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     Of scenes the first is opened and all are listed; then paths are taken. Companions belong to their scene.
     A folder of photographs is offered for training. What is none of these is said.
     """
-    if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0]):
+    is_folder = len(paths) == 1 and isdir(paths[0]) and format_of(paths[0]) is None
+    if is_folder and count_photographs(paths[0]):
         choose_photographs(viewer, paths[0])
         open_panel(viewer, "Train")
         return

@@ -137,7 +137,6 @@ class Grid:
 
     segments: Array  # (M, 2, 3) world units
     spacing: float  # world units
-    marks: tuple[tuple[str, Array], ...]  # what a line is called, and where that is written (3,)
 
 
 def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None, origin: Array = NO_ORIGIN) -> Grid:
@@ -164,6 +163,4 @@ def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None, origin
 
     lines = [(point(x, ahead[0]), point(x, ahead[-1])) for x in across]
     lines += [(point(across[0], z), point(across[-1], z)) for z in ahead]
-    marks = [(f"{x * scale:.10g}", point(x, ahead[0])) for x in across[1:]]
-    marks += [(f"{z * scale:.10g}", point(across[0], z)) for z in ahead[1:]]
-    return Grid(np.array(lines), spacing, tuple(marks))
+    return Grid(np.array(lines), spacing)

@@ -128,7 +128,8 @@ class Toasts:
         self._last = said[-1] if said else None
         since = (*self._shown, *((message, now) for message in new))
         self._shown = [(message, at) for message, at in since if now - at < self.seconds][-MOST_TOASTS:]
-        if not self._shown and viewer.recorder.current is None:
+        writes = viewer.recorder.current
+        if not self._shown and writes is None:
             return
         foot = ImVec2(area.left + area.width / 2, area.top + area.height - hello_imgui.em_size(2))
         flags = ui.FLOATS & ~imgui.WindowFlags_.no_bring_to_front_on_focus | imgui.WindowFlags_.no_nav
@@ -137,8 +138,9 @@ class Toasts:
                 for number, (message, _) in enumerate(self._shown):
                     with imgui_ctx.push_id(str(number)):
                         self._toast(viewer, message)
-            imgui.dummy(ImVec2(hello_imgui.em_size(BAR_EM if viewer.recorder.current else 0), 0))
-            ui.recorder_bar(viewer)
+            if writes is not None and ui.stoppable(*writes, BAR_EM, "##recorder"):
+                viewer.recorder.cancel()
+                viewer.state.say("stopped: nothing was written")
             if imgui.is_window_hovered():
                 self._shown = [(message, now) for message, _ in self._shown]
                 if imgui.is_mouse_clicked(0) and not imgui.is_any_item_hovered():

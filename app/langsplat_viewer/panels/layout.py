@@ -206,7 +206,9 @@ def draw_over(
     area = ui.scene_area()
     start.draw(viewer, area)
     free = _float_search(viewer, area, menus.draw_toolbar(viewer, area))
-    said = _said(viewer)
+    state, said = viewer.state, viewer.state.nothing  # in place of an image
+    if state.scene is None and not state.show_start:
+        said = f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or press Ctrl+O"
     if said:
         overlays.say(said, free)
     else:
@@ -244,12 +246,3 @@ def _float_search(viewer: Viewer, area: ui.Area, left: float) -> ui.Area:
     with ui.floating(search.TITLE, at, padding_em=0.9):
         search.draw(viewer)
     return area.right_of(left + margin + width)
-
-
-def _said(viewer: Viewer) -> str:
-    """Return the words in place of an image; empty while there is one."""
-    state = viewer.state
-    if state.scene is not None:
-        return state.nothing
-    opening = f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or press Ctrl+O"
-    return "" if state.show_start else opening

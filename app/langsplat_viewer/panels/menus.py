@@ -112,7 +112,7 @@ def draw_status(viewer: Viewer) -> None:
     imgui.align_text_to_frame_padding()
     work = viewer.worker.current
     if work is not None:
-        if ui.stoppable(*work, width=hello_imgui.em_size(BAR_EM)):
+        if ui.stoppable(*work, BAR_EM):
             opening.cancel(viewer)
         imgui.same_line()
     for text, about in _figures(viewer):

@@ -184,7 +184,7 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
         pen = Pen(part, state.view.camera(*part.size), overlays.LEAST_DEPTH * state.extent.radius)
         paint.push_clip_rect(*part.corners, True)
         if grid is not None:
-            _grid(grid, pen)
+            _lines(pen.segments(grid.segments)[0], GRID, 1.0)
         if "cameras" in shown:
             _cameras(viewer, viewpoint.camera_frusta(viewer), pen)
         if "things" in shown:  # after the lines, so that its words are readable
@@ -304,16 +304,6 @@ def _names(named: list[Named], area: ui.Area) -> None:
             paint.add_line(ImVec2(*name.corner), end, imgui.get_color_u32(name.colour), 1.5)
     for name, label in zip(named, found, strict=True):
         text_on_shade(name.text, area.left + label.x + edge, area.top + label.y + edge, area)
-
-
-def _grid(grid: overlays.Grid, pen: Pen) -> None:
-    """Draw the lines on the ground, each with its distance from the world's zero."""
-    _lines(pen.segments(grid.segments)[0], GRID, 1.0)
-    paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32((*GRID[:3], 1.0))
-    for text, point in grid.marks:
-        place = pen.place(point)
-        if place is not None:
-            paint.add_text(ImVec2(*(place + (3, 0))), packed, text)
 
 
 def _axes(view: OrbitCamera, area: ui.Area) -> None:

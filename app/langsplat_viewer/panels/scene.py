@@ -190,10 +190,6 @@ def draw_training(viewer: Viewer) -> None:
     if ui.next_button("Photographs ...", "Choose their folder"):
         opening.ask_for_dataset(viewer)
     ui.small_wrapped("An interrupted training continues where it stopped.")
-    if state.warnings and state.path is not None:
-        imgui.separator_text(f"What speaks against {state.path.name}")
-        for warning in state.warnings:
-            ui.small_wrapped(warning, "bad")
 
 
 def _running(viewer: Viewer, process: Training) -> None:

@@ -233,7 +233,11 @@ def _uncover(viewer: Viewer, answer: QueryAnswer) -> None:
     settings.put(state, uncovered=answer.things)
     corners = np.concatenate([thing.oriented.corners for thing in answer.things])
     pixels, depths = state.view.camera(*area.size).project(corners)
-    for window in ui.windows_over(TITLE):
+    docks = hello_imgui.get_runner_params().docking_params.dockable_windows
+    for window in map(imgui.internal.find_window_by_name, (TITLE, *(dock.label for dock in docks))):
+        node = None if window is None else window.dock_node
+        if window is None or not window.active or (node is not None and not node.is_floating_node()):
+            continue  # beside the scene
         low = window.pos - ImVec2(area.left, area.top)
         high, gap = low + window.size, hello_imgui.em_size(1)
         under = ((pixels >= tuple(low)) & (pixels <= tuple(high))).all(1) & (depths > 0)

@@ -75,16 +75,6 @@ def scene_area() -> Area:
     return Area(node.pos.x, node.pos.y, max(node.size.x, 1.0), max(node.size.y, 1.0))
 
 
-def windows_over(*titles: str) -> list[Any]:
-    """Return the open windows of these titles and of panels that are docked nowhere, as imgui has them."""
-    docks = hello_imgui.get_runner_params().docking_params.dockable_windows
-    found = map(imgui.internal.find_window_by_name, (*titles, *(window.label for window in docks)))
-    windows = [window for window in found if window is not None and window.active]
-    return [one for one in windows if one.dock_node is None or one.dock_node.is_floating_node()]
-
-
-TIP_LETTERS = 72  # of a line
-LABEL_EM = 5.2  # width of what is written before a row of choices
 MOST_OVER = 0.94  # of the window that something which lies over it may take
 
 
@@ -102,33 +92,16 @@ def small_wrapped(text: str, colour: str = "soft") -> None:
 def tip(text: str) -> None:
     """Show a tooltip while the mouse is over the last item."""
     if text and imgui.is_item_hovered():
-        imgui.set_tooltip(fill(text, TIP_LETTERS, break_on_hyphens=False))
+        imgui.set_tooltip(fill(text, 72, break_on_hyphens=False))
 
 
-def stoppable(label: str, fraction: float, tag: str = "", width: float = 0.0) -> bool:
-    """Draw a bar with a button beside it; return whether that was clicked.
-
-    `tag`: for an id of its own; `width`: of the bar, 0 for all of the row.
-    """
-    if width:
-        label = elided(label, width)
-    elif width_of(label) > imgui.get_content_region_avail().x + beside_button("Cancel"):  # no room in the bar
-        imgui.text_wrapped(label)
-        label = ""
-    width = width or beside_button("Cancel")
+def stoppable(label: str, fraction: float, ems: float, tag: str = "") -> bool:
+    """Draw a bar `ems` wide with a button beside it, `tag` in its id; return whether that was clicked."""
+    width = hello_imgui.em_size(ems)
     with theme.styled(plot_histogram="pressed"):
-        imgui.progress_bar(fraction, ImVec2(width, 0), label)
+        imgui.progress_bar(fraction, ImVec2(width, 0), elided(label, width))
     imgui.same_line()
-    return bool(imgui.button(f"Cancel##{tag}" if tag else "Cancel"))
-
-
-def recorder_bar(viewer: Viewer) -> bool:
-    """Draw how far the film, picture or page is that is written, with its Cancel; return whether one is."""
-    work = viewer.recorder.current
-    if work is not None and stoppable(*work, tag="recorder"):
-        viewer.recorder.cancel()
-        viewer.state.say("stopped: nothing was written")
-    return work is not None
+    return bool(imgui.button(f"Cancel{tag}"))
 
 
 def width_of(text: str) -> float:
@@ -279,9 +252,7 @@ def row(label: str) -> None:
     """Begin a row with a label, in a column with those above and below."""
     imgui.align_text_to_frame_padding()
     coloured(label)
-    imgui.same_line(
-        max(hello_imgui.em_size(LABEL_EM), width_of(label) + 2 * imgui.get_style().item_spacing.x)
-    )
+    imgui.same_line(max(hello_imgui.em_size(5.2), width_of(label) + 2 * imgui.get_style().item_spacing.x))
 
 
 def choice(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = None) -> T:

@@ -78,7 +78,7 @@ def _training_cameras(viewer: Viewer, cameras: Sequence[Camera]) -> None:
 
 # The panel "Timeline": keyframes of the camera path, and playing it.
 
-NUMBER_EM, FPS_EM, LOOP_EM = 8.0, 5.0, 5.0
+NUMBER_EM, LOOP_EM = 8.0, 5.0
 MOST_EM = 8.0  # height of a thumbnail
 
 
@@ -181,20 +181,15 @@ def draw_record(viewer: Viewer) -> None:
     if changed:
         width, height = (min(max(side, 1), MAX_SIDE) for side in size)
         settings.put(record, size=(width, height))
-    ui.beside("fps", hello_imgui.em_size(FPS_EM))
-    imgui.set_next_item_width(hello_imgui.em_size(FPS_EM))
-    if imgui.begin_combo("fps", f"{record.fps:g}"):
-        for fps in (10.0, 24.0, 25.0, 30.0, 60.0):
-            if imgui.selectable(f"{fps:g}", fps == record.fps)[0]:
-                settings.put(record, fps=fps)
-        imgui.end_combo()
+    ui.row("Images a second")
+    rates = {fps: f"{fps:g}" for fps in (10.0, 24.0, 25.0, 30.0, 60.0)}
+    settings.put(record, fps=ui.choice(rates, record.fps))
     imgui.set_next_item_width(-1)
     hint = "film.mp4, .webp, .gif or a folder"
     _, typed = imgui.input_text_with_hint("##film", hint, record.film_file)
     ui.tip("Where the film goes; empty: a new name beside the scene")
     settings.put(record, film_file=typed)
-    if not ui.recorder_bar(viewer):
-        ui.verbs(viewer, "Save film", "Picture of this size")
+    ui.verbs(viewer, "Save film", "Picture of this size")
 
 
 # The panel "Bookmarks".
