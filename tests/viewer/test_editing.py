@@ -377,6 +377,8 @@ def test_failed_export_of_a_command_says_why(opened, tmp_path, monkeypatch):
     saving.run_export(opened, tmp_path / "a.ply", form_of(opened, "labels"))
     recorded(opened)
     assert errors(opened) == ["describe has no cameras; --encoder=my own"]
+    opened.state.path = tmp_path / "blobs.ply"
+    opened.state.path.touch()
     saving.run_export(opened, opened.state.path, form_of(opened, "scene"))
     recorded(opened)
     assert "would replace the original scene" in errors(opened)[-1]

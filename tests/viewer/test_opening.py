@@ -187,16 +187,6 @@ def test_chosen_path_that_does_not_exist_is_one_error(viewer, folder, typed):
     assert len(errors(viewer)) == 1
 
 
-def test_recent_scenes_are_listed_latest_first(viewer):
-    for name in ("blobs.ply", "plain.ply", "blobs.ply"):
-        open_scene(viewer, name)
-    recent = viewer.state.preferences.recent
-    assert [Path(path).name for path in recent] == ["blobs.ply", "plain.ply"]
-    assert all(Path(path).is_absolute() for path in recent)
-    act(opening.open_file, viewer, Path(recent[1]))
-    assert viewer.state.scene is SCENES["plain.ply"]
-
-
 # The shown scene's files change on disk, without a window.
 
 
