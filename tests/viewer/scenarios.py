@@ -309,6 +309,7 @@ def drag_the_gizmo(s: Any) -> None:
     s.search("mug")
     editing.select_query(viewer)
     settings.set_display(viewer, "rgb")
+    s.key("R")  # from where the view has moved aside
     s.open_panel("Transform", frames=1)
     s.key("G")
     view, chosen = s.state.view, s.state.marks.selected

@@ -328,6 +328,7 @@ def find_more(s: Session) -> np.ndarray:
     s.click("//**/Add")  # new answers
     s.fold()
     s.search("mug")
+    s.key("R")  # from where the view has moved aside
     both = s.shot("both")
     for point, slot in ((PLANT, 0), (MUG, 1)):  # each in its own colour; what is unknown takes none
         colour, own = s.at(both, point), QUERY_COLOURS[slot]  # in lightness it follows the image
