@@ -19,6 +19,7 @@ from packaging.requirements import Requirement
 from PIL import Image
 
 from langsplat_core import load_scene
+from langsplat_core.cli.scenes import PICTURES
 from langsplat_core.errors import EXTRAS
 from langsplat_core.io.scenes import formats
 from langsplat_core.raster.opengl.rasterizer import create_egl_context
@@ -264,6 +265,13 @@ def test_plain_install_draws_searches_and_selects(light: Path, tmp_path: Path) -
     done = run(light, "langsplat", "select", scene, "keyboard", "--out", tmp_path / "keyboard.ply")
     assert done.returncode == 0, done.stderr
     assert 300 < len(load_scene(tmp_path / "keyboard.ply").gaussians.means) < 3000
+
+
+@pytest.mark.long
+def test_plain_install_runs_the_demo(light: Path, tmp_path: Path) -> None:
+    done = run(light, "langsplat", "demo", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {*PICTURES}
 
 
 @pytest.mark.long

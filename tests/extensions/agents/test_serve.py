@@ -203,17 +203,7 @@ def test_a_closed_output_ends_the_server_without_a_word(folder):
 @pytest.mark.slow
 def test_two_thousand_calls_are_all_answered(folder, request):
     rng = np.random.default_rng(request.config.getoption("--seed") or 0)
-    texts = [
-        "mug",
-        "red mug",
-        "the",
-        "",
-        "book on the table",
-        "mug of mug of mug",
-        "\ud800",
-        "x" * 3000,
-        "not",
-    ]
+    texts = ["mug", "red mug", "the", "", "book on the table", "mug of mug", "\ud800", "x" * 3000, "not"]
     numbers = [0, 1, -1, 10**30, 1.5, "2", None, True, float("nan"), float("inf")]
     tools = [("find", "phrase"), ("count", "phrase"), ("look", "phrase"), ("distance", "first")]
     memory = []
