@@ -398,7 +398,7 @@ def test_taught_word_may_be_a_part(described, capsys):
         ("select a.ply void", "'void' was not found"),
         *((f"query a.ply mug {given} .", "with --why; add that") for given in ("--work", "--photographs")),
         ("teach named.ply --name vase --remove --camera 1", "--camera: is only used with --at"),
-        ("eval lerf-ovs . --maps . --paper-order", "--paper-order: is only used with a scene"),
+        ("eval lerf-ovs . --maps . --encoder demo", "--encoder: is only used with a scene"),
         ("compact a.ply --photos . --assumed-psnr 30", "--assumed-psnr: the loss is measured"),
         ("convert a.ply b.spz --phrases mug", "are for checkpoints"),
         ("select a.ply spoon", "does not know 'spoon'"),

@@ -34,8 +34,6 @@ class _Eval:
     """Names of the benchmark's scenes to score; all of them if empty."""
     json: OutFile | None = None
     """Also write all figures to this file."""
-    paper_order: Annotated[bool, Needs("is_ours", "a scene in place of --maps")] = False
-    """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""
     encoder: Annotated[EncoderOption, Needs("is_ours", "a scene in place of --maps")] = ""
 
     @property
@@ -55,7 +53,7 @@ class _Eval:
                 else "give a scene and the benchmark's folder, or the folder alone and --maps FOLDER"
             )
         scene = None if self.maps else self.paths[0]
-        subject = Evaluated(scene, self.maps, self.encoder, self.paper_order)
+        subject = Evaluated(scene, self.maps, self.encoder)
         benchmark = read(self.paths[-1])
         with TerminalProgress() as progress:
             report = run_benchmark(benchmark, profile, subject, load_text_encoder, self.only, progress)

@@ -22,7 +22,7 @@ from langsplat_core.io.hostile import opened, read_npy
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.lookup import peak_pixel, splatted_relevancy
 from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import render, view_of
 from langsplat_core.scene import LEVELS, Camera
@@ -246,7 +246,6 @@ class SceneSource:
     cameras: Mapping[str, Camera]  # by name without extension
     trained: frozenset[str] | None  # names of the training views; None: they are not the dataset's names
     profile: Profile
-    paper_order: bool = False  # blend latents and decode every pixel, instead of blending relevancies
 
     def trained_on(self, frame: str) -> bool | None:
         """Return True where the view was trained on, False where it was not, None where that is not known."""
@@ -273,10 +272,6 @@ class SceneSource:
     def _predictions(self, camera: Camera, phrases: Sequence[str]) -> list[Prediction]:
         rule, scene, engine = self.profile.rule, self.engine.scene, self.engine
         view, gate, count = view_of(scene, camera), PictureConfig().alpha_gate, len(LEVELS)
-        if isinstance(rule, MapRule) and self.paper_order:
-            vectors = engine.text_vectors(phrases)
-            levels = [decoded_relevancy(view, engine.field, k, vectors, gate) for k in range(count)]
-            return [read_maps(maps, rule) for maps in np.moveaxis(np.stack(levels), 3, 0)]
         if isinstance(rule, OwnRule) and rule.composed:
             results = [run_phrase(engine, phrase, viewpoint=camera).answer for phrase in phrases]
         else:

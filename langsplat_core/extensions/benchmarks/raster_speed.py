@@ -64,8 +64,6 @@ _NOTES = """- The size with most scenes and the most channels; every other measu
 class BenchRaster:
     """Time, error and memory of every rasterizer that loads here, in one run; takes some minutes."""
 
-    quick: bool = False
-    """Fewer and smaller scenes, in about a minute; --counts and --sizes are then not read."""
     counts: tuple[Count, ...] = (10_000, 31_000, 100_000, 200_000, 1_000_000)
     """Sizes of the random scenes, drawn at the middle one of --sizes."""
     sizes: Annotated[tuple[Size, ...], Range(1, 65_536, some=True)] = ((320, 240), (640, 480), (960, 720))
@@ -82,15 +80,11 @@ class BenchRaster:
     """Folder for raster.md, raster.json and raster.png."""
 
     def run(self) -> None:
-        plan = self
         for path in self.scenes:  # before the minutes that the others take
             if not exists(path):
                 raise InputError(f"{path}: no such file; check the spelling and the folder")
-        if self.quick:
-            counts, sizes = (3_000, 10_000, 31_000), ((160, 120), (320, 240), (640, 480))
-            plan = replace(self, counts=counts, sizes=sizes, pivot=10_000, limit=min(self.limit, 3.0))
         with TerminalProgress() as progress:
-            report = run_plan(plan, progress, self._keep)
+            report = run_plan(self, progress, self._keep)
         self._keep(report)
         print(report.text)
 

@@ -282,7 +282,6 @@ class Evaluated:
     scene: Path | None = None  # a scene file, or a folder of <benchmark's scene>.ply
     maps: Path | None = None  # <view>/<phrase>..., or <benchmark's scene>/<view>/<phrase>...
     encoder: str = ""  # in place of the one that the scene names
-    paper_order: bool = False
 
 
 def run_benchmark(
@@ -298,10 +297,6 @@ def run_benchmark(
     Raises InputError for a scene or maps that do not belong to the labels, EncoderError where the text
     encoder cannot be loaded.
     """
-    if subject.paper_order and (subject.maps is not None or not isinstance(profile.rule, MapRule)):
-        raise InputError(
-            "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"
-        )
     names = _chosen_scenes(list(benchmark.scenes), only, subject)
     queries, left_out = list[QueryScore](), list[str]()
     for name in names:
@@ -314,8 +309,7 @@ def run_benchmark(
         scores, without = score_scene(labelled, source, profile, progress)
         queries += scores
         left_out += without
-    order = ", latents blended and every pixel decoded (the paper's order)" if subject.paper_order else ""
-    said = f"{subject.scene or subject.maps}{order}"
+    said = str(subject.scene or subject.maps)
     return BenchmarkReport(benchmark.name, profile, said, tuple(queries), tuple(left_out))
 
 
@@ -356,7 +350,7 @@ def _scene_source(
     # With no name in common the scene's views are named by another rule: nothing is known of training.
     related = not own.keys().isdisjoint([*others, *(frame.name for frame in labelled.frames)])
     trained = frozenset(own) if related else None
-    return SceneSource(engine, {**others, **own}, trained, profile, subject.paper_order)
+    return SceneSource(engine, {**others, **own}, trained, profile)
 
 
 def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Path) -> MapSource:
