@@ -149,9 +149,11 @@ def test_langsplat_v2(tmp_path):
     assert got.levels[0] is got.levels[2] is None
 
 
-def occam(folder: Path, kept: tuple[Array, ...]) -> list[Path]:
+def occam(
+    folder: Path, kept: tuple[Array, ...] = (ALL,) * 3, g: Gaussians = G, vectors: Array = VECTORS
+) -> list[Path]:
     return [
-        save_model(folder / f"chkpnt30000_langfeat_{level + 1}.pth", G.take(k), tensor(VECTORS[level][k]))
+        save_model(folder / f"chkpnt30000_langfeat_{level + 1}.pth", g.take(k), tensor(vectors[level][k]))
         for level, k in enumerate(kept)
     ]
 
@@ -390,10 +392,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def occam_levels(folder: Path, vectors: Array = LEVELS) -> list[Path]:
-    return [
-        save_model(folder / f"chkpnt_langfeat_{i + 1}.pth", GAUSSIANS, tensor(vectors[i]))
-        for i in range(len(vectors))
-    ]
+    return occam(folder, (np.arange(COUNT),) * 3, GAUSSIANS, vectors)
 
 
 def decoded(field: LanguageField, level: int) -> Array:
@@ -548,12 +547,8 @@ def test_refusals(tmp_path, clip, caplog):
 @pytest.fixture
 def checkpoints(tmp_path: Path) -> list[Path]:
     """Of Occam's LGS, three levels of vectors as long as the demo encoder's."""
-    g = random_gaussians(20, sh_degree=1)
     features = unit(rng.normal(size=(5, load_text_encoder("demo").dim))).astype(np.float32)
-    return [
-        save_model(tmp_path / f"chkpnt_langfeat_{level}.pth", g, tensor(features[rng.integers(0, 5, 20)]))
-        for level in (1, 2, 3)
-    ]
+    return occam(tmp_path, vectors=features[rng.integers(0, 5, (3, N))])
 
 
 @pytest.mark.long
