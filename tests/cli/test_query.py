@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.cli import describe, query
-from langsplat_core.cli.export import SetScale
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import EncoderError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.io.sidecar import read_words
 from langsplat_core.query.engine import QueryEngine
@@ -256,21 +255,6 @@ def test_known_length_gives_the_scale(folder, capsys):
     assert "no scale" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"metres": 1.0}, "belong together"),
-        ({"metres": 1.0, "between": (0, 0, 0, 0, 0, 0)}, "must be above 0"),
-        ({"metres": 1.0, "between": (0, 0, 0, 1, 0, 0), "metres_per_unit": 1.0}, "give either"),
-        ({"metres_per_unit": 0.0}, "must be above 0"),
-    ],
-)
-def test_invalid_scale_is_refused(folder, given, message):
-    with pytest.raises(InputError, match=message):
-        SetScale(folder / "a.ply", **given).run()
-    assert load_scene("a.ply").metres_per_unit == 0.5
-
-
 # `langsplat describe`.
 
 
@@ -409,6 +393,10 @@ def test_taught_word_may_be_a_part(described, capsys):
         ("select a.ply mug --out a.ply", "would replace the original"),
         ("select a.ply mug --out there/b.ply", "there: no such folder for b.ply"),
         ("select a.ply mug --scale 0", "--scale 0"),
+        ("scale a.ply --metres 1", "belong together"),
+        ("scale a.ply --metres 1 --between 0 0 0 0 0 0", "must be above 0"),
+        ("scale a.ply --metres 1 --between 0 0 0 1 0 0 --metres-per-unit 1", "give either"),
+        ("scale a.ply --metres-per-unit 0", "must be above 0"),
         ("select plain.ply mug", "no language field"),
         ("describe named.ply --vocabulary empty.txt", "empty.txt: the vocabulary is empty"),
         ("describe named.ply --vocabulary bad.txt", "bad.txt, line 2"),

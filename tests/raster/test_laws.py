@@ -269,7 +269,6 @@ def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) 
     assert seen.alpha.shape == (camera.height, camera.width)
     assert seen.alpha.min() >= 0
     assert seen.alpha.max() <= 1
-    assert case.dropped == sum(seen.drawing.gaussians.invalid_rows().values())
     antialiased_by_gsplat = backend.gsplat and drawing.settings.antialiased  # compared in test_devices
     if case.compare and backend.name != "reference" and not antialiased_by_gsplat:
         compare(seen, measured)
