@@ -14,7 +14,7 @@ import tyro
 from rich.table import Table
 
 from langsplat_core.arrays import Array, length_text
-from langsplat_core.cli.arguments import EncoderOption, Level, Needs, TrainedScene
+from langsplat_core.cli.arguments import EncoderOption, JsonOption, Level, Needs, TrainedScene
 from langsplat_core.cli.query import Unit, basis_fields, camera_of, in_world, unit_of
 from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.config import CountOrZero, PictureConfig
@@ -49,8 +49,7 @@ class Describe:
     vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Your own list, one phrase per line, in place of the bundled everyday things and parts."""
     encoder: EncoderOption = ""
-    json: bool = False
-    """Print JSON."""
+    json: JsonOption = False
 
     def run(self) -> None:
         """Describe, and print the words."""

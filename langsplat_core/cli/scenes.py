@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Annotated, Any
 
 from langsplat_core import __version__
-from langsplat_core.cli.arguments import AnyScene, Needs, OutFolder
+from langsplat_core.cli.arguments import AnyScene, JsonOption, Needs, OutFolder
 from langsplat_core.cli.run import print_json
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, printable_line, remedy
 from langsplat_core.io.scenes import load_scene
@@ -34,8 +34,7 @@ class Inspect:
     """Print what a scene file holds, how healthy its rows are and where its bytes go."""
 
     scene: AnyScene
-    json: bool = False
-    """Print JSON."""
+    json: JsonOption = False
 
     def run(self) -> None:
         scene = load_scene(self.scene)
@@ -97,8 +96,7 @@ class Doctor:
     """Try this encoder: demo, a hub id, a folder or a file of weights."""
     calibrate: Annotated[bool, Needs("encoder")] = False
     """Keep the calibration that the room gives, for all scenes of this encoder that have none."""
-    json: bool = False
-    """Print JSON."""
+    json: JsonOption = False
 
     def run(self) -> None:
         if not self.encoder:

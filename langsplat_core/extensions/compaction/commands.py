@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
-from langsplat_core.cli.arguments import AnyScene, OutFile, WrittenScene
+from langsplat_core.cli.arguments import AnyScene, JsonOption, OutFile, WrittenScene
 from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.extensions.compaction.clean import CleanConfig, CleanReport, clean_scene
 from langsplat_core.extensions.compaction.compact import BudgetConfig, CompactReport, compact_scene
@@ -26,8 +26,7 @@ class Clean:
     out: WrittenScene
     photos: Path | None = None
     """Dataset the scene was trained on: true floaters then cost nothing, and more of them go."""
-    json: bool = False
-    """Print JSON."""
+    json: JsonOption = False
     config: Annotated[CleanConfig, tyro.conf.arg(name="")] = field(default_factory=CleanConfig)
 
     def run(self) -> None:
@@ -64,8 +63,7 @@ class Compact:
     """The scene to write (default: SCENE with .compact.ply for its ending)."""
     photos: Path | None = None
     """Dataset the scene was trained on: the loss is then measured against its photographs."""
-    json: bool = False
-    """Print JSON."""
+    json: JsonOption = False
     config: Annotated[BudgetConfig, tyro.conf.arg(name="")] = field(default_factory=BudgetConfig)
 
     def run(self) -> None:
