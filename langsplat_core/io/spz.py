@@ -5,9 +5,9 @@ in the order of `_Header.widths`. Version 4 is a header of 32 bytes, extension r
 header names, a table of (compressed, whole) sizes as uint64, and one Zstandard frame per block. In
 versions 2 and 3 extension records lie behind the last block. A record is a uint32 type, a uint32 length
 and so many bytes; the only one that is read is the axes' (SPZ_ADOBE_coordinate_system), an index into
-LDB RDB LUB RUB LDF RDF LUF RUF (left or right, down or up, back or forward), from 1, and from 9 the same
-with y and z exchanged: LBD RBD LBU RBU LFD RFD LFU RFU. Without it a file should be RUB (x to the right,
-y up, z backwards), but splat-transform, gsply and Niantic's ply_to_spz leave a PLY's RDF as it is.
+LDB RDB LUB RUB LDF RDF LUF RUF (left or right, down or up, back or forward), from 1; z up, from 9, is not
+read. Without it a file should be RUB (x to the right, y up, z backwards), but splat-transform, gsply and
+Niantic's ply_to_spz leave a PLY's RDF as it is.
 
 Source of the layout: README, extensions and loader of nianticlabs/spz; the code here is our own.
 """
@@ -31,7 +31,6 @@ from langsplat_core.io.hostile import SMALL_RATIO, Allowance, open_for_reading
 from langsplat_core.io.quantised import check_steps, mirrored, smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 from langsplat_core.scene.surface import surface_areas
-from langsplat_core.scene.transform import rotating, transform_gaussians
 
 MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 ANTIALIASED, EXTENDED = 0x1, 0x2  # flags
@@ -71,7 +70,7 @@ class _Packed:
     """The content of a .spz file, unpacked but still quantised."""
 
     header: _Header
-    axes: int  # 1 to 16, see above; 0 where the file does not say
+    axes: int  # 1 to 8, see above; 0 where the file does not say
     blocks: dict[str, Array]  # attribute -> (N, bytes of one Gaussian) uint8
 
 
@@ -161,7 +160,7 @@ def _axes(records: bytes, path: Path, tell: Tell) -> int:
         else:
             others.add(f"{kind:#010x}")
         at += 8 + length
-    if axes > 16:
+    if axes > 8:
         raise malformed(path, f"its axes are of kind {axes}", "export the scene with axes RUB")
     tell(unread("extension records", others))
     if at < len(records):
@@ -258,11 +257,7 @@ def _scene(packed: _Packed, axes: int, tell: Tell) -> Scene:
         opacity_logits=logit(blocks["alphas"][:, 0] / 255),
         sh=np.concatenate([base[:, None], (rest.astype(np.float32) - 128) / 128], axis=1),
     )
-    axes = packed.axes or axes
-    if axes > 8:  # a quarter turn about x makes y of z, and what was forward in y backward in z
-        gaussians = transform_gaussians(gaussians, rotating(np.eye(3)[0], -90))
-        axes = (axes - 9 ^ 4) + 1
-    turned = mirrored(gaussians, _signs_to_rdf(axes))
+    turned = mirrored(gaussians, _signs_to_rdf(packed.axes or axes))
     return Scene(turned, antialiased=bool(packed.header.flags & ANTIALIASED))
 
 

@@ -118,26 +118,7 @@ def check_spz(got: Gaussians, want: Gaussians, version: int) -> None:
     assert rotation_error(got, want) <= ROTATION[version]
 
 
-# The order of Niantic's enumeration, and what its letters are along the axes of a PLY.
-AXES = [
-    "LDB",
-    "RDB",
-    "LUB",
-    "RUB",
-    "LDF",
-    "RDF",
-    "LUF",
-    "RUF",
-    "LBD",
-    "RBD",
-    "LBU",
-    "RBU",
-    "LFD",
-    "RFD",
-    "LFU",
-    "RFU",
-]
-LETTERS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+AXES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 
 
 @pytest.mark.parametrize("version", [1, 2, 3, 4])
@@ -172,7 +153,7 @@ def test_spz_is_written_as_by_another_encoder(tmp_path, degree, antialiased, ver
 @pytest.mark.parametrize("version", [3, 4])
 def test_spz_along_other_axes_is_turned(put, axes, version):
     """Other axes, two or none of them mirrored; a record of another kind stands in front."""
-    turn = np.array([LETTERS[letter] for letter in axes], float)
+    turn = np.diag([1.0 if letter in "RDF" else -1.0 for letter in axes])
     records = struct.pack("<IIxxx", 0x12340001, 3) + struct.pack("<III", 0xADBE0003, 4, AXES.index(axes) + 1)
     want = random_gaussians(60, sh_degree=3)
     got = read_spz_scene(put(spz_bytes(want, version, flags=2, records=records, turn=turn))).gaussians
@@ -314,7 +295,7 @@ def meta_with(**entries: object) -> dict[str, bytes]:
 
 
 SPZ, SPZ_4 = gzip.decompress(spz_bytes(WANT, 3)), spz_bytes(WANT, 4)
-AXES_17 = spz_bytes(WANT, 4, flags=2, records=struct.pack("<III", 0xADBE0003, 4, 17))
+AXES_9 = spz_bytes(WANT, 4, flags=2, records=struct.pack("<III", 0xADBE0003, 4, 9))
 MOST = 2**32 - 1
 MALFORMED = {  # what a file with this ending holds
     "a.splat": (b"", SPLAT[:-1], SPLAT + b"\0", np.random.default_rng(0).bytes(3200)),
@@ -323,7 +304,7 @@ MALFORMED = {  # what a file with this ending holds
         *(patched(SPZ, *change) for change in ((4, "<I", 0), (4, "<I", 5), (12, "B", 5))),
         *(gzip.compress(patched(SPZ, 8, "<I", count)) for count in (31, MOST)),
         *(spz_bytes(WANT, 3)[:300], spz_bytes(WANT, 3)[:-8] + bytes(8), gzip.compress(SPZ + bytes(2**21))),
-        *(SPZ_4[:30], SPZ_4[:60], patched(SPZ_4, 8, "<I", MOST), AXES_17),
+        *(SPZ_4[:30], SPZ_4[:60], patched(SPZ_4, 8, "<I", MOST), AXES_9),
     ),
     "a.sog": tuple(
         zipped(files)

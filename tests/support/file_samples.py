@@ -23,7 +23,6 @@ import pytest
 import torch
 import zstandard
 from PIL import Image
-from scipy.spatial.transform import Rotation
 from torch import nn
 
 from langsplat_core.arrays import Array, sigmoid, unit
@@ -370,11 +369,7 @@ def spz_blocks(g: Gaussians, version: int, bits: int = 12, turn: Array = HALF_TU
         blocks[2].append(bytes(_byte(255 * (0.5 + 0.15 * float(c))) for c in g.sh[i, 0]))
         blocks[3].append(bytes(_byte(16 * (float(s) + 10)) for s in g.log_scales[i]))
         w, x, y, z = _quaternion(g, i)
-        if np.diag(turn).all():
-            x, y, z = np.linalg.det(turn) * turn @ [x, y, z]  # the axis of a rotation is a pseudovector
-        else:  # axes that change their places turn a Gaussian, whose own first axis may point either way
-            turned = turn @ Rotation.from_quat([x, y, z, w]).as_matrix() * [np.linalg.det(turn), 1, 1]
-            x, y, z, w = Rotation.from_matrix(turned).as_quat()
+        x, y, z = np.linalg.det(turn) * turn @ [x, y, z]  # the axis of a rotation is a pseudovector
         if version < 3:
             sign = 1 if w >= 0 else -1
             blocks[4].append(bytes(_byte(127.5 + 127.5 * sign * float(q)) for q in (x, y, z)))

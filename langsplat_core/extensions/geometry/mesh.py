@@ -279,16 +279,16 @@ def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
 def _silenced() -> Iterator[None]:
     """Drop what native code prints: PoissonRecon tells of roots that it does not find, and does without."""
     sys.stdout.flush()
-    kept = [os.dup(number) for number in (1, 2)]
-    with open(os.devnull, "wb") as nowhere:
-        for number in (1, 2):
-            os.dup2(nowhere.fileno(), number)
+    nowhere, kept = os.open(os.devnull, os.O_WRONLY), {number: os.dup(number) for number in (1, 2)}
     try:
+        for number in kept:
+            os.dup2(nowhere, number)
         yield
     finally:
-        for number, copy in zip((1, 2), kept, strict=True):
+        for number, copy in kept.items():
             os.dup2(copy, number)
             os.close(copy)
+        os.close(nowhere)
 
 
 # Files that other programs open.
