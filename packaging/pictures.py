@@ -70,7 +70,7 @@ def _under_the_cursor(ctx: Any, window: Window) -> None:
 
 def _selected(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    settings.open_panel(viewer, "Select")
+    settings.open_panel(viewer, "Selection")
     editing.select_query(viewer)
     settings.set_display(viewer, "rgb")
 
@@ -133,7 +133,7 @@ def _transformed(ctx: Any, window: Window) -> None:
 def _side_by_side(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     settings.open_panel(viewer, "Record")
-    settings.compare_with(viewer, "latent", 2)
+    settings.compare(viewer, "wipe", "latent", 2)
     settings.toggle_overlay(viewer, "cube")
     settings.toggle_overlay(viewer, "grid")
 
@@ -145,7 +145,7 @@ def _palette(ctx: Any, window: Window) -> None:
 
 def _light(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    settings.toggle_theme(viewer)
+    settings.prefer(viewer, theme="light")
     settings.set_picture(viewer, replace(viewer.state.session.picture, colour_map="cividis"))
 
 

@@ -170,8 +170,6 @@ def move_aside_for_what_is_covered(s: Any) -> None:
         by = panel.pos + panel.size / 2 - ImVec2(*s.on_screen(BOOK))
         viewpoint.move(s.viewer, lambda view, by=by: pan(view, by.x, by.y, s.state.size))
     below = s.state.view
-    s.rest(20)
-    assert s.state.view is below
     s.search("book", stay=True)
     assert s.on_screen(BOOK)[0] > panel.pos.x + panel.size.x
     viewpoint.move(s.viewer, lambda view: below)
