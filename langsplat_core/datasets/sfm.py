@@ -69,8 +69,7 @@ def load_photos(
         )
     unread = lost.pop(workspaces.UNREADABLE, [])
     if before and unread:  # else the process has told of them, with the reasons
-        share = f"{len(unread)} of {len(files)} photographs"
-        report_loss("%s cannot be read and are left out: %s", share, shortened(unread))
+        report_loss("%d of %d photographs cannot be read: %s", len(unread), len(files), shortened(unread))
     if lost:
         share = f"{sum(map(len, lost.values()))} of {len(files)} photographs"
         what = "could not be located and are left out"

@@ -66,10 +66,8 @@ def test_the_full_budget_is_the_inria_schedule() -> None:
 
 
 def test_a_small_budget_moves_geometry_faster_and_cools() -> None:
-    full, short, last = (
-        schedule_for(RadianceConfig(steps=n), 2.0).learning_rates(step)
-        for n, step in ((30_000, 15_000), (300, 150), (300, 300))
-    )
+    runs = (30_000, 15_000), (300, 150), (300, 300)
+    full, short, last = (schedule_for(RadianceConfig(steps=n), 2.0).learning_rates(at) for n, at in runs)
     for name in ("means", "log_scales", "quats_wxyz"):
         assert short[name] == pytest.approx(10 * full[name])  # the root of 100
     for name in ("opacity_logits", "sh_dc", "sh_rest"):
@@ -254,8 +252,7 @@ def test_larger_budgets_are_supported_where_most_views_gain(scores: list[list[fl
 def test_unpromising_training_ends_halfway(promising: bool) -> None:
     steps: list[float] = []
     told = Progress(lambda at: steps.append(at.fraction))
-    config = replace(SHORT, few_views=0, steps=4)
-    train_radiance(noise(), config, range(4), None, told, lambda _: promising)
+    train_radiance(noise(), replace(SHORT, few_views=0, steps=4), range(4), None, told, lambda _: promising)
     assert steps == [0.25, 0.5, 0.75, 1.0][: 4 if promising else 2]
 
 
