@@ -248,10 +248,9 @@ def check_keeps(out: Path, *sources: Path) -> None:
     read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
     companions = _companions(out) if out.suffix.lower() in writable_suffixes() else ()
     for path in (out, *companions):
-        if path.resolve() in read and exists(path):
-            what = "" if path == out else f"its {shown(Path(path.name))} "
-            own = "the original scene" if path == out else "that of the original scene"
-            raise InputError(f"{shown(out)}: {what}would replace {own}; choose another name")
+        if path.resolve() in read and (path == out or exists(path)):
+            what = "would replace" if path == out else f"its {shown(Path(path.name))} would replace that of"
+            raise InputError(f"{shown(out)}: {what} the original scene; choose another name")
 
 
 def report_left_out(path: Path, scene: Scene, kind: str, loses: Sequence[str], keeper: str) -> None:
