@@ -1,16 +1,12 @@
 """`langsplat find`: a phrase in every scene of a folder; `langsplat changes`: two scenes of one place."""
 
-import html
 import sys
-from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from PIL import Image
 
 from langsplat_core.arrays import length_text
 from langsplat_core.cli.arguments import EncoderOption, JsonOption, OutFile, TrainedScene
@@ -21,7 +17,6 @@ from langsplat_core.errors import EncoderError, InputError, report_loss
 from langsplat_core.extensions.geometry.commands import read_transform, registered
 from langsplat_core.extensions.library.changes import Change, changes
 from langsplat_core.extensions.library.index import Answered, Hit, Library, find, update_library
-from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine, searchable
@@ -45,8 +40,6 @@ class Find:
     """Scenes that are opened and answered exactly, of each encoder; 0: what the index says alone."""
     all: bool = False
     """List also the scenes where it was not found."""
-    sheet: OutFile | None = None
-    """Write pictures of the answers here, one HTML file."""
     index: OutFile | None = None
     """File of the index (default: .langsplat-library in the folder)."""
     encoder: EncoderOption = ""
@@ -55,8 +48,6 @@ class Find:
     def run(self) -> None:
         if len(self.words) < 2:
             raise InputError("give phrases and a folder; for example: langsplat find 'blue gift' scans")
-        if self.sheet is not None and self.sheet.suffix.lower() != ".html":
-            raise InputError(f"--sheet {self.sheet}: name an .html file")
         phrases = [phrase for text in self.words[:-1] for phrase in split_phrases(text) or [text]]
         load = once(load_text_encoder, self.encoder)
         with TerminalProgress() as progress:
@@ -67,9 +58,6 @@ class Find:
         listed = [
             (each, [hit for hit in each.hits if self.all or hit.verdict != "not here"]) for each in answers
         ]
-        if self.sheet is not None:
-            with atomic_path(self.sheet) as path:
-                path.write_text(_html(listed, library), encoding="utf-8")
         if self.json:
             print_json([_fields(each, hits, library) for each, hits in listed])
             return
@@ -128,28 +116,6 @@ def _hit_fields(hit: Hit, library: Library) -> dict[str, Any]:
         "box": None if answer is None else answer.box,
     }
     return {**in_world(fields, hit.origin)}
-
-
-def _html(listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> str:
-    """Return the answers that have pictures, under the headings of their phrases."""
-    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # names of files are no code
-    parts = [f'<!doctype html><meta http-equiv="Content-Security-Policy" content="{policy}">']
-    parts += ["<meta charset='utf-8'><title>langsplat find</title>"]
-    parts += ["<style>body{font:14px sans-serif}figure{display:inline-block;margin:4px}</style>"]
-    for answered, hits in listed:
-        parts.append(f"<h2>{html.escape(_heading(answered))}</h2>")
-        for hit in hits:
-            if hit.picture is None:
-                continue
-            packed = BytesIO()
-            Image.fromarray(hit.picture).save(packed, "PNG")
-            name = html.escape(_name(hit, library))
-            says = html.escape(_said(hit))
-            source = f"data:image/png;base64,{b64encode(packed.getvalue()).decode()}"
-            parts.append(
-                f"<figure><img alt='{name}' src='{source}'><figcaption>{name}<br>{says}</figcaption></figure>"
-            )
-    return "\n".join(parts) + "\n"
 
 
 STATED = ("kind", "name", "centre", "box", "moved", "distance", "colours", "share")  # of a change, in JSON

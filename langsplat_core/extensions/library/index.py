@@ -65,7 +65,6 @@ log = logging.getLogger("langsplat")
 INDEX = ".langsplat-library"  # its name in the folder
 SCENES = "scenes 2"  # key of the metadata; "scenes" has bars of fits that common fits are in
 THUMBNAIL = (96, 72)  # width and height, pixels, of the picture that the index keeps of a scene
-PICTURE = (320, 240)  # and of the picture of an answer
 Whole = Annotated[int, msgspec.Meta(ge=0, lt=2**62)]
 
 
@@ -467,7 +466,6 @@ class Hit(Judged):
     answer: QueryResult | None = None  # None where only the index was asked
     metres_per_unit: float | None = None
     origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) that places are relative to
-    picture: Array | None = None  # (H, W, 3) uint8, the answer as a heat map
 
     @property
     def margin(self) -> float:
@@ -530,13 +528,11 @@ def _ask_group(
         try:
             scene = load_scene(hits[name].path)
             answer = run_phrase(QueryEngine(scene, load_encoder), phrase).answer
-            picture = np.asarray(draw(scene, PICTURE, answer))
         except LangSplatError as error:
             unread.append((name, str(error)))
             del hits[name]
             continue
-        about = answer, scene.metres_per_unit, scene.origin, picture
-        exact[name] = Hit(hits[name].path, answer.judgement, *about)
+        exact[name] = Hit(hits[name].path, answer.judgement, answer, scene.metres_per_unit, scene.origin)
     found = [hit for hit in exact.values() if hit.verdict != "not here"]
     others = [hit for hit in (hits | exact).values() if hit not in found]
     ordered = (sorted(some, key=lambda hit: -hit.margin) for some in (found, others))
