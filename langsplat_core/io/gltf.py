@@ -397,10 +397,9 @@ def node_of(scene: Scene) -> dict[str, Any]:
     Its matrix turns the scene's up to y, and makes metres of units where the scale is known; extras keep
     what this program needs to take that back.
     """
-    half = similarity(np.diag([*SIGNS, 1.0]))
-    upright = half.then(turning(half.points(scene.up()), AXES["y"]))
-    there = upright.then(moving(turned_origin(upright.rotation, scene.origin)))
-    there = half.then(there.then(scaling(scene.metres_per_unit or 1.0)))  # half a turn is its own inverse
+    turn = turning(SIGNS * scene.up(), AXES["y"])
+    there = turn.then(moving(turned_origin(turn.rotation * SIGNS, scene.origin)))
+    there = there.then(scaling(scene.metres_per_unit or 1.0))
     matrix = None if there.is_identity else there.matrix.T.reshape(-1).tolist()
     kept = _Kept(matrix, tuple(scene.origin.tolist()), scene.metres_per_unit, scene.antialiased)
     said = {"matrix": matrix} if matrix else {}

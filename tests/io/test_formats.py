@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,9 @@ from tests.support.file_samples import (
     bytes_of,
     compressed_ply,
     glb,
+    glb_column,
     load_gaussians,
+    parts,
     plain_ply,
     random_field,
     sog_files,
@@ -399,12 +402,6 @@ def test_rows_that_cannot_be_drawn_are_transparent(tmp_path, suffix):
 HALF_TURN = rotating(np.array([0, 0, 1]), 180)  # between the axes of glTF and those of the PLY
 
 
-def parts(data: bytes) -> tuple[dict, bytes]:
-    """JSON and binary chunk of a .glb."""
-    size = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20 : 20 + size]), data[28 + size :]
-
-
 def changed(path: Path, scene: Gaussians, change: Callable[[dict], object] = lambda content: None) -> Path:
     """`scene` as a .glb whose JSON is changed in place."""
     write_gltf(path, Scene(scene))
@@ -440,12 +437,7 @@ def test_written_axes_are_those_of_the_standard(tmp_path):
     write_gltf(tmp_path / "a.glb", Scene(scene))
     content, binary = parts((tmp_path / "a.glb").read_bytes())
 
-    def column(name: str) -> np.ndarray:
-        about = content["accessors"][splats(content)["attributes"][name]]
-        view = content["bufferViews"][about["bufferView"]]
-        data = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
-        return np.frombuffer(data, "<f4").reshape(50, -1)
-
+    column = partial(glb_column, content, binary)
     want = transform_gaussians(scene, HALF_TURN)
     np.testing.assert_allclose(column("POSITION"), want.means, atol=1e-6)
     np.testing.assert_allclose(column(f"{EXTENSION}:SCALE"), np.exp(want.log_scales), rtol=1e-5)

@@ -250,6 +250,20 @@ def zipped(files: dict[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
+def parts(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """JSON and binary chunk of a .glb."""
+    size = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def glb_column(content: dict[str, Any], binary: bytes, name: str) -> Array:
+    """(N, k) an attribute of the first primitive, as glTF says it is stored."""
+    about = content["accessors"][content["meshes"][0]["primitives"][0]["attributes"][name]]
+    view, kind = content["bufferViews"][about["bufferView"]], {5123: "<u2", 5126: "<f4"}
+    data = binary[view["byteOffset"] :][: view["byteLength"]]
+    return np.frombuffer(data, kind[about["componentType"]]).reshape(about["count"], -1)
+
+
 def glb(content: dict, binary: bytes) -> bytes:
     text = json.dumps(content).encode()
     text += b" " * (-len(text) % 4)

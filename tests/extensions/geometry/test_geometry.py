@@ -3,7 +3,6 @@ along rays, the map of the floor, poses in front of things."""
 
 import json
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -61,7 +60,7 @@ from langsplat_core.scene.transform import (
 )
 from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, named_scene
 from tests.support.file_kinds import FileKind, drawable_share, few_and_many, in_json
-from tests.support.file_samples import random_field
+from tests.support.file_samples import glb_column, parts, random_field
 from tests.support.processes import refusal, run
 from tests.support.scenes import DEMO, FLOOR, WALL, box_room, random_camera, random_gaussians
 
@@ -594,22 +593,6 @@ def test_a_ply_holds_a_mesh(tmp_path):
     assert data["vertex"]["red"].tolist() == [255, 0, 0, 0]
 
 
-def glb_parts(path: Path) -> tuple[dict[str, Any], Callable[[str], Array]]:
-    """The node of a file with one, and its primitive's attributes, as glTF says they are stored."""
-    data = path.read_bytes()
-    size = int.from_bytes(data[12:16], "little")
-    content, binary = json.loads(data[20 : 20 + size]), data[28 + size :]
-
-    def column(name: str) -> Array:
-        about = content["accessors"][content["meshes"][0]["primitives"][0]["attributes"][name]]
-        start = content["bufferViews"][about["bufferView"]]["byteOffset"]
-        kind = {5123: "<u2", 5126: "<f4"}[about["componentType"]]
-        shape = about["count"], int(about["type"][-1])
-        return np.frombuffer(binary, kind, shape[0] * shape[1], start).reshape(shape)
-
-    return content["nodes"][0], column
-
-
 ASIDE = np.array([2.0, 1.0, -1.5])
 EYES = [ASIDE + 6 * np.array([np.cos(angle), np.sin(angle), 0.3]) for angle in range(14)]
 RING = tuple(look_at(eye, ASIDE, AXES["z"], (320, 320)) for eye in EYES)
@@ -623,10 +606,10 @@ def test_splats_and_surface_of_a_glb_overlap(tmp_path, cameras, metres):
     write_mesh(tmp_path / "mesh.glb", fuse(scene, resolution=0.05)[0], scene)
     places, colours = [], []
     for name in ("splats", "mesh"):
-        node, column = glb_parts(tmp_path / f"{name}.glb")
-        matrix = np.reshape(node.get("matrix", np.eye(4).ravel()), (4, 4)).T
-        places.append(column("POSITION") @ matrix[:3, :3].T + matrix[:3, 3])
-        colours.append(np.median(column("COLOR_0")[:, :3], axis=0) / 65_535)
+        file = parts((tmp_path / f"{name}.glb").read_bytes())
+        matrix = np.reshape(file[0]["nodes"][0].get("matrix", np.eye(4).ravel()), (4, 4)).T
+        places.append(glb_column(*file, "POSITION") @ matrix[:3, :3].T + matrix[:3, 3])
+        colours.append(np.median(glb_column(*file, "COLOR_0")[:, :3], axis=0) / 65_535)
     size = 4 * (metres or 1.0)
     np.testing.assert_allclose(np.ptp(places[0], axis=0), size, rtol=0.02)
     gaps = cKDTree(places[0]).query(places[1])[0]
