@@ -17,8 +17,7 @@ from langsplat_core import __version__
 from langsplat_core.cli.arguments import AnyScene, JsonOption, Needs, OutFolder
 from langsplat_core.cli.run import print_json
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, printable_line, remedy
-from langsplat_core.io.scenes import load_scene
-from langsplat_core.io.summary import disk_bytes, summarise
+from langsplat_core.io.scenes import disk_bytes, load_scene, summarise
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import encoders

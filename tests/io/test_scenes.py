@@ -22,10 +22,10 @@ from langsplat_core.io.scenes import (
     load_without_language,
     save_scene,
     scene_files,
+    summarise,
 )
 from langsplat_core.io.sidecar import SUFFIX as SIDECAR
 from langsplat_core.io.sidecar import write_language
-from langsplat_core.io.summary import summarise
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, Calibration, PlattScaling, Scene
 from langsplat_core.scene.language import tree_of_wholes

@@ -45,8 +45,15 @@ from langsplat_core.config import DatasetConfig, Decibels, Range, SeveralCount, 
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import shown
-from langsplat_core.io.scenes import ORIGIN_SUFFIX, check_writable, load_scene, report_left_out, save_scene
-from langsplat_core.io.summary import disk_bytes, memory_bytes
+from langsplat_core.io.scenes import (
+    ORIGIN_SUFFIX,
+    check_writable,
+    disk_bytes,
+    load_scene,
+    memory_bytes,
+    report_left_out,
+    save_scene,
+)
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import colours_seen, render, view_of
 from langsplat_core.scene import SH_COUNTS, Camera, Scene
