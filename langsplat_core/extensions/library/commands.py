@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from langsplat_core.arrays import length_text
-from langsplat_core.cli.arguments import EncoderOption, JsonOption, OutFile, TrainedScene
+from langsplat_core.cli.arguments import EncoderOption, JsonOption, TrainedScene
 from langsplat_core.cli.query import Unit, in_world, once, unit_of
 from langsplat_core.cli.run import print_json
 from langsplat_core.config import CountOrZero, Positive
@@ -40,8 +40,6 @@ class Find:
     """Scenes that are opened and answered exactly, of each encoder; 0: what the index says alone."""
     all: bool = False
     """List also the scenes where it was not found."""
-    index: OutFile | None = None
-    """File of the index (default: .langsplat-library in the folder)."""
     encoder: EncoderOption = ""
     json: JsonOption = False
 
@@ -51,7 +49,7 @@ class Find:
         phrases = [phrase for text in self.words[:-1] for phrase in split_phrases(text) or [text]]
         load = once(load_text_encoder, self.encoder)
         with TerminalProgress() as progress:
-            library = update_library(Path(self.words[-1]), self.index, load, progress)
+            library = update_library(Path(self.words[-1]), load, progress)
             answers = [each for phrase in phrases for each in find(library, phrase, load, self.top, progress)]
         if all(each.problem for each in answers):
             raise InputError("; ".join(dict.fromkeys(each.problem for each in answers)))

@@ -260,17 +260,14 @@ def _columns(engine: QueryEngine) -> Columns:
 
 
 def update_library(
-    folder: Path,
-    index: Path | None = None,
-    load_encoder: LoadEncoder | None = None,
-    progress: Progress = silent,
+    folder: Path, load_encoder: LoadEncoder | None = None, progress: Progress = silent
 ) -> Library:
     """Return the library of a folder, with new and changed scenes read again.
 
     The index is written where anything is different; an interrupted call keeps what it had read. A damaged
     index costs a warning, and is made again. Raises InputError without scenes.
     """
-    index = index_of(folder) if index is None else index
+    index = index_of(folder)
     paths = {path.relative_to(folder).as_posix(): path for path in scenes_in(folder)}
     if not paths:
         raise InputError(f"{folder}: no scene with a language field in it; `langsplat train` makes them")
