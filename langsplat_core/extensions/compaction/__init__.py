@@ -2,5 +2,5 @@
 
 from langsplat_core.registry import Extension
 
-_COMMANDS = "langsplat_core.extensions.compaction.commands"
-EXTENSION = Extension(commands={"clean": f"{_COMMANDS}:Clean", "compact": f"{_COMMANDS}:Compact"})
+_HERE = "langsplat_core.extensions.compaction"
+EXTENSION = Extension(commands={"clean": f"{_HERE}.clean:Clean", "compact": f"{_HERE}.compact:Compact"})

@@ -17,15 +17,18 @@ loss, measured on other views, allows.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+import tyro
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array, rotation_matrices
+from langsplat_core.cli.arguments import AnyScene, JsonOption, WrittenScene
+from langsplat_core.cli.run import print_json
 from langsplat_core.config import Count, check_settings
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.compaction.compact import (
@@ -39,7 +42,7 @@ from langsplat_core.extensions.compaction.compact import (
     scene_for,
 )
 from langsplat_core.io.scenes import save_scene
-from langsplat_core.progress import Progress, silent
+from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
@@ -269,3 +272,43 @@ def clean_scene(
     keep, report = clean(scene, views, config, progress)
     save_scene(out, replace(scene.take(keep), path=out), tell=False)
     return report
+
+
+# `langsplat clean`.
+
+
+@dataclass(frozen=True)
+class Clean:
+    """Remove floaters: small regions that touch nothing and veils in free space, the least visible first.
+
+    As many go as the allowed loss of PSNR lets go. It is measured on photographs that the scene was not
+    trained on where --photos has some, else derived from how far the scene's images change.
+    """
+
+    scene: AnyScene
+    out: WrittenScene
+    photos: Path | None = None
+    """Dataset the scene was trained on: true floaters then cost nothing, and more of them go."""
+    json: JsonOption = False
+    config: Annotated[CleanConfig, tyro.conf.arg(name="")] = field(default_factory=CleanConfig)
+
+    def run(self) -> None:
+        with TerminalProgress() as progress:
+            report = clean_scene(self.scene, self.out, self.config, self.photos, progress)
+        if self.json:
+            print_json({"out": str(self.out), "removed": report.removed, **asdict(report)})
+            return
+        print(*_clean_lines(report), f"written: {self.out}", sep="\n")
+
+
+def _clean_lines(report: CleanReport) -> list[str]:
+    lines = [
+        f"removed: {report.removed} of {report.gaussians} Gaussians: {report.regions} in small regions, "
+        f"{report.free_space} in free space, {report.invalid} that cannot be drawn",
+        *report.lines,
+    ]
+    if report.psnr_before is not None and report.psnr_after is not None:
+        lines.append(f"PSNR: {report.psnr_before:.2f} dB before, {report.psnr_after:.2f} after")
+    if report.kept:
+        lines.append(f"kept: {report.kept} more are suspected; --max-psnr-loss allows more")
+    return lines

@@ -34,13 +34,17 @@ photographs and true e, this agreed with the measured loss within 0.03 dB at los
 
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
+import tyro
+from rich.table import Table
 
 from langsplat_core.arrays import Array, mean_squared_error, psnr
+from langsplat_core.cli.arguments import AnyScene, JsonOption, OutFile
+from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.config import DatasetConfig, Decibels, Range, SeveralCount, Side, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
@@ -54,7 +58,7 @@ from langsplat_core.io.scenes import (
     report_left_out,
     save_scene,
 )
-from langsplat_core.progress import Progress, silent
+from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.raster.render import colours_seen, render, view_of
 from langsplat_core.scene import SH_COUNTS, Camera, Scene
 from langsplat_core.scene.transform import place_scene
@@ -381,3 +385,48 @@ def smallest(
     progress("finding the smallest scene", 1.0)
     # Any format must hold position, scale, rotation, opacity and colour of a Gaussian.
     return min(found, key=lambda choice: choice[0] * (11 + 3 * SH_COUNTS[choice[1]]), default=None)
+
+
+# `langsplat compact`.
+
+
+@dataclass(frozen=True)
+class Compact:
+    """Drop the Gaussians and colour harmonics that the views do not need, within an error budget.
+
+    Nothing is retrained; the language field, the cameras and extra properties are taken along.
+    """
+
+    scene: AnyScene
+    out: OutFile | None = None
+    """The scene to write (default: SCENE with .compact.ply for its ending)."""
+    photos: Path | None = None
+    """Dataset the scene was trained on: the loss is then measured against its photographs."""
+    json: JsonOption = False
+    config: Annotated[BudgetConfig, tyro.conf.arg(name="")] = field(default_factory=BudgetConfig)
+
+    def run(self) -> None:
+        out = self.out or self.scene.with_name(self.scene.name.split(".")[0] + ".compact.ply")
+        with TerminalProgress() as progress:
+            report = compact_scene(self.scene, out, self.config, self.photos, progress)
+        if self.json:
+            print_json({"out": str(out), **asdict(report)})
+            return
+        OutputConsole().print(_table(report))
+        print(*report.lines, f"written: {out}", sep="\n")
+
+
+def _table(report: CompactReport) -> Table:
+    table = Table("", "before", "after", "after / before")
+    before, after = report.before, report.after
+    rows: list[tuple[str, float, float, str]] = [
+        ("Gaussians", before.gaussians, after.gaussians, ",d"),
+        ("SH degree", before.sh_degree, after.sh_degree, "d"),
+        ("on disk, MB", before.disk_bytes / 1e6, after.disk_bytes / 1e6, ".2f"),
+        ("in memory, MB", before.memory_bytes / 1e6, after.memory_bytes / 1e6, ".2f"),
+    ]
+    if before.psnr is not None and after.psnr is not None:
+        rows.append(("PSNR, dB", before.psnr, after.psnr, ".2f"))
+    for name, old, new, form in rows:
+        table.add_row(name, format(old, form), format(new, form), f"{100 * new / old:.1f} %" if old else "-")
+    return table

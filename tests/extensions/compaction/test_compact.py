@@ -11,10 +11,10 @@ from langsplat_core.datasets import Capture
 from langsplat_core.errors import STRICTNESS, InputError
 from langsplat_core.extensions.compaction import compact
 from langsplat_core.extensions.compaction.clean import CleanConfig, CleanReport, clean, find_floaters
-from langsplat_core.extensions.compaction.commands import Compact
 from langsplat_core.extensions.compaction.compact import (
     ALONE,
     BudgetConfig,
+    Compact,
     MeasuringView,
     Views,
     choose_views,
