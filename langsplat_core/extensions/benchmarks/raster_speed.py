@@ -84,13 +84,10 @@ class BenchRaster:
             if not exists(path):
                 raise InputError(f"{path}: no such file; check the spelling and the folder")
         with TerminalProgress() as progress:
-            report = run_plan(self, progress, self._keep)
-        self._keep(report)
+            for report in run_plan(self, progress):  # what there is, in files
+                figures = {"machine": report.machine, "measurements": [asdict(row) for row in report.rows]}
+                write_report(self.out, "raster", report.text, figures, partial(plot, report.rows))
         print(report.text)
-
-    def _keep(self, report: "RasterReport") -> None:
-        figures = {"machine": report.machine, "measurements": [asdict(row) for row in report.rows]}
-        write_report(self.out, "raster", report.text, figures, lambda path: plot(report.rows, path))
 
 
 # Memory of this process, as Linux tells it. Not getrusage: its maximum is inherited from the parent process.
@@ -175,10 +172,8 @@ class RasterReport:
         return f"# Rasterizers: time against error\n\n{machine}\n{table(chosen)}\n{_NOTES}"
 
 
-def run_plan(
-    plan: BenchRaster, progress: Progress = silent, keep: Callable[[RasterReport], None] = lambda _: None
-) -> RasterReport:
-    """Measure, for minutes; `keep` is given what there is after each scene and size."""
+def run_plan(plan: BenchRaster, progress: Progress = silent) -> Iterator[RasterReport]:
+    """Measure, for minutes; yield what there is after each scene and size, and at last all."""
     machine = describe_machine()
     backends = _backends(machine)
     progress("bench: compiling", 0.0)
@@ -194,9 +189,9 @@ def run_plan(
         for step, (channels, backend) in enumerate(steps):
             progress(f"{name}, {backend.name}", (n + step / len(steps)) / total)
             rows += measure(backend, case, channels, exact, plan.limit, rates)
-        keep(RasterReport(machine | {"unfinished": f"{n + 1} of {total} scenes and sizes"}, list(rows)))
+        yield RasterReport(machine | {"unfinished": f"{n + 1} of {total} scenes and sizes"}, list(rows))
     progress("bench: done", 1.0)
-    return RasterReport(machine, rows)
+    yield RasterReport(machine, rows)
 
 
 def sweep(

@@ -563,8 +563,8 @@ class TestReferenceWindows:
 @pytest.mark.long
 def test_a_tiny_run_writes_three_sane_files(tmp_path):
     sizes = ["--counts", "60", "120", "200", "--sizes", "40", "30", "--pivot", "120", "--channels", "1", "3"]
-    command, unfinished = parse(["bench", "raster", *sizes, "--out", str(tmp_path)]), []
-    run_plan(command, keep=unfinished.append)
+    command = parse(["bench", "raster", *sizes, "--out", str(tmp_path)])
+    *unfinished, _ = run_plan(command)
     command.run()
     assert [part.machine["unfinished"][0] for part in unfinished] == ["1", "2", "3"]
     assert {row.gaussians for row in unfinished[0].rows} == {60}
