@@ -484,3 +484,12 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(text, said, tmp_path, 
     line = refusal(capsys, *WORDS, "--config", file)
     assert line.startswith(f"langsplat: {file}: ")
     assert said in line
+
+
+@pytest.mark.parametrize("said", [None, "ACTIVE"])
+def test_threads_of_torch_do_not_spin_unless_asked_to(said):
+    code = "import os, langsplat_core; print(os.environ['OMP_WAIT_POLICY'])"
+    rest = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    own = {} if said is None else {"OMP_WAIT_POLICY": said}
+    text = subprocess.check_output([sys.executable, "-c", code], env=rest | own, text=True)
+    assert text.strip() == (said or "PASSIVE")
