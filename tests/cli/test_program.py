@@ -177,6 +177,7 @@ LINES = {  # words that work: positions, and options; what would take long ends 
     "mesh": "s.ply m.ply -- --views 3",
     "register": "s.ply t.ply --",
     "merge": "s.ply t.ply -- --out o.ply --as-is",
+    "usd": "s.ply o.usda --",
     "clean": "s.ply o.ply -- --views 2",
     "compact": "s.ply -- --out o.ply --views 2",
     "eval lerf-ovs": "s.ply . --",
