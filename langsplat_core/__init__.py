@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from langsplat_core.errors import optional_imports
 
 # Threads of torch wait by spinning, which takes the cores from whatever else runs: beside six busy processes
-# images took six times as long to encode, and four times the processor's time. Read when torch is imported.
+# masks took five times as long to describe. Read when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:

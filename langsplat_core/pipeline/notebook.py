@@ -47,8 +47,8 @@ def show(
 ) -> NotebookPage:
     """Return the page of a scene, or of the scene of an engine, in which `phrase` is asked.
 
-    at_most: Gaussians that are drawn, those that cover most, so that a notebook stays small (20 bytes each
-    without view dependence); answers are those of the whole scene.
+    at_most: Gaussians that are drawn, those that cover most, so that a notebook stays small (the bundled
+    scene's 81 288 are 6.5 MB); answers are those of the whole scene.
     """
     scene = source if isinstance(source, Scene) else source.scene
     engine = source if isinstance(source, QueryEngine) else None

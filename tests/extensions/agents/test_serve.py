@@ -154,7 +154,7 @@ def call(number: int, tool: str, **arguments: object) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("name", ["plain.ply", "nowhere.ply", "empty", "test.txt"])
-def test_what_is_no_scene_ends_the_server_at_its_start(folder, capsys, name):
+def test_server_refuses_what_is_no_scene(folder, capsys, name):
     pytest.importorskip("mcp")
     (folder / "empty").mkdir(exist_ok=True)
     (folder / "test.txt").touch()
