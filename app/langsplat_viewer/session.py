@@ -57,7 +57,7 @@ class Bits:
 
     @property
     def mask(self) -> Array:
-        """(count,) bool."""
+        """The Booleans unpacked: (count,) bool."""
         return np.unpackbits(np.frombuffer(self.packed, np.uint8), count=self.count).astype(bool)
 
 
@@ -186,7 +186,7 @@ class Bookmark:
 
 @dataclass(frozen=True)
 class Session:
-    """All that a user sees and did in a scene."""
+    """State of a scene that its user set: what is undone, kept with the scene and saved in projects."""
 
     # how it is shown
     picture: PictureConfig = field(default_factory=PictureConfig)

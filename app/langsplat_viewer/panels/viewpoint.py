@@ -36,7 +36,7 @@ def draw_camera(viewer: Viewer) -> None:
 
 
 def _projection(viewer: Viewer, view: OrbitCamera) -> None:
-    """With perspective or without; the field of view is one of perspective."""
+    """Draw the choice of projection, and the field of view that perspective has."""
     text = with_key("Orthographic", viewpoint.toggle_orthographic)
     changed, orthographic = imgui.checkbox(f"{text}###orthographic", view.orthographic)
     if changed:
