@@ -145,8 +145,8 @@ class RasterSettings:
     far: Positive | None = None  # nor those with camera z > far; None: none is too far
     fov_clamp: Positive = 1.3  # Jacobian taken at most at this multiple of the half field of view
     dilation: NotNegative = 0.3  # added to both diagonal entries of the 2D covariance, px^2
-    # px, of the photographs that the Gaussians were fitted to: a longer one dilates more, see
-    # `raster.protocol.dilation`; None: no more
+    # px, of the photographs that the Gaussians were fitted to: a longer one dilates more, a shorter one less,
+    # see `raster.protocol.dilation`; None: all alike
     focal: Positive | None = None
     alpha_max: Share = 0.99  # cap of one Gaussian's alpha
     alpha_min: Share = 1 / 255  # smaller alphas are skipped

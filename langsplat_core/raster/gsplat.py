@@ -3,7 +3,8 @@
 gsplat (1.5 or newer) is an optional dependency and compiles its kernels at first use. What differs from the
 reference, all of it gsplat's own: float32 throughout, the covariance formed in 3D first, so that long thin
 footprints lose digits, alpha capped at 0.999 in 1.5, at 0.99 from 1.6 on, antialiasing without INRIA's floor
-of 0.005, and `gather` sums with atomics, so its last digits vary between runs.
+of 0.005, images smaller than the photographs without their pixels' means (`protocol.dilation`), and `gather`
+sums with atomics, so its last digits vary between runs.
 """
 
 import subprocess
@@ -79,6 +80,7 @@ def draw(
 
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
     view = camera.world_to_camera if view_matrix is None else view_matrix
+    added, fitted = dilation(camera, settings)
     images, alphas, extra = rasterization(
         means=gaussians["means"],
         quats=gaussians["quats_wxyz"],
@@ -91,7 +93,7 @@ def draw(
         height=camera.height,
         near_plane=settings.near,
         far_plane=min(farthest(settings), FARTHEST),
-        eps2d=dilation(camera, settings),
+        eps2d=added if settings.antialiased else fitted,
         sh_degree=sh_degree,
         packed=False,
         rasterize_mode="antialiased" if settings.antialiased else "classic",

@@ -7,7 +7,7 @@ it can lift, `gather` (``W^T y``, the exact adjoint).
 
 import math
 from abc import ABC, abstractmethod
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -141,17 +141,30 @@ def tangent_limits(camera: Camera, settings: RasterSettings) -> tuple[float, flo
     )
 
 
-def dilation(camera: Camera, settings: RasterSettings) -> float:
+class Dilation(NamedTuple):
+    """How a footprint becomes one of pixels, px^2."""
+
+    added: float  # to both variances
+    # The part of it that opacities were fitted with: they fade by sqrt(det with this / det with all of it)
+    fitted: float
+
+
+def dilation(camera: Camera, settings: RasterSettings) -> Dilation:
     """Return what is added to both variances of a footprint, px^2.
 
-    Gaussians are fitted with the dilation around them. In an image of more pixels than the photographs had,
-    the same number of pixels is less of the world: what was closed there opens, and edges fray into needles
-    (Yu et al. 2024, Mip-Splatting, figure 1). So it grows as the image does, up to `MOST_GROWTH`. It never
-    shrinks: it also guards against aliasing.
+    Gaussians are fitted with the dilation around them, so it is a part of what they look like. In an image
+    of more pixels than the photographs had it covers more of them, up to `MOST_GROWTH`: otherwise what was
+    closed opens, and edges fray into needles (Yu et al. 2024, Mip-Splatting, figure 1). In one of fewer it
+    covers less, and pixels are means of those of the photographs: a box, whose variance less theirs is added
+    without making anything heavier. Antialiased Gaussians were fitted without dilation, by a filter of
+    their own.
     """
-    if settings.focal is None or camera.orthographic:
-        return settings.dilation
-    growth = camera.fx * camera.fy / settings.focal / settings.focal
-    if growth < 1 + 1e-6:  # at the photographs' own size it is rounding that differs
-        return settings.dilation
-    return settings.dilation * min(growth, MOST_GROWTH)
+    growth = 1.0
+    if settings.focal is not None and not camera.orthographic:
+        growth = min(camera.fx * camera.fy / settings.focal / settings.focal, MOST_GROWTH)
+    if abs(growth - 1) < 1e-6:  # at the photographs' own size it is rounding that differs
+        growth = 1.0
+    if settings.antialiased:
+        return Dilation(settings.dilation * max(growth, 1.0), 0.0)
+    fitted = settings.dilation * growth
+    return Dilation(fitted + max(1 - growth, 0.0) / 12, fitted)

@@ -84,13 +84,14 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
     yy = (a[:, 1] ** 2).sum(1)
     xy = (a[:, 0] * a[:, 1]).sum(1)
     det_sharp = (np.cross(a[:, 0], a[:, 1]) ** 2).sum(1)
-    added = dilation(camera, settings)
+    added, fitted = dilation(camera, settings)
+    det_fitted = det_sharp + fitted * (xx + yy) + fitted**2
     det = det_sharp + added * (xx + yy) + added**2
     xx, yy = xx + added, yy + added
 
     opacities = sigmoid(np.where(drawn, gaussians.opacity_logits, -np.inf).astype(np.float64))
-    if settings.antialiased:
-        opacities = opacities * np.sqrt(np.maximum(det_sharp / det, 0.005**2))
+    if fitted < added:
+        opacities = opacities * np.sqrt(np.maximum(det_fitted / det, 0.005**2))
     opacities = np.where(drawn & (opacities >= settings.alpha_min), opacities, 0)
     reach = np.sqrt(2 * np.log(np.maximum(opacities / settings.alpha_min, 1)))  # in standard deviations
     return Footprints(

@@ -145,7 +145,7 @@ def _may_reach(
         if not camera.orthographic:
             x, y = x / z, y / z
             largest *= np.sqrt(1 + x * x + y * y) / z
-        variance = largest**2 + np.float32(protocol.dilation(camera, settings))
+        variance = largest**2 + np.float32(protocol.dilation(camera, settings).added)
         reach = np.sqrt(np.float32(2 * np.log(1 / settings.alpha_min)) * variance) + 1
         across = np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5))
         down = np.abs(camera.fy * y + np.float32(camera.cy - pixel[1] - 0.5))

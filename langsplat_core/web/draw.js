@@ -298,7 +298,9 @@ class Painter {
     const { width, height } = camera;
     const { raster } = meta;
     // As raster.protocol.dilation.
-    const finer = raster.focal ? (camera.fx * camera.fy) / raster.focal ** 2 : 1;
+    let growth = raster.focal ? Math.min((camera.fx * camera.fy) / raster.focal ** 2, 256) : 1;
+    if (Math.abs(growth - 1) < 1e-6) growth = 1;
+    const fitted = raster.dilation * (raster.antialiased ? Math.max(growth, 1) : growth);
     const r = camera.rotation;
     const high = camera.position.map(Math.fround);
     const beyond = 0.5 * (raster.fov_clamp - 1); // of the image, on each side
@@ -311,8 +313,8 @@ class Painter {
       sh: 1,
       orthographic: 0,
       sh_count: meta.sh_count,
-      antialiased: +raster.antialiased,
-      dilation: raster.dilation * Math.min(Math.max(finer, 1), 256),
+      dilation: raster.antialiased ? fitted : fitted + Math.max(1 - growth, 0) / 12,
+      fitted: raster.antialiased ? 0 : fitted,
       alpha_min: raster.alpha_min,
       colour_max: 65504,
       focal: [camera.fx, camera.fy],

@@ -271,13 +271,14 @@ def assert_gradients(gaussians, camera, settings=INRIA, channels=3, rows=None):
 @pytest.mark.parametrize("orthographic", [False, True])
 @pytest.mark.parametrize("seed", range(10))
 def test_gradients_are_slopes_of_the_reference(seed, orthographic):
-    """Every other scene antialiased, every third in the gsplat profile, every fifth mostly opaque; of 1, 3
-    and 5 channels."""
+    """Every other scene antialiased, every third in the gsplat profile, every fifth mostly opaque, every
+    fourth smaller than its photographs; of 1, 3 and 5 channels."""
     gaussians = random_gaussians(40, seed, scale_range=(0.003, 0.1) if seed % 2 else (0.02, 0.25))
     if seed % 5 == 0:
         gaussians = replace(gaussians, opacity_logits=gaussians.opacity_logits + np.float32(3))
     settings = replace(GSPLAT if seed % 3 == 0 else INRIA, antialiased=bool(seed % 2))
     camera = random_camera(seed, 32, 22)
+    settings = replace(settings, focal=None if seed % 4 else 3 * camera.fx)
     camera = without_perspective(camera) if orthographic else camera
     got = assert_gradients(gaussians, camera, settings, 1 + 2 * (seed % 4 % 3))
     assert (got.opacity_logits != 0).sum() > 15

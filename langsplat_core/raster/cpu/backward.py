@@ -219,16 +219,17 @@ def _footprint_gradient(g: Array, moments: Array) -> tuple[float, float, cp.Poin
 
 @helper
 def _with_compensation(by_covariance: cp.Point, a: Array, camera: cp.KernelCamera, q: float) -> cp.Point:
-    """Add the gradient of Mip-Splatting's factor sqrt(det sharp / det dilated) to that by the covariance."""
-    xx, xy, yy, det, sharp = cp.covariance(a, camera.dilation)
-    if not camera.antialiased or sharp / det <= cp.COMPENSATION_MIN:
+    """Add the gradient of the factor sqrt(det fitted / det dilated) to that by the covariance."""
+    xx, xy, yy, det, fitted = cp.covariance(a, camera.dilation, camera.fitted)
+    if camera.fitted >= camera.dilation or fitted / det <= cp.COMPENSATION_MIN:
         return by_covariance
     gxx, gxy, gyy = by_covariance
     half = 0.5 * q
+    more = camera.dilation - camera.fitted
     return (
-        gxx + half * ((yy - camera.dilation) / sharp - yy / det),
-        gxy + half * (xy / det - xy / sharp),
-        gyy + half * ((xx - camera.dilation) / sharp - xx / det),
+        gxx + half * ((yy - more) / fitted - yy / det),
+        gxy + half * (xy / det - xy / fitted),
+        gyy + half * ((xx - more) / fitted - xx / det),
     )
 
 

@@ -32,7 +32,7 @@ UNUSABLE = -1.0  # size of a row that is not valid
 MEAN_X, MEAN_Y, FACTOR_A, FACTOR_K, FACTOR_C, LOG2_OPACITY, HALF_WIDTH, HALF_HEIGHT = range(8)  # columns
 HALF_LOG2_E = 0.5 / np.log(2.0)
 LN2 = np.log(2.0)
-COMPENSATION_MIN = 0.005**2  # floor of det before / det after dilation, as gsplat has it
+COMPENSATION_MIN = 0.005**2  # floor of det with the fitted dilation / det with all of it, as INRIA has it
 _MAX_LOG_SCALE, _MIN_QUAT_SQUARED = 80.0, 1e-24  # see Gaussians.valid
 _TINY = 1e-30
 _LARGEST_BITS = int(np.float32(LARGEST_COEFFICIENT).view(np.uint32))  # positive floats order as their bits
@@ -78,8 +78,8 @@ class KernelCamera(NamedTuple):
     near: float
     far: float
     dilation: float
+    fitted: float  # of the dilation, see `protocol.Dilation`
     alpha_min: float
-    antialiased: bool
     orthographic: bool
     reach_x: float  # bounds of a footprint's half width and height: px for each unit of size over depth
     reach_y: float
@@ -89,7 +89,7 @@ class KernelCamera(NamedTuple):
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
     """Return camera and settings as kernels take them."""
     limits = dict(zip(("left", "top", "right", "bottom"), tangent_limits(camera, settings), strict=True))
-    added = dilation(camera, settings)
+    added, fitted = dilation(camera, settings)
     # Half width = reach sqrt((A A^T)_xx + dilation), A = J R S: so at most
     # reach (|J_x| |R| size + sqrt(dilation)).
     reach = np.sqrt(-2 * np.log(min(settings.alpha_min, 1.0)))
@@ -108,8 +108,8 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
         near=float(settings.near),
         far=float(farthest(settings)),
         dilation=float(added),
+        fitted=float(fitted),
         alpha_min=float(settings.alpha_min),
-        antialiased=bool(settings.antialiased),
         orthographic=camera.orthographic,
         reach_x=float(most * camera.fx * np.hypot(1, wide)),
         reach_y=float(most * camera.fy * np.hypot(1, high)),
@@ -175,8 +175,8 @@ def fill_axes(
 
 
 @helper
-def covariance(a: Array, dilation: float) -> tuple[float, float, float, float, float]:
-    """2D covariance xx, xy, yy with dilation, its determinant, and the determinant before dilation.
+def covariance(a: Array, dilation: float, fitted: float) -> tuple[float, float, float, float, float]:
+    """2D covariance xx, xy, yy with dilation, its determinant, and that with the fitted dilation.
 
     det(A A^T) = |row0 x row1|^2 (Cauchy-Binet): no cancellation, however thin the needle.
     """
@@ -187,7 +187,8 @@ def covariance(a: Array, dilation: float) -> tuple[float, float, float, float, f
     c1 = a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]
     c2 = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
     sharp = c0 * c0 + c1 * c1 + c2 * c2
-    return xx + dilation, xy, yy + dilation, sharp + dilation * (xx + yy) + dilation * dilation, sharp
+    det = sharp + dilation * (xx + yy) + dilation * dilation
+    return xx + dilation, xy, yy + dilation, det, sharp + fitted * (xx + yy) + fitted * fitted
 
 
 @helper
@@ -277,9 +278,9 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
         if not opacity >= camera.alpha_min:
             continue
         fill_axes((x, y, z), rows.log_scales[i], rows.quats_wxyz[i], camera, work)
-        xx, xy, yy, det, sharp = covariance(work[2], camera.dilation)
-        if camera.antialiased:
-            opacity *= np.sqrt(max(sharp / det, COMPENSATION_MIN))
+        xx, xy, yy, det, det_fitted = covariance(work[2], camera.dilation, camera.fitted)
+        if camera.fitted < camera.dilation:
+            opacity *= np.sqrt(max(det_fitted / det, COMPENSATION_MIN))
             if opacity < camera.alpha_min:
                 continue
         log2_opacity = np.log2(opacity)

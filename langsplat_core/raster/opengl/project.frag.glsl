@@ -14,8 +14,8 @@ uniform vec2 focal;        // px; orthographic: px per world unit
 uniform vec2 principal;    // px
 uniform vec4 tangents;     // clamp of x/z and y/z: left, top, right, bottom
 uniform float dilation;    // px^2
+uniform float fitted;      // part of it that opacities were fitted with
 uniform float alpha_min;
-uniform bool antialiased;
 uniform float colour_max;  // largest number of the image
 uniform int sh_count;      // 1, 4, 9 or 16
 
@@ -106,8 +106,10 @@ void main() {
     along = size > 0.0 ? along / size : vec2(1.0, 0.0);
 
     float opacity = mean_opacity.w;
-    if (antialiased)
-        opacity *= sqrt(max(det_sharp / det, 0.005 * 0.005));
+    if (fitted < dilation) {
+        float det_fitted = det_sharp + fitted * (xx + yy) + fitted * fitted;
+        opacity *= sqrt(max(det_fitted / det, 0.005 * 0.005));
+    }
     placement = vec4(focal * tangent + principal, p.z, opacity >= alpha_min ? opacity : 0.0);
     shape = vec4(along, inversesqrt(variance_along), inversesqrt(variance_across));
     vec3 sight = orthographic ? vec3(0.0, 0.0, 1.0) * world_to_camera : from_camera;

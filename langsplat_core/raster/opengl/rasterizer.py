@@ -309,6 +309,7 @@ class GlRasterizer:
     def _fill(self, scene: SceneTextures, view: "GlView") -> None:
         camera, settings = view.camera, view.settings
         high = camera.position.astype(np.float32)
+        added, fitted = dilation(camera, settings)
         set_uniforms(
             self._project,
             {
@@ -321,9 +322,9 @@ class GlRasterizer:
                 "focal": (camera.fx, camera.fy),
                 "principal": (camera.cx, camera.cy),
                 "tangents": tangent_limits(camera, settings),
-                "dilation": dilation(camera, settings),
+                "dilation": added,
+                "fitted": fitted,
                 "alpha_min": settings.alpha_min,
-                "antialiased": settings.antialiased,
                 "colour_max": HALF_MAX if self.precision == "half" else np.finfo(np.float32).max,
                 "sh_count": SH_COUNTS[view.gaussians.sh_degree],
             },
