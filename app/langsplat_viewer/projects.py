@@ -1,4 +1,4 @@
-"""Files of a user, as JSON: camera paths, bookmarks, projects and preferences.
+"""Files of a user, as JSON: camera paths, projects and preferences.
 
 What they hold are parts of a `Session`, which msgspec turns into JSON and back; what its types do not say is
 checked here. Nothing in a file becomes a path, an array or a call that was not checked before.
@@ -33,7 +33,6 @@ from langsplat_core.scene.transform import similarity
 from langsplat_viewer.camera.flight import FOV_LIMITS, LONGEST, SAME_TIME, SPAN_LIMITS, Flight, Keyframe, Pose
 from langsplat_viewer.session import (
     LONGEST_NOTE,
-    MOST_BOOKMARKS,
     MOST_RECENT,
     SCALES,
     SLOTS,
@@ -113,7 +112,7 @@ def _write(path: Path, content: object) -> None:
         temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
-# Poses, in paths and bookmarks flat beside what else an entry has:
+# Poses, in paths flat beside what else an entry has:
 #
 # {"position": [x, y, z],      in the world; in projects relative to their origin
 #  "rotation": [[...], ...],   camera to world, three rows; OpenCV axes, as in cameras.json
@@ -187,30 +186,6 @@ def write_flight(path: Path | str, flight: Flight) -> None:
     """Write `flight`, whole or not at all."""
     keyframes = [_flat(plain(key)) for key in flight.keyframes]
     _write(Path(path), {PATH_MARK: PATH_VERSION, "keyframes": keyframes})
-
-
-# Bookmarks that earlier versions kept of each scene in the folder of the preferences, and not in its project:
-# {"version": 1, "scenes": {path: [{"name", "distance" to what the view turns around, and a pose}]}}
-
-BOOKMARKS = "bookmarks.json"
-
-
-def read_bookmarks(folder: Path | None, scene: Path) -> tuple[Bookmark, ...]:
-    """Read what an earlier version kept of a scene. InputError where the file makes no sense."""
-    path = None if folder is None else folder / BOOKMARKS
-    if path is None or not path.exists():
-        return ()
-
-    def decode(top: Any) -> tuple[Bookmark, ...]:
-        if top["version"] != 1:
-            raise ValueError("of another version")
-        entries = map(_nested, top["scenes"].get(str(scene.absolute()), [])[:MOST_BOOKMARKS])
-        bookmarks: tuple[Bookmark, ...] = _converted(list(entries), tuple[Bookmark, ...])
-        for bookmark in bookmarks:
-            _check_pose(bookmark.pose)
-        return tuple(replace(bookmark, name=_line(bookmark.name)) for bookmark in bookmarks)
-
-    return _read(path, "bookmarks of this version, mend or delete the file", decode)
 
 
 # Projects: a scene and its session.

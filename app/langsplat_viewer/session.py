@@ -273,9 +273,9 @@ class Session:
         ruler = now.ruler if now.moves == self.moves else replace(now.ruler, points=())
         return replace(self, ruler=ruler)
 
-    def of_next_scene(self, bookmarks: tuple[Bookmark, ...]) -> "Session":
+    def of_next_scene(self) -> "Session":
         """Return the session that another scene begins with: settings of the window stay."""
-        return Session(bookmarks=bookmarks, **{name: getattr(self, name) for name in OF_WINDOW})
+        return Session(**{name: getattr(self, name) for name in OF_WINDOW})
 
     def found_again(self, now: "Session") -> "Session":
         """Return the session of a scene that is shown again.

@@ -14,14 +14,13 @@ from langsplat_viewer.actions import editing, settings, viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.camera.controls import OrbitCamera, from_side, spanning
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of
-from langsplat_viewer.projects import BOOKMARKS
 from langsplat_viewer.rendering.renderer import renderer_for
 from langsplat_viewer.rendering.request import Clip, depth_range, image_formation, plain_request, why_nothing
 from langsplat_viewer.state import GLIDE_SECONDS, QueryAnswer
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.scenes import random_camera, random_gaussians
-from tests.support.windowless import ask, errors, go, open_scene, result
+from tests.support.windowless import ask, go, open_scene, result
 
 SIZE = (320, 200)
 
@@ -376,14 +375,6 @@ def test_a_bookmark_leads_back_and_is_undone(opened):
     assert_same(opened.state.view, marked)
     open_scene(opened, "plain.ply")
     assert names(opened) == []
-
-
-def test_bookmarks_of_an_earlier_version_that_make_no_sense_are_said(opened, tmp_path):
-    (tmp_path / BOOKMARKS).write_text('{"version": 2, "scenes": {}}')
-    opened.folder = tmp_path
-    open_scene(opened, "blobs.ply")
-    assert names(opened) == []
-    assert BOOKMARKS in errors(opened)[0]
 
 
 def view_with_up(up) -> controls.OrbitCamera:

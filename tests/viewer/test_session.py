@@ -27,7 +27,6 @@ from langsplat_viewer.projects import (
     NO_GROUPS,
     NOT_COMPARED,
     load_preferences,
-    read_bookmarks,
     read_flight,
     read_project,
     save_preferences,
@@ -280,10 +279,10 @@ def save_session(opened: Viewer, folder: Path) -> Path:
 
 
 @contextmanager
-def new_viewer(folder: Path | None = None) -> Iterator[Viewer]:
-    """Nothing is open; bookmarks are kept in `folder`."""
+def new_viewer() -> Iterator[Viewer]:
+    """Nothing is open."""
     services = Services(load, lambda encoder_id: FakeEncoder())
-    made = Viewer(services, surface=FakeSurface(), folder=folder)
+    made = Viewer(services, surface=FakeSurface())
     yield made
     made.worker.close()
 
@@ -430,12 +429,11 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
 def test_other_files_of_version_1_open_and_mean_the_same():
     project = read_project(SAVED / "version1.langsplat")
     assert project.session.things == Things({3: "the atlas"})
-    (bookmark,) = read_bookmarks(SAVED, Path("/scenes/blobs.ply"))
     first, second = read_flight(SAVED / "version1.path.json").keyframes
-    for pose in (bookmark.pose, first.pose, project.view.pose):
+    for pose in (first.pose, project.view.pose):
         np.testing.assert_allclose(pose.position, [-3.551118, -1.122909, -3.418507], atol=1e-5)
         np.testing.assert_allclose(pose.rotation[2], [0.702835, 0.222248, 0.675743], atol=1e-5)
-    assert (bookmark.name, second.seconds) == ("from the left", 2.0)
+    assert second.seconds == 2.0
     assert second.pose.span == pytest.approx(4.705585)
     assert load_preferences(SAVED) == Preferences(
         "light",
@@ -454,7 +452,7 @@ def session_files(name: str) -> Callable[[Path], list[bytes]]:
     """Return what makes files `name`, of this version and, moved to the folder, of version 1."""
 
     def samples(folder: Path) -> list[bytes]:
-        with new_viewer(folder) as made:
+        with new_viewer() as made:
             open_scene(made, folder / "blobs.ply")
             viewpoint.add_bookmark(made)
             save_session(made, folder)
@@ -463,14 +461,13 @@ def session_files(name: str) -> Callable[[Path], list[bytes]]:
             saving.save_path(made, folder)
             save_preferences(folder, made.state.preferences)
         old = (SAVED / name.replace("blobs-001", "version1")).read_text()
-        new = [(folder / name).read_bytes()] if name != "bookmarks.json" else []  # only earlier versions do
-        return [*new, old.replace("/scenes", str(folder)).encode()]
+        return [(folder / name).read_bytes(), old.replace("/scenes", str(folder)).encode()]
 
     return samples
 
 
 def opened_again(path: Path) -> float:
-    with new_viewer(path.parent) as made:
+    with new_viewer() as made:
         if path.name == "preferences.json":
             made.state.preferences = load_preferences(path.parent)
             settings.take_preferences(made)
@@ -494,7 +491,7 @@ def opened_again(path: Path) -> float:
 
 KINDS = {
     name: FileKind(name, session_files(name), opened_again, in_json, share=0.2)
-    for name in ("blobs-001.langsplat", "blobs-001.path.json", "bookmarks.json", "preferences.json")
+    for name in ("blobs-001.langsplat", "blobs-001.path.json", "preferences.json")
 }
 test_a_few_mutants_are_read_or_refused, test_many_mutants_are_read_or_refused = few_and_many(KINDS)
 

@@ -104,7 +104,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state, scene, field = viewer.state, opened.scene, opened.scene.language
     if state.path is not None:
         viewer.visits[state.path.absolute()] = state.visit()
-    session = state.session.of_next_scene(viewpoint.read_bookmarks(viewer, path, scene.origin))
+    session = state.session.of_next_scene()
     if field is None:
         state.pointing = False
         session = _without_field(session)
@@ -328,7 +328,6 @@ def _restore(viewer: Viewer, project: Project, path: Path) -> None:
     assert state.extent is not None
     offset = np.array(project.origin) - state.origin
     session = session.moved(offset)
-    session = replace(session, bookmarks=session.bookmarks or now.bookmarks)
     if project.version == 1:  # which had no other settings
         session = replace(session, split=now.split, splats=now.splats, overlays=now.overlays)
     for reason in project.left_out:
@@ -510,7 +509,7 @@ def _mirrored(state: ViewerState, other: ViewerState) -> Session:
     first = state.session
     answered = [query for query in first.queries if state.answer(query).result is not None]
     return replace(
-        first.of_next_scene(other.session.bookmarks),
+        first.of_next_scene(),
         split=Split(),
         clip=first.clip,
         queries=tuple(replace(query, slot=None) if hidden(query) else query for query in answered),

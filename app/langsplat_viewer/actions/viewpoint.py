@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError, LangSplatError, printable_line
+from langsplat_core.errors import LangSplatError, printable_line
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera
-from langsplat_viewer import projects
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera import controls, flight
 from langsplat_viewer.camera.controls import Extent, OrbitCamera, Side
@@ -430,12 +429,3 @@ def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
     view = flight.view_of(bookmark.pose, extent)
     target = view.eye + bookmark.distance * view.rotation[2]
     return replace(view, target=target, distance=bookmark.distance)
-
-
-def read_bookmarks(viewer: Viewer, path: Path, origin: Array) -> tuple[Bookmark, ...]:
-    """Read what an earlier version kept of a scene with an `origin` (3,); where it makes no sense, say so."""
-    try:
-        return tuple(bookmark.moved(-origin) for bookmark in projects.read_bookmarks(viewer.folder, path))
-    except InputError as error:
-        viewer.say_error(str(error))
-        return ()
