@@ -11,9 +11,10 @@ blue. Normals are zeros that nobody reads. Of a scene with an origin ``x y z`` a
 world.
 
 As read: the properties in any order and of any scalar type, any byte order, ascii, LF or CR LF in the
-header, without normals, with further elements (not read, which is said) and properties (kept as
-`Scene.extras`). Rows are kept as they are, NaN included; doubles, but of positions, are rounded to float32.
-Of comments in the header two kinds mean something; of several of a kind the last one counts:
+header, without normals, with further elements (not read, which is said; of a binary file, lists only behind
+the vertices) and properties (kept as `Scene.extras`). Rows are kept as they are, NaN included; doubles, but
+of positions, are rounded to float32. Of comments in the header two kinds mean something; of several of a kind
+the last one counts:
 
     metres_per_unit 0.25        length of the world's unit; no positive number: unknown
     SplatRenderMode: mip        trained with Mip-Splatting's compensation: Brush, splat-transform, gsplat
@@ -67,12 +68,11 @@ class PlyElement:
     name: str
     count: int  # rows
     numbers: dict[str, str] = field(default_factory=dict)  # property -> NumPy code without byte order
-    lists: dict[str, str] = field(default_factory=dict)  # of properties that are lists: code of the length
+    has_lists: bool = False  # among its properties, so that its rows differ in length
 
     def row(self, byte_order: str) -> np.dtype[np.void]:
-        """Return the type of a binary row in which every list is empty."""
-        kinds = {**self.numbers, **self.lists}
-        return np.dtype([(name, byte_order + code) for name, code in kinds.items()])
+        """Return the type of a binary row, where there are no lists."""
+        return np.dtype([(name, byte_order + code) for name, code in self.numbers.items()])
 
 
 class PlyFile:
@@ -104,7 +104,7 @@ class PlyFile:
             raise malformed(path, "the header has no 'format' line")
         for element in self.elements.values():
             plain = [name.removeprefix(CLOUDCOMPARE) for name in element.numbers]
-            if len(set(plain)) == len(plain) and not element.lists:
+            if len(set(plain)) == len(plain) and not element.has_lists:
                 element.numbers = dict(zip(plain, element.numbers.values(), strict=True))
         self._order = BYTE_ORDERS[self._format]  # "<" or ">"; empty of ascii
 
@@ -130,7 +130,7 @@ class PlyFile:
                     case []:
                         pass
                     case ["list", code] if _TYPES.get(code, "f")[0] != "f":
-                        last.lists[name] = _TYPES[code]
+                        last.has_lists = True
                     case _:
                         return False
             case _:
@@ -156,7 +156,7 @@ class PlyFile:
         integer, arbitrary. FormatError for an element without these properties, or with lists.
         """
         absent = [name for names, _ in groups for name in names if name not in element.numbers]
-        if absent or element.lists:
+        if absent or element.has_lists:
             lacks = f"has no number {absent[0]!r}" if absent else "has a list"
             raise malformed(self.path, f"element {element.name} {lacks}; expected numbers")
         self._seek(element)
@@ -195,8 +195,8 @@ class PlyFile:
         yield unread("elements", (f"{each.name} ({each.count} rows)" for each in others))
         if self._beyond:
             yield f"{self._beyond} numbers do not fit the types of their properties"
-        if self._order and any(each.lists for each in self.elements.values()):
-            return  # where the last row ends only walking them tells, which takes long
+        if self._order and any(each.has_lists for each in self.elements.values()):
+            return  # where the last row ends only walking them tells
         self._seek(None)
         left = (
             self._size - self._file.tell()
@@ -222,37 +222,11 @@ class PlyFile:
                 lines = (line for line in self._lines() if line.strip())
                 if sum(1 for _ in islice(lines, element.count)) < element.count:
                     raise malformed(self.path, f"truncated: it ends in element {element.name}")
-            elif element.lists:
-                self._skip_lists(element)
+            elif element.has_lists:
+                what = f"element {element.name} has lists, and lies before what is read"
+                raise malformed(self.path, what, "export it with its vertices first")
             else:
                 self._file.seek(element.count * least, 1)
-
-    def _skip_lists(self, element: PlyElement) -> None:
-        """Walk the rows, of which only their own lengths tell where they end; many equal ones at once."""
-        left, ahead = element.count, 16
-        while left:
-            start, size, lengths = self._file.tell(), 0, list[tuple[int, bytes]]()
-            for name, code in element.numbers.items():
-                step = np.dtype(code).itemsize
-                if name in element.lists:
-                    kind = np.dtype(self._order + element.lists[name])
-                    self._file.seek(start + size)
-                    lengths.append((size, self._exactly(kind.itemsize)))
-                    step = kind.itemsize + step * int(np.frombuffer(lengths[-1][1], kind)[0])
-                if step < 0:
-                    raise malformed(self.path, f"a list of element {element.name} has a negative length")
-                size += step
-            self._file.seek(start + size)
-            same = min(ahead, left - 1, (1 << 22) // max(size, 1))
-            rows = np.frombuffer(self._file.read(size * same), np.uint8)
-            rows = rows[: len(rows) // size * size].reshape(-1, size)
-            alike = np.ones(len(rows), bool)
-            for at, length in lengths:
-                alike &= (rows[:, at : at + len(length)] == np.frombuffer(length, np.uint8)).all(1)
-            same = len(rows) if alike.all() else int(alike.argmin())
-            ahead = max(4 * same, 16)
-            left -= 1 + same
-            self._file.seek(start + size * (1 + same))
 
     def _lines(self) -> Iterator[bytes]:
         """Yield the lines that follow, none of which is the rest of a file without ends of lines."""

@@ -76,15 +76,12 @@ def vertex_table(g: Gaussians, names: list[str], code: str = "<f4") -> Array:
     return table
 
 
-def plain_ply(
-    g: Gaussians, names: list[str] | None = None, *, front: bytes = b"", newline: str = "\n"
-) -> bytes:
-    """Binary little endian; `front` is the body of a list element `face` of 2 rows before the vertices."""
+def plain_ply(g: Gaussians, names: list[str] | None = None, *, newline: str = "\n") -> bytes:
+    """Binary little endian."""
     names = names or inria_names(g.sh_degree)
-    faces = ["element face 2", "property list uchar int vertex_indices"] if front else []
-    header = ["format binary_little_endian 1.0", *faces]
-    header += [f"element vertex {len(g)}", *(f"property float {name}" for name in names)]
-    return ply_bytes(header, front + vertex_table(g, names).tobytes(), newline)
+    header = ["format binary_little_endian 1.0", f"element vertex {len(g)}"]
+    header += [f"property float {name}" for name in names]
+    return ply_bytes(header, vertex_table(g, names).tobytes(), newline)
 
 
 def ascii_ply(g: Gaussians) -> bytes:
