@@ -37,7 +37,6 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError
 from langsplat_core.extensions.benchmarks.raster_speed import (
     Case,
-    Rates,
     default_camera,
     describe_machine,
     label_maps,
@@ -231,7 +230,6 @@ def _said_by(*command: str) -> str:
 
 # gsplat beside the CPU rasterizer: time of every operation, and its error against the float64 reference.
 
-LONGEST_S = 10.0  # what is likely to take the CPU longer is not begun
 
 NOTES = """- Through the interface, arrays in and out of NumPy: every `frame` copies the scene to the device.
 - Errors against the float64 reference on three windows of 64x64 pixels, values in [0, 1); the reference caps
@@ -247,14 +245,13 @@ def measure_raster(plan: Plan) -> Iterator[str]:
     settings = {"cpu": INRIA, "cuda": drawn_settings(INRIA)}
     warm_up(backends, plan.channels)
     yield "# gsplat's rasterizer\n\n" + NOTES
-    rates = Rates()
     for count, size in plan.scenes:
         case = Case("random", random_scene(count), default_camera(*size))
         rows = []
         for backend in backends:
             exact = reference_windows(case.gaussians, case.camera, settings[backend.name])
             for channels in plan.channels:
-                rows += measure_backend(backend, case, channels, exact, LONGEST_S, rates)
+                rows += measure_backend(backend, case, channels, exact)
         yield speed_table(rows)
         yield "On the device alone, scene and picture staying there:\n"
         yield _on_device(case, plan.channels)
@@ -485,7 +482,7 @@ def tables(plan: Plan, context: moderngl.Context) -> Iterator[str]:
         exact = reference_windows(case.gaussians, case.camera, ENDLESS)
         rows = []
         for backend in backends:
-            rows += measure_backend(backend, case, 3, exact, 30.0, {})
+            rows += measure_backend(backend, case, 3, exact)
         yield speed_table(rows)
 
 

@@ -26,7 +26,7 @@ import scipy.sparse
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import OutFolder
-from langsplat_core.config import INRIA, Count, Positive, Range, RasterSettings
+from langsplat_core.config import INRIA, Count, Range, RasterSettings
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.extensions.benchmarks.report import markdown, write_report
 from langsplat_core.io.hostile import exists
@@ -74,8 +74,6 @@ class BenchRaster:
     """Values per Gaussian."""
     scenes: tuple[Path, ...] = ()
     """Real scenes to measure beside the random ones, from their first camera, else one that frames them."""
-    limit: Positive = 60.0
-    """Seconds that a single call may be expected to take; what would take longer is named and left out."""
     out: OutFolder = Path("bench_out")
     """Folder for raster.md, raster.json and raster.png."""
 
@@ -148,12 +146,11 @@ class Measurement:
     channels: int
     operation: str
     backend: str
-    milliseconds: float | None = None  # median; None: not run, see `note`
+    milliseconds: float = 0.0  # median
     peak_mib: float | None = None  # rise of the resident set; None: unknown
     largest_error: float | None = None  # None: not compared
     error_off_cuts: float | None = None  # away from cut-offs
     flips: int | None = None  # pixels near a cut-off that came out on its other side
-    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -178,7 +175,7 @@ def run_plan(plan: BenchRaster, progress: Progress = silent) -> Iterator[RasterR
     backends = _backends(machine)
     progress("bench: compiling", 0.0)
     warm_up(backends, plan.channels)
-    rows, rates = list[Measurement](), Rates()
+    rows = list[Measurement]()
     pairs = sweep(plan.counts, plan.sizes, plan.pivot)
     total = len(plan.scenes) + len(pairs)
     for n, case in enumerate(_cases(plan, pairs)):
@@ -188,7 +185,7 @@ def run_plan(plan: BenchRaster, progress: Progress = silent) -> Iterator[RasterR
         steps = [(channels, backend) for channels in plan.channels for backend in backends]
         for step, (channels, backend) in enumerate(steps):
             progress(f"{name}, {backend.name}", (n + step / len(steps)) / total)
-            rows += measure(backend, case, channels, exact, plan.limit, rates)
+            rows += measure(backend, case, channels, exact)
         yield RasterReport(machine | {"unfinished": f"{n + 1} of {total} scenes and sizes"}, list(rows))
     progress("bench: done", 1.0)
     yield RasterReport(machine, rows)
@@ -197,7 +194,7 @@ def run_plan(plan: BenchRaster, progress: Progress = silent) -> Iterator[RasterR
 def sweep(
     counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int
 ) -> list[tuple[int, tuple[int, int]]]:
-    """Return every count at the middle size and every size at `pivot`, small ones first: they foretell."""
+    """Return every count at the middle size and every size at `pivot`, small ones first."""
     middle = sorted(sizes)[len(sizes) // 2]
     pairs = {(count, middle) for count in counts} | {(pivot, size) for size in sizes}
     return sorted(pairs, key=lambda pair: (pair[0], pair[1][0] * pair[1][1]))
@@ -270,9 +267,6 @@ def _processor() -> str:
 # One backend on one case.
 
 
-Rates = dict[tuple[str, str, int], float]  # seconds per overlap of a footprint and a tile, of each operation
-
-
 def warm_up(backends: Sequence[Rasterizer], channels: Sequence[int]) -> None:
     """Compile and load everything on a tiny scene, so that no measurement contains it."""
     case = Case("random", random_scene(200), default_camera(40, 30))
@@ -283,23 +277,14 @@ def warm_up(backends: Sequence[Rasterizer], channels: Sequence[int]) -> None:
 
 
 def measure(
-    backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindows", limit: float, rates: Rates
+    backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindows"
 ) -> Iterator[Measurement]:
-    """Time every operation of `backend` on one case that `rates` foretell less than `limit` seconds of."""
-    drawn = exact.footprints.opacities > 0
-    overlaps = int(np.prod(2 * exact.footprints.extents_px / 16 + 1, axis=1)[drawn].sum())
+    """Time every operation of `backend` on one case."""
     shape = case.scene, len(case.gaussians), case.camera.width, case.camera.height, channels
     name = f"{backend.name} {getattr(backend, 'precision', '')}".strip()
     for operation, call, error_of in _operations(backend, case, channels):
-        row = Measurement(*shape, operation, name)
-        key = name, operation, channels
-        expected = rates.get(key, 0.0) * overlaps
-        if expected > limit:
-            yield replace(row, note=f"not run: about {expected:.0f} s expected")
-            continue
         seconds, peak = _timed(call)
-        rates[key] = seconds / max(overlaps, 1)
-        row = replace(row, milliseconds=1e3 * seconds, peak_mib=peak)
+        row = Measurement(*shape, operation, name, 1e3 * seconds, peak)
         if error_of is not None:
             error = error_of(exact)
             row = replace(row, largest_error=error.largest, error_off_cuts=error.off_cuts, flips=error.flips)
@@ -416,7 +401,6 @@ class ReferenceWindows:
     them.
     """
 
-    footprints: Footprints  # of all N
     rows: Array  # (K,) ascending: the Gaussians that reach into a window
     windows: tuple[ReferenceWindow, ...]
 
@@ -482,7 +466,7 @@ def reference_windows(
             **{column.name: getattr(footprints, column.name)[mine] for column in fields(Footprints)}
         )
         windows.append(_window(part, camera, settings, at, (len(rows), np.searchsorted(rows, mine))))
-    return ReferenceWindows(footprints, rows, tuple(windows))
+    return ReferenceWindows(rows, tuple(windows))
 
 
 def _place(camera: Camera, fraction: tuple[float, float]) -> tuple[slice, slice]:
@@ -528,7 +512,7 @@ def table(rows: Sequence[Measurement]) -> str:
         (*head, "error off cut-offs", "largest error", "flips"),
         (
             (r.scene, r.gaussians, f"{r.width}x{r.height}", r.channels, r.operation, r.backend)
-            + (r.note or _cell(r.milliseconds, ".4g"), _cell(r.peak_mib, ".1f"))
+            + (f"{r.milliseconds:.4g}", _cell(r.peak_mib, ".1f"))
             + (_cell(r.error_off_cuts, ".1e"), _cell(r.largest_error, ".1e"), _cell(r.flips, "d"))
             for r in rows
         ),
@@ -547,7 +531,7 @@ def plot(rows: Sequence[Measurement], path: Path) -> None:
     from matplotlib import pyplot
 
     size = _busiest(rows)
-    here = [r for r in rows if r.milliseconds and r.scene == "random" and (r.width, r.height) == size]
+    here = [r for r in rows if r.scene == "random" and (r.width, r.height) == size]
     operations = list(dict.fromkeys(r.operation for r in here))
     backends = list(dict.fromkeys(r.backend for r in rows))
     ends = sorted({r.channels for r in rows})
@@ -563,9 +547,7 @@ def plot(rows: Sequence[Measurement], path: Path) -> None:
                 panel.plot(*points.T, style, color=f"C{number}", marker="o")
         panel.set(title=operation, xlabel="Gaussians", ylabel="ms", xscale="log", yscale="log")
     for number, backend in enumerate(backends):
-        compared = [
-            r for r in rows if r.backend == backend and r.milliseconds and r.error_off_cuts is not None
-        ]
+        compared = [r for r in rows if r.backend == backend and r.error_off_cuts is not None]
         errors = [max(r.error_off_cuts or 0, 1e-9) for r in compared]
         grid[-1][-1].plot([r.milliseconds for r in compared], errors, "o", color=f"C{number}", label=backend)
     grid[-1][-1].set(title="error", xlabel="ms", ylabel="largest error", xscale="log", yscale="log")
