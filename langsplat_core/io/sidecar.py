@@ -51,9 +51,8 @@ format "langsplat words", version "1", encoder and taught.
 like the one in memory. The PLY stays a plain file that other programs edit; the checksum notices it, and the
 positions let `rematch_language` carry the field over to an edited PLY.
 
-Older versions are read too: version 2 has no tree but `things`, uint16 (N,) number of the thing of each
-Gaussian, 65535 for none; in version 1 everything is float32, with `means` (N, 3) in place of positions and
-corners, no temperature and no found.
+Older versions are read too: version 2 has no tree but `things`, which are not read; in version 1 everything
+is float32, with `means` (N, 3) in place of positions and corners, no temperature and no found.
 """
 
 import hashlib
@@ -78,7 +77,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import FromFile, decode_json, open_for_reading
 from langsplat_core.scene import LEVELS, NO_NODE, NO_ORIGIN, Calibration, LanguageField, TaughtWord, Tree
 from langsplat_core.scene.codec import codec_from_tensors
-from langsplat_core.scene.language import CANONICAL_PHRASES, MOST_SHOWN, PlattScaling, tree_of_wholes
+from langsplat_core.scene.language import CANONICAL_PHRASES, MOST_SHOWN, PlattScaling
 
 SUFFIX = ".langsplat.safetensors"
 CODEC = "codec."
@@ -130,8 +129,6 @@ def read_stored(path: Path) -> Stored:
             raise ValueError(f"levels {quoted(about['levels'])}; expected {','.join(LEVELS)!r}")
         if "means" in tensors:  # of version 1
             tensors["positions"], tensors["corners"] = pack_positions(tensors["means"])
-        if "things" in tensors:  # of version 2
-            tensors |= _tree_tensors(tree_of_wholes(_signed(tensors["things"])))
         field = _field(tensors, about)
         if (about["d"], about["gaussians"]) != (field.codec.latent_dim, len(field)):
             raise ValueError("the header's d or number of Gaussians is not that of the tensors")
@@ -145,7 +142,7 @@ def read_stored(path: Path) -> Stored:
         return Stored(field, means + about.get("origin", 0.0), precision, about["means_blake2b"])
 
 
-_ALWAYS = ("confidence", "positions", "corners", "means", "canonical", "everyday", "phrasebook", "things")
+_ALWAYS = ("confidence", "positions", "corners", "means", "canonical", "everyday", "phrasebook")
 _STATED = {*_PARSED, "format", "version", "encoder", "levels", "codec", "means_blake2b", "calibration"}
 
 

@@ -257,13 +257,11 @@ class QueryEngine:
 
     @cached_property
     def tree(self) -> Tree:
-        """The scene's own tree; where it has none, or wholes alone, one that is built."""
+        """The scene's own tree; where it has none, one that is built."""
         field = self.field
-        if field.tree is not None and field.tree.complete:
+        if field.tree is not None:
             return field.tree
-        things = None if field.tree is None else field.tree.things()
-        tree = build_tree(self.surface, field.codec, field.latents, field.known, things)
-        return tree if things is None else tree.voted_by(things)
+        return build_tree(self.surface, field.codec, field.latents, field.known)
 
     @cached_property
     def regions(self) -> Regions:

@@ -101,11 +101,6 @@ class Tree:
             raise ValueError("tree: levels must be 0, 1 or 2 and not above the parent's")
 
     @property
-    def complete(self) -> bool:
-        """False for a tree of wholes without parts."""
-        return bool((self.levels < len(LEVELS) - 1).any()) or self.count == 0
-
-    @property
     def count(self) -> int:
         """Number K of nodes."""
         return len(self.parents)
@@ -119,16 +114,11 @@ class Tree:
                 owners[node] = owners[parent]
         return np.array(owners, np.int32)[self.leaves]
 
-    def voted(self, level: int) -> Array:
-        """`at` a level, NO_NODE where no mask voted for that node."""
-        at = self.at(level)
-        votes = np.append(self.votes[:, 0] > 0, False)
-        return np.where(votes[at], at, np.int32(NO_NODE))
-
     @cached_property
     def voted_wholes(self) -> Array:
-        """`voted` at the level of wholes, kept: what divides answers into things."""
-        return self.voted(len(LEVELS) - 1)
+        """`at` the level of wholes, NO_NODE where no mask voted for it: what divides answers into things."""
+        at, votes = self.at(len(LEVELS) - 1), np.append(self.votes[:, 0] > 0, False)
+        return np.where(votes[at], at, np.int32(NO_NODE))
 
     def members(self, node: int) -> Array:
         """(N,) bool: the Gaussians of a node, those of its descendants included."""
@@ -164,22 +154,6 @@ class Tree:
         rows = np.flatnonzero(inside)
         return NodeGaussians(rows[np.argsort(behind[self.leaves[rows]], kind="stable")], starts, sizes)
 
-    def things(self) -> Array:
-        """(3, N) int32 nodes of each level that masks voted for, see `build_tree`."""
-        levels = np.append(self.levels, len(LEVELS))
-        voted = [self.voted(level) for level in range(len(LEVELS))]
-        return np.stack([np.where(levels[row] == level, row, NO_NODE) for level, row in enumerate(voted)])
-
-    def voted_by(self, things: Array) -> "Tree":
-        """Return the tree with one vote for each node mostly of `things`, for want of photographs' counts."""
-        votes = np.zeros((self.count, 2), np.uint16)
-        for level, row in enumerate(things):
-            at = self.at(level)
-            inside = at != NO_NODE
-            shares = np.bincount(at[inside], row[inside] != NO_NODE, self.count)
-            votes[2 * shares > np.bincount(at[inside], minlength=self.count), 0] = 1
-        return replace(self, votes=votes)
-
 
 @dataclass(frozen=True, eq=False)
 class NodeGaussians:
@@ -199,14 +173,6 @@ class NodeGaussians:
         running = np.cumsum(values[self.order], axis=0, dtype=np.float64)
         running = np.concatenate([np.zeros_like(running[:1], shape=(1, *values.shape[1:])), running])
         return np.asarray(running[self.starts + self.sizes] - running[self.starts])
-
-
-def tree_of_wholes(things: Array) -> Tree:
-    """Return the tree of things alone: (N,) number, from 0, of each Gaussian's thing, NO_NODE for none."""
-    count = int(things.max(initial=NO_NODE)) + 1
-    votes = np.tile(np.array([1, 0], np.uint16), (count, 1))
-    parents, levels = np.full(count, NO_NODE, np.int32), np.full(count, 2, np.uint8)
-    return Tree(things.astype(np.int32), parents, levels, votes)
 
 
 # Calibration of one text encoder's cosines: how probable it is that what is asked for is there at all.
@@ -298,7 +264,7 @@ class LanguageField:
     temperature: float = 10.0  # of the softmax over cosines; 10 in the code of LERF and LangSplat, for CLIP
     found: float = 0.6  # peak relevancy, as published, from which a phrase counts as present
     calibration: Calibration | None = None  # None: no probability is known to hold here
-    tree: Tree | None = None  # of N Gaussians; of wholes alone where nothing but these was kept
+    tree: Tree | None = None  # of N Gaussians; None: where it is asked, one is built
     everyday: Array | None = None  # (V, D) float32 unit vectors of phrases most of which name nothing here
     taught: tuple[TaughtWord, ...] = ()  # no two of one key
 

@@ -16,10 +16,9 @@ from langsplat_core.io.scenes import companion_path, load_scene, save_scene
 from langsplat_core.io.sidecar import SUFFIX as SIDECAR
 from langsplat_core.io.sidecar import write_language
 from langsplat_core.scene import Scene, TaughtWord
-from langsplat_core.scene.language import tree_of_wholes
 from tests.support.file_samples import assert_same_extras, random_field, sog_files, write_folder
 from tests.support.processes import contents, refusal, run
-from tests.support.scenes import random_camera, random_extras, random_gaussians
+from tests.support.scenes import random_camera, random_extras, random_gaussians, tree_of_wholes
 
 DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"
 

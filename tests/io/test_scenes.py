@@ -28,7 +28,6 @@ from langsplat_core.io.sidecar import SUFFIX as SIDECAR
 from langsplat_core.io.sidecar import write_language
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, Calibration, PlattScaling, Scene
-from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.transform import moving, place_scene
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import (
@@ -42,7 +41,7 @@ from tests.support.file_samples import (
     write_folder,
 )
 from tests.support.processes import killed_everywhere, refusal, run
-from tests.support.scenes import random_camera, random_extras, random_gaussians
+from tests.support.scenes import random_camera, random_extras, random_gaussians, tree_of_wholes
 
 N = 60
 

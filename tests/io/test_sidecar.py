@@ -249,16 +249,11 @@ def test_malformed_words_are_refused_in_a_line(own_words, case):
     assert_refused(read_words, own_words)
 
 
-def test_things_of_version_2_are_wholes(sidecar, means):
-    things = (np.arange(N) // 7).astype(np.uint16)
-    things[::5] = 65_535
-    change(sidecar, things=things, **NO_TREE)
+def test_things_of_version_2_are_not_read(sidecar, means, caplog):
+    change(sidecar, things=np.zeros(N, np.uint16), **NO_TREE)
     says(version="2")(sidecar)
-    tree = read_language(sidecar, means).tree
-    assert tree is not None
-    assert not tree.complete
-    assert tree.at(2).tolist() == [NO_NODE if row % 5 == 0 else row // 7 for row in range(N)]
-    assert (tree.voted(2) == tree.at(2)).all()
+    assert read_language(sidecar, means).tree is None
+    assert ["things" in message for message in caplog.messages] == [True]
 
 
 def test_files_without_tree_and_odds_are_read(sidecar, means, caplog):

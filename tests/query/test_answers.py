@@ -47,12 +47,19 @@ from langsplat_core.scene import (
     Tree,
 )
 from langsplat_core.scene.codec import CodebookCodec
-from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, tree_of_wholes
+from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN
 from langsplat_core.scene.surface import SMALLEST, Surface, build_surface
 from langsplat_core.semantics.relevancy import FLOOR, Scale, TextEncoder, fit_of
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field
-from tests.support.scenes import chain_of_levels, random_gaussians, regions_of, unturned_gaussians
+from tests.support.scenes import (
+    chain_of_levels,
+    random_gaussians,
+    regions_of,
+    tree_of_wholes,
+    unturned_gaussians,
+    with_tree,
+)
 
 RULES = ("regions", "peak")
 SURE = Calibration(*[PlattScaling(constant=0.0, whole=20.0, finer=2.0, found=0.8)] * 3)
@@ -419,7 +426,7 @@ def row_of(things: list[int], seed: int) -> Scene:
         everyday=unit(0.8 * unit(FEATURES.mean(0)) + FEATURES).astype(np.float32),
         tree=tree_of_wholes(np.where(of < len(things) - PIECES, of, NO_NODE)),
     )
-    return Scene(unturned_gaussians(places, np.log(0.08), 2.0), field)
+    return with_tree(Scene(unturned_gaussians(places, np.log(0.08), 2.0), field))
 
 
 def test_smoothing_follows_what_varies_slowly_and_evens_out_noise():

@@ -40,7 +40,6 @@ from langsplat_core.scene import (
     PlattScaling,
     Scene,
 )
-from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.semantics import relevancy as relevancies
 from langsplat_core.semantics.encoders import DEMO, OPEN_MODEL, keep_calibration
 from langsplat_core.semantics.relevancy import FEWEST, Scale, latent_relevancy, relevancy, relevancy_of
@@ -56,7 +55,7 @@ from tests.support.fakes import (
     named_scene,
 )
 from tests.support.file_samples import random_field
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import random_camera, random_gaussians, tree_of_wholes
 
 
 def test_engine_errors_say_what_to_do():

@@ -30,11 +30,10 @@ from langsplat_core.query.selection import (
 )
 from langsplat_core.scene import NO_NODE, Gaussians, LanguageField, Scene, look_at
 from langsplat_core.scene import surface as surfaces
-from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.surface import Surface, build_surface
 from tests.support.fakes import CENTRES, PER_BLOB, blob_scene
 from tests.support.file_samples import random_field
-from tests.support.scenes import random_gaussians, regions_of, unturned_gaussians
+from tests.support.scenes import random_gaussians, regions_of, tree_of_wholes, unturned_gaussians
 
 
 def test_smoothing_is_the_weighted_mean_of_the_nearest():

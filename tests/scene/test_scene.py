@@ -288,7 +288,7 @@ def test_nodes_are_nested_sets():
     assert members == [[0, 1], [2], [3, 4], [6], [0, 1, 2], [3, 4, 6], [0, 1, 2]]
     assert [rows.tolist() for rows in TREE.gaussians()] == members
     voted = replace(TREE, votes=np.array([[0, 5]] * 5 + [[1, 2], [0, 1]], np.uint16))
-    assert voted.voted(2).tolist() == [NO_NODE] * 3 + [5, 5, NO_NODE, 5]
+    assert voted.voted_wholes.tolist() == [NO_NODE] * 3 + [5, 5, NO_NODE, 5]
 
 
 def test_gaussians_of_random_nodes_are_their_members():
@@ -333,14 +333,6 @@ def test_taking_rows_of_a_field_takes_their_leaves():
         np.testing.assert_array_equal(taken.tree.at(1), TREE.at(1)[rows])
         assert len(taken) == len(LEAVES[rows])
     assert random_field(N).take(np.arange(3)).tree is None
-
-
-def test_things_are_nodes_of_their_level_that_masks_voted_for():
-    voted = replace(TREE, votes=np.array([[1, 0], [0, 3], [2, 0], [0, 0], [4, 1], [0, 0], [1, 1]], np.uint16))
-    none = [NO_NODE] * 4
-    assert voted.things().tolist() == [[0, 0, NO_NODE, *none], [4, 4, 4, *none], [6, 6, 6, *none]]
-    again = replace(TREE, votes=np.zeros((7, 2), np.uint16)).voted_by(voted.things())
-    assert again.votes[:, 0].tolist() == [1, 0, 0, 0, 1, 0, 1]
 
 
 # A transformed scene seen by the transformed camera is the scene that was there before.

@@ -18,7 +18,7 @@ from langsplat_core.query.answers import Regions, build_regions
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, LanguageField, LinearCodec, Scene, look_at
-from langsplat_core.scene.language import Tree
+from langsplat_core.scene.language import NO_NODE, Tree
 from langsplat_core.scene.surface import Surface, build_surface, build_tree, surface_weights
 from langsplat_core.scene.transform import C0
 from langsplat_core.semantics.features import ImageFeatures
@@ -154,12 +154,17 @@ class Answer:
 
 
 def tree_of(scene: Scene, surface: Surface | None = None) -> Tree:
-    """The tree that is built of a scene with a field."""
+    """The tree that is built of a scene with a field; wholes of one that it has stay wholes, voted for."""
     field = scene.language
     assert field is not None
-    surface = surface or build_surface(scene.gaussians)
-    things = None if field.tree is None else field.tree.things()
-    return build_tree(surface, field.codec, field.latents, field.known, things)
+    built = surface or build_surface(scene.gaussians), field.codec, field.latents, field.known
+    if field.tree is None:
+        return build_tree(*built)
+    wholes = field.tree.leaves
+    tree = build_tree(*built, np.stack([*2 * [np.full(len(wholes), NO_NODE)], wholes]))
+    votes, at = tree.votes.copy(), tree.at(2)
+    votes[np.unique(at[(wholes != NO_NODE) & (at != NO_NODE)]), 0] = 1
+    return replace(tree, votes=votes)
 
 
 def regions_of(scene: Scene, surface: Surface | None = None) -> Regions:
@@ -171,6 +176,14 @@ def with_tree(scene: Scene) -> Scene:
     """`scene` with its tree in its field."""
     assert scene.language is not None
     return replace(scene, language=replace(scene.language, tree=tree_of(scene)))
+
+
+def tree_of_wholes(things: Array) -> Tree:
+    """(N,) number, from 0, of each Gaussian's thing, NO_NODE for none -> a tree of these alone, voted for."""
+    count = int(things.max(initial=NO_NODE)) + 1
+    votes = np.tile(np.array([1, 0], np.uint16), (count, 1))
+    parents, levels = np.full(count, NO_NODE, np.int32), np.full(count, 2, np.uint8)
+    return Tree(things.astype(np.int32), parents, levels, votes)
 
 
 def chain_of_levels(leaves: Array) -> Tree:

@@ -31,12 +31,11 @@ from langsplat_core.progress import silent
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from langsplat_core.scene.gaussians import join_gaussians
-from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.transform import moving, scaling, transform_scene
 from tests.support.file_samples import random_field
 from tests.support.hard_cases import balls
 from tests.support.processes import contents
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import random_gaussians, tree_of_wholes
 
 N = 400
 CONFIG = BudgetConfig(max_psnr_loss=0.3, max_side=64)

@@ -47,7 +47,6 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import NO_NODE, NO_ORIGIN, Gaussians, Scene, TaughtWord, look_at
-from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.transform import (
     AXES,
     IDENTITY,
@@ -62,7 +61,7 @@ from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, named_scene
 from tests.support.file_kinds import FileKind, drawable_share, few_and_many, in_json
 from tests.support.file_samples import glb_column, parts, random_field
 from tests.support.processes import refusal, run
-from tests.support.scenes import DEMO, FLOOR, WALL, box_room, random_camera, random_gaussians
+from tests.support.scenes import DEMO, FLOOR, WALL, box_room, random_camera, random_gaussians, tree_of_wholes
 
 pytest.importorskip("open3d")
 

@@ -17,7 +17,6 @@ from langsplat_core.scene import (
     codec_from_tensors,
 )
 from langsplat_core.scene.codec import KINDS, CodebookCodec, principal_colours
-from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.relevancy import Scale
 from langsplat_core.training.language.codec_fit import (
@@ -33,7 +32,7 @@ from langsplat_core.training.language.codec_fit import (
     spherical_kmeans,
 )
 from tests.support.file_samples import random_field
-from tests.support.scenes import unturned_gaussians
+from tests.support.scenes import tree_of_wholes, unturned_gaussians
 
 pytestmark = pytest.mark.long
 
