@@ -13,7 +13,7 @@ class DiscView(View):
     def __init__(self, gaussians, camera, settings):
         centres, self.depths = camera.project(gaussians.means)  # pixels, world units
         variances = (np.exp(gaussians.log_scales).mean(1) * camera.fx / self.depths) ** 2
-        variances += dilation(camera, settings)
+        variances += dilation(camera, settings).added
         pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1) + 0.5
         squared = ((pixels - centres[:, None, None]) ** 2).sum(-1) / variances[:, None, None]  # (N, H, W)
         opacities = (self.depths > settings.near) / (1 + np.exp(-gaussians.opacity_logits))
