@@ -298,8 +298,8 @@ class Painter {
     const { width, height } = camera;
     const { raster } = meta;
     // As raster.protocol.dilation.
-    let growth = raster.focal ? Math.min((camera.fx * camera.fy) / raster.focal ** 2, 256) : 1;
-    if (Math.abs(growth - 1) < 1e-6) growth = 1;
+    const ratio = raster.focal ? (camera.fx * camera.fy) / raster.focal ** 2 : 1;
+    const growth = Math.abs(ratio - 1) < 1e-6 ? 1 : Math.min(ratio, 256);
     const fitted = raster.dilation * (raster.antialiased ? Math.max(growth, 1) : growth);
     const r = camera.rotation;
     const high = camera.position.map(Math.fround);
