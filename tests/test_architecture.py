@@ -171,6 +171,17 @@ def test_every_module_has_a_layer():
     assert homeless <= {FACADE, "langsplat_core.training.__init__", "langsplat_viewer.__init__"}
 
 
+def test_texts_are_read_and_written_in_a_stated_encoding() -> None:
+    """What is not stated is code page 1252 or another on Windows."""
+    found = []
+    for path in SOURCES:
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(call, ast.Call) and getattr(call.func, "attr", "") in ("read_text", "write_text"):
+                stated = any(word.arg == "encoding" for word in call.keywords)
+                found += [] if stated else [f"{path}:{call.lineno}"]
+    assert found == []
+
+
 CORE = "core, core.io.scenes, core.scene, core.query.engine, core.display.displays, core.raster"
 OF_WINDOW = ("moderngl", "glfw", "imgui_bundle")
 

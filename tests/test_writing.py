@@ -49,6 +49,7 @@ from tests.support.processes import (
     contents,
     files_of_at_most,
     killed_everywhere,
+    surroundings,
 )
 from tests.support.scenes import random_camera, random_gaussians
 from tests.support.windowless import flight as some_flight
@@ -348,3 +349,13 @@ def test_other_errors_of_a_writer_are_raised(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="ours"), files_of_at_most(0), atomic_path(tmp_path / "a"):
         raise InputError("ours")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.long
+def test_program_works_without_what_windows_lacks(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tests.support.processes", "--as-on-windows", tmp_path]
+    environment = surroundings("") | {"PYTHONUTF8": "0", "PYTHONIOENCODING": "cp1252"}
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    said = (done.stdout + done.stderr).decode("cp1252")
+    assert done.returncode == 0, said[-4000:]
+    assert "aux.ply: cannot be written (no name on Windows); choose another\n" in said

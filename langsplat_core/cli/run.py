@@ -180,7 +180,8 @@ def _prepare_standard_streams() -> None:
         sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115  as long as the process
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
-    if sys.stderr is sys.__stderr__:
+    console = sys.platform == "win32" and sys.stderr is not None and sys.stderr.isatty()  # takes no bytes
+    if sys.stderr is sys.__stderr__ and not console:
         encoding = "utf-8" if sys.stderr is None else sys.stderr.encoding
         raw = io.BufferedWriter(_StandardError(2, "w", closefd=False))
         sys.stderr = io.TextIOWrapper(raw, encoding, errors="backslashreplace", line_buffering=True)

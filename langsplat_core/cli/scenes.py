@@ -133,11 +133,12 @@ def _machine() -> dict[str, str]:
         "python": f"{platform.python_version()} on {platform.platform()}, {cores}",
     }
     machine |= {name: _version(name) for name in ("numpy", "numba", "moderngl", "imgui-bundle", *OPTIONAL)}
-    for library, package in LIBRARIES.items():
-        found = ctypes.util.find_library(library)
-        machine[f"lib{library}"] = found or f"missing: apt install {package}"
+    if sys.platform == "linux":
+        for library, package in LIBRARIES.items():
+            found = ctypes.util.find_library(library)
+            machine[f"lib{library}"] = found or f"missing: apt install {package}"
+        machine["DISPLAY"] = os.environ.get("DISPLAY") or "not set: use --headless"
     return machine | {
-        "DISPLAY": os.environ.get("DISPLAY") or "not set: use --headless",
         "OpenGL": _opengl(),
         "text encoder": _encoder(),
     }

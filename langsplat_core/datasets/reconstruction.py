@@ -102,7 +102,8 @@ def match_features(folder: Path, pairs: Sequence[workspace.Pair], progress: Prog
         batch = lacking[start : start + MATCH_BATCH]
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = folder / "pairs.txt"
-        pairing.match_list_path.write_text("".join(f"{first} {second}\n" for first, second in batch))
+        lines = "".join(f"{first} {second}\n" for first, second in batch)
+        pairing.match_list_path.write_text(lines, encoding="utf-8")
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = 0
         pycolmap.match_image_pairs(
@@ -160,7 +161,7 @@ def store_model(model: Model, folder: Path) -> None:
         raise workspace.disk_full(folder) from None
     if len(written.points) != model.num_points3D():
         raise workspace.disk_full(folder)
-    (unfinished / workspace.DIGEST).write_text(workspace.digest_of_model(unfinished))
+    (unfinished / workspace.DIGEST).write_text(workspace.digest_of_model(unfinished), encoding="utf-8")
     shutil.rmtree(folder / "sparse", ignore_errors=True)
     unfinished.rename(folder / "sparse")
     for name in ("database.db", "pairs.txt"):
@@ -320,4 +321,4 @@ def keep_matches(folder: Path) -> None:
     ends = [[names[number] for number in pycolmap.pair_id_to_image_pair(pair)] for pair in pairs]
     kept = [[*end, int(count)] for end, count in zip(ends, inliers, strict=True) if count]
     with atomic_path(folder / workspace.MATCHES) as temporary:
-        temporary.write_text(json.dumps({"features": features, "pairs": sorted(kept)}))
+        temporary.write_text(json.dumps({"features": features, "pairs": sorted(kept)}), encoding="utf-8")

@@ -64,8 +64,9 @@ def run(
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            pickle.dump((log.getEffectiveLevel(), STRICTNESS.on, function, arguments), process.stdin)
-            process.stdin.flush()
+            with contextlib.suppress(OSError):  # it has ended, which reading tells
+                pickle.dump((log.getEffectiveLevel(), STRICTNESS.on, function, arguments), process.stdin)
+                process.stdin.flush()
             while True:
                 match pickle.load(process.stdout):
                     case "progress", report:
@@ -77,7 +78,7 @@ def run(
                     case _, (result, losses):
                         STRICTNESS.said.extend(losses)
                         return result
-        except (EOFError, pickle.UnpicklingError, BrokenPipeError):  # it ended within or before a message
+        except (EOFError, pickle.UnpicklingError):  # it ended within or before a message
             code = process.wait()
             how = signal.Signals(-code).name if code < 0 else f"code {code}"
             how += ", as where memory runs out" if how == "SIGKILL" else ""
@@ -87,15 +88,16 @@ def run(
             raise AbortedError(f"ended with {how}: {last}") from None
         finally:
             process.kill()
-            with contextlib.suppress(BrokenPipeError):
+            with contextlib.suppress(OSError):
                 process.stdin.close()
 
 
 def serve() -> None:
     """Run in the other process what standard input brings, and write the result to standard output."""
-    given = sys.stdin.buffer
-    out = os.fdopen(os.dup(1), "wb")
+    given, out = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints is no message
+    # Windows would not load a library that looks at standard input while a thread waits for it.
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     lock = threading.Lock()
 
     def send(kind: str, content: object) -> None:

@@ -8,7 +8,8 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -20,6 +21,8 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # where a disk is full, or broken
+# Names that Windows does not take, or takes for a device.
+_NOT_OF_WINDOWS = re.compile(r"""(?i)[<>:"|?*\0-\x1f]|[. ]$|^(con|prn|aux|nul|(com|lpt)[1-9]) *(\.|$)""")
 _UMASK = os.umask(0o077)
 os.umask(_UMASK)  # the only way to ask is to change it
 
@@ -46,7 +49,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         yield temporary
         if not (place.is_file() and place.stat().st_nlink > 1 and _filled(place, temporary)):
             _take_rights(temporary, place)
-            temporary.replace(place)
+            patiently(lambda: temporary.replace(place))
     except LangSplatError as error:  # which may name what is written: by the name that the user knows
         error.args = tuple(str(part).replace(str(temporary), str(target)) for part in error.args)
         raise
@@ -58,7 +61,23 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             raise
         raise OSError(cause.errno, cause.strerror, str(target)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(PermissionError):
+            patiently(lambda: temporary.unlink(missing_ok=True))
+
+
+def patiently(step: Callable[[], object]) -> None:
+    """Replace or remove a file; Windows refuses that as long as another program has it open.
+
+    A window that looks at a training's checkpoint has it for a moment, and so have scanners for viruses.
+    """
+    for wait in (0.05, 0.2, 0.8) if sys.platform == "win32" else ():
+        try:
+            step()
+        except PermissionError:
+            time.sleep(wait)
+        else:
+            return
+    step()
 
 
 def _take_rights(temporary: Path, place: Path) -> None:
@@ -170,6 +189,8 @@ def _checked(target: Path) -> int:
         folder = next((above for above in whole.parents if os.path.lexists(above)), Path(whole.anchor))
         for part in whole.relative_to(folder).parts:
             _mode(folder / part)  # whether the file system takes the name
+            if sys.platform == "win32" and _NOT_OF_WINDOWS.search(part):
+                raise OSError(errno.EINVAL, "no name on Windows")
     except UnicodeEncodeError:
         raise InputError(
             f"{shown(target)}: names here are {sys.getfilesystemencoding()} (language settings), which lacks "

@@ -20,7 +20,7 @@ from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainCo
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
 from langsplat_core.errors import STRICTNESS, FormatError, InputError
-from langsplat_core.io.files import atomic_path, check_output_folder, shown, write_json
+from langsplat_core.io.files import atomic_path, check_output_folder, patiently, shown, write_json
 from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.pipeline import language_field
@@ -295,8 +295,8 @@ def trained_gaussians(
     gaussians = trainer.train_radiance(capture, config.spending(budget), train, checkpoint, progress)
     write_ply(done, gaussians)
     with atomic_path(stated) as temporary:
-        temporary.write_text(digest_of(read_ply(done)))
-    checkpoint.unlink(missing_ok=True)
+        temporary.write_text(digest_of(read_ply(done)), encoding="utf-8")
+    patiently(lambda: checkpoint.unlink(missing_ok=True))
     return gaussians
 
 

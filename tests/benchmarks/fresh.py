@@ -39,7 +39,7 @@ def read(reader: str, path: Path) -> dict[str, Any]:
     start = time.perf_counter()
     arrays = _read_by_plyfile(path) if reader == "plyfile" else _read_by_ours(path)
     seconds, status = time.perf_counter() - start, Path("/proc/self/status")
-    highest = re.search(r"VmHWM:\s*(\d+) kB", status.read_text()) if status.exists() else None
+    highest = re.search(r"VmHWM:\s*(\d+) kB", status.read_text(encoding="utf-8")) if status.exists() else None
     peak = 1024 * int(highest[1]) if highest else None
     digest = hashlib.blake2b()
     for array in arrays:

@@ -5,14 +5,19 @@ python -m tests.support.processes FOLDER    runs `langsplat convert` for every F
 
 import base64
 import ctypes
+import errno
 import gc
+import importlib
 import json
 import os
+import pkgutil
+import re
 import resource
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -396,5 +401,76 @@ def killed_everywhere(work: Callable[[], int | None], folder: Path) -> Iterator[
             return
 
 
+# Windows, as far as it can be had here.
+
+LACKING = {
+    os: "chown fork geteuid getuid killpg link mkfifo posix_fallocate sched_getaffinity symlink uname",
+    signal: "SIGALRM SIGCHLD SIGHUP SIGKILL SIGPIPE SIGUSR1 alarm setitimer",
+}
+NO_NAME = re.compile(r"""(?i)[<>:"|?*\\]|[. ]$|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)""")
+
+
+def files_in_use() -> set[str]:
+    """The files that this process has open, or mapped into its memory."""
+    maps = Path("/proc/self/maps").read_text(encoding="utf-8").splitlines()
+    opened = (os.path.realpath(f"/proc/self/fd/{number}") for number in os.listdir("/proc/self/fd"))
+    return {line.split(maxsplit=5)[5] for line in maps if "/" in line} | set(opened)
+
+
+def as_on_windows() -> None:
+    """Take away, for the rest of this process, what Windows lacks; what is imported already keeps it.
+
+    What is open or mapped is neither replaced nor removed, and some names are refused.
+    """
+    sys.modules.update(dict.fromkeys(("fcntl", "grp", "pwd", "resource", "termios")))  # type: ignore[arg-type]
+    for module, names in LACKING.items():
+        for name in names.split():
+            delattr(module, name)
+    shutil._use_fd_functions = False  # type: ignore[attr-defined]  # noqa: SLF001  by opening folders
+    load, asking = ctypes.CDLL.__init__, threading.local()
+
+    def library(self: ctypes.CDLL, name: str | None, *options: Any, **others: Any) -> None:
+        assert name is not None, "Windows has no one C library"
+        load(self, name, *options, **others)
+
+    def refuse(event: str, given: tuple[Any, ...]) -> None:
+        if event not in STEPS or not isinstance(given[0], str | os.PathLike) or hasattr(asking, "on"):
+            return
+        asking.on = True  # what follows opens files too
+        ends = [os.path.realpath(end) for end in given[: 1 + (event == "os.rename")]]
+        in_use = event in ("os.rename", "os.remove") and files_in_use() & set(ends)
+        del asking.on
+        writes = event in ("os.rename", "os.mkdir") or (event == "open" and given[2] & os.O_CREAT)
+        if in_use or (writes and NO_NAME.search(os.path.basename(ends[-1]))):
+            raise PermissionError(errno.EACCES, "in use, or no name on Windows", ends[-1])
+        if ends[0].startswith(("/proc/", "/dev/shm/")):
+            raise FileNotFoundError(errno.ENOENT, "no such place on Windows", ends[0])
+
+    ctypes.CDLL.__init__ = library  # type: ignore[method-assign]
+    sys.addaudithook(refuse)
+
+
+def use_on_windows(folder: Path) -> None:
+    """Import every module of the program, then open, ask and save the bundled scene."""
+    importlib.import_module("torch")  # which would look for libraries of this system
+    as_on_windows()
+    for package in map(importlib.import_module, ("langsplat_core", "langsplat_viewer")):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            importlib.import_module(module.name)
+    sys.platform = "win32"
+    scene, saved, duck = ROOT / "assets" / "demo" / "scene.ply", folder / "s.ply", "duck: \u0160 \u2192"
+    assert run("doctor") == 0
+    for suffix in 2 * (".ply", ".sog"):
+        assert run("convert", scene, folder / f"s{suffix}") == 0
+    assert run("convert", scene, folder / "aux.ply") == 2
+    threading.Timer(
+        0.5, saved.with_suffix(".langsplat.safetensors").open("rb").close
+    ).start()  # another program
+    assert run("teach", saved, "--at", "412,230", "--name", duck) == 0
+    assert run("query", saved, duck, "blue gift") == 0
+    assert run("select", scene, "blue gift", "--out", folder / "gift.ply") == 0
+    assert run("export", folder / "gift.ply", folder / "gift.html") == 0
+
+
 if __name__ == "__main__":
-    _all(Path(sys.argv[1]))
+    use_on_windows(Path(sys.argv[2])) if "--as-on-windows" in sys.argv else _all(Path(sys.argv[1]))

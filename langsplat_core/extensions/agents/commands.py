@@ -80,7 +80,7 @@ def scene_files(place: Path) -> dict[str, Path]:
     """Searchable scenes by name: of a folder all of it, named by their path in it. InputError for none."""
     if not place.is_dir() or format_of(place) is not None:
         return {place.name: place}
-    found = {str(path.relative_to(place)): path for path in scenes_in(place)}
+    found = {path.relative_to(place).as_posix(): path for path in scenes_in(place)}
     if not found:
         raise InputError(f"{place}: no scene with a language field in it; `langsplat train` makes one")
     return found

@@ -109,7 +109,7 @@ def restart_peak() -> int | None:
     try:
         if trim is not None:
             trim(0)
-        _CLEAR.write_text("5")
+        _CLEAR.write_text("5", encoding="ascii")
     except OSError:
         return None
     return resident_memory()
@@ -117,7 +117,7 @@ def restart_peak() -> int | None:
 
 def _status(key: str) -> int | None:
     try:
-        found = re.search(rf"{key}:\s*(\d+) kB", _STATUS.read_text())
+        found = re.search(rf"{key}:\s*(\d+) kB", _STATUS.read_text(encoding="utf-8"))
     except OSError:
         return None
     return int(found[1]) * 1024 if found else None
@@ -259,7 +259,7 @@ def describe_machine() -> dict[str, object]:
 
 def _processor() -> str:
     info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
     named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(named, platform.processor() or platform.machine())
 

@@ -309,7 +309,8 @@ def load_checkpoint(path: Path, made_from: str, device: torch.device) -> Trainin
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name).to(device) for name in file.keys()}  # noqa: SIM118
+            # Copies: what is mapped into memory cannot be replaced on Windows.
+            tensors = {name: file.get_tensor(name).to(device, copy=True) for name in file.keys()}  # noqa: SIM118
         if metadata.get("kind") != KIND:
             raise ValueError(f"kind {metadata.get('kind')!r}")
         header = json.loads(metadata["state"])
