@@ -13,10 +13,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 import platformdirs
@@ -291,34 +292,48 @@ class TorchText:
     add around it (which side is padded, whether an end token is there) differs between its versions.
     """
 
-    def __init__(self, kind: Any, weights: Weights, config: Any, output: str, begin: str | None) -> None:
-        """kind: class of transformers; output: name of the vectors in what it returns.
+    def __init__(
+        self,
+        kind: Any,
+        weights: Weights,
+        config: Any,
+        output: str,
+        dim: int,
+        begin: str = "",
+        ends: bool = True,
+        padded: bool = False,
+    ) -> None:
+        """kind: class of transformers; output: name of the vectors in what it returns; dim: their length.
 
-        begin: token that every phrase begins with; without one, phrases are padded to the length of training.
+        begin: token that every phrase begins with, if one does; ends: whether a token ends it; padded:
+        whether it is padded to the length of training, instead of that of the longest phrase beside it.
         """
-        self.dim = int(config.projection_dim if begin else config.projection_size)
+        self.dim = dim
         self.temperature = TEMPERATURE
         self._device, self._output = weights.device, output
-        self._length = int(config.max_position_embeddings)
+        self._length, self._padded = int(config.max_position_embeddings), padded
         self._model: Any = models.load_model(kind, weights, config)
         self.tokenizer = _tokenizer(weights, int(config.vocab_size))
-        self._end = _special_token(weights, self.tokenizer, "eos_token", ("<|endoftext|>", "</s>", "<eos>"))
-        self._begin = [_special_token(weights, self.tokenizer, "bos_token", (begin,))] if begin else []
-        self._pad = 0 if begin else _special_token(weights, self.tokenizer, "pad_token", ("<pad>", "</s>"))
+        special = partial(_special_token, weights, self.tokenizer)
+        self._begin = [special("bos_token", (begin,))] if begin else []
+        self._end = [special("eos_token", ("<|endoftext|>", "</s>", "<eos>"))] if ends else []
+        own_pad = padded or not ends
+        self._pad = special("pad_token", ("<pad>", "</s>")) if own_pad else self._end[0]
 
     def encode(self, texts: list[str]) -> Array:
         import torch
 
         plain = [clean_text(text) for text in texts]
         found = self.tokenizer.encode_batch(plain, add_special_tokens=False)
-        rows = [[*self._begin, *row.ids, self._end] for row in found]
-        room = self._length - len(self._begin) - 1
+        rows = [[*self._begin, *row.ids, *self._end] for row in found]
+        room = self._length - len(self._begin) - len(self._end)
         for text, row in zip(plain, found, strict=True):
-            check_whole(text, row.ids, room, {self._end})
-        # What follows the end token of a CLIP is not seen by it.
-        length, pad = (max(map(len, rows)), self._end) if self._begin else (self._length, self._pad)
-        ids = torch.tensor([row + [pad] * (length - len(row)) for row in rows]).to(self._device)
-        return inferred(lambda: getattr(self._model(input_ids=ids), self._output))
+            check_whole(text, row.ids, room, {*self._end, self._pad})
+        # What follows the end token of a CLIP is not seen by it; without one, padding is masked.
+        length = self._length if self._padded else max(map(len, rows))
+        ids = torch.tensor([row + [self._pad] * (length - len(row)) for row in rows]).to(self._device)
+        mask = {} if self._end else {"attention_mask": (ids != self._pad).long()}
+        return inferred(lambda: getattr(self._model(input_ids=ids, **mask), self._output))
 
 
 def _tokenizer(weights: Weights, vocabulary: int) -> Any:
@@ -338,7 +353,8 @@ def _tokenizer(weights: Weights, vocabulary: int) -> Any:
         tokenizer.no_truncation()
         tokenizer.no_padding()
         tokenizer.encode(UNUSUAL, add_special_tokens=False)
-        most = max(tokenizer.get_vocab().values()) + 1
+        # Without those that T5 was trained to fill gaps with, which no phrase has.
+        most = 1 + max(n for token, n in tokenizer.get_vocab().items() if "<extra_id_" not in token)
         if most > vocabulary:
             raise ValueError(f"{most} tokens, its model knows {vocabulary}")
         return tokenizer
@@ -374,23 +390,24 @@ def clip_text(weights: Weights) -> TextTower:
 
 def torch_clip_text(weights: Weights) -> TorchText:
     """Return the text tower of a CLIP, by torch."""
+    from transformers import CLIPConfig
     from transformers import CLIPTextModelWithProjection as Model
 
-    return TorchText(Model, weights, _clip_config(weights, "text"), "text_embeds", "<|startoftext|>")
+    config = clip_config(CLIPConfig, weights, "text")
+    return TorchText(Model, weights, config, "text_embeds", config.projection_dim, "<|startoftext|>")
 
 
 def clip_images(weights: Weights) -> ImageTower:
     """Return the image tower of a CLIP, by torch."""
+    from transformers import CLIPConfig
     from transformers import CLIPVisionModelWithProjection as Model
 
-    return Images(Model, weights, _clip_config(weights, "vision"), "image_embeds", CLIP_PIXELS)
+    return Images(Model, weights, clip_config(CLIPConfig, weights, "vision"), "image_embeds", CLIP_PIXELS)
 
 
-def _clip_config(weights: Weights, tower: str) -> Any:
-    """Return the configuration of one tower, "text" or "vision", with its projection."""
-    from transformers import CLIPConfig
-
-    config = models.load_config(CLIPConfig, weights, "CLIP")
+def clip_config(kind: Any, weights: Weights, tower: Literal["text", "vision"]) -> Any:
+    """Return the configuration of one tower with its projection; kind: class of transformers for both."""
+    config = models.load_config(kind, weights, "CLIP")
     tower_config = getattr(config, f"{tower}_config")
     tower_config.projection_dim = config.projection_dim  # some files state it for the pair only
     return tower_config

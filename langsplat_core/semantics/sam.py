@@ -33,8 +33,8 @@ from langsplat_core.semantics.masks import (
 )
 from langsplat_core.semantics.weights import Weights
 
-PIXEL_MEAN = (123.675, 116.28, 103.53)  # ImageNet's, values 0..255; of every model here
-PIXEL_STD = (58.395, 57.12, 57.375)
+Statistics = tuple[tuple[float, float, float], tuple[float, float, float]]  # mean and deviation of pixels
+IMAGENET: Statistics = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)  # of values 0..255
 MASKS_PER_POINT = 3  # masks per point
 
 
@@ -92,34 +92,38 @@ def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
     return ious[points, order], logits[points, order]
 
 
-def normalised(image: Array, side: int, padded: bool) -> tuple[Array, tuple[int, int]]:
+def normalised(
+    image: Array, side: int, padded: bool, statistics: Statistics = IMAGENET
+) -> tuple[Array, tuple[int, int]]:
     """Return (1, 3, side, side) float32 of (H, W, 3) uint8, and the (height, width) of the image in it.
 
     It is stretched to the square, or with `padded` its longer side is, with zeros to the right and below.
     """
+    mean, deviation = statistics
     height, width = image.shape[:2]
     scale = side / max(height, width)
     size = (max(1, int(height * scale + 0.5)), max(1, int(width * scale + 0.5))) if padded else (side, side)
     resized = Image.fromarray(image).resize((size[1], size[0]), Image.Resampling.BILINEAR)
     pixels = np.zeros((side, side, 3), np.float32)
-    pixels[: size[0], : size[1]] = (np.asarray(resized, np.float32) - PIXEL_MEAN) / PIXEL_STD
+    pixels[: size[0], : size[1]] = (np.asarray(resized, np.float32) - mean) / deviation
     return np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]), size
 
 
 @dataclass(frozen=True)
 class Sam:
-    """Segment Anything (Kirillov et al. 2023), and SAM 2 and 2.1 (Ravi et al. 2024) on single images."""
+    """Segment Anything (Kirillov et al. 2023), SAM 2, 2.1 and 3 (Ravi et al. 2024, Carion et al. 2025)."""
 
     name: str
     model: Any  # a transformers model
     side: int  # of the images it takes, px
     ordered: bool  # SAM: images are padded, and its three masks of a point are subpart, part and whole
+    statistics: Statistics = IMAGENET
 
     @models.asking_errors("the segmenter")
     def encode(self, image: Array) -> EncodedImage:
         import torch
 
-        pixels, size = normalised(image, self.side, padded=self.ordered)
+        pixels, size = normalised(image, self.side, self.ordered, self.statistics)
         given = torch.from_numpy(pixels).to(self.model.device)
         seen = {"image_embeddings": self.model.get_image_embeddings(given)}
         inside = size if self.ordered else None

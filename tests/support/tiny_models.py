@@ -11,22 +11,30 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
+from safetensors.torch import save_file
 from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors
 from transformers import (
     CLIPConfig,
     CLIPModel,
     CLIPTokenizer,
+    MetaClip2Config,
+    MetaClip2Model,
     Sam2Config,
     Sam2HieraDetConfig,
     Sam2Model,
     Sam2VideoConfig,
     Sam2VideoModel,
     Sam2VisionConfig,
+    Sam3VideoConfig,
+    Sam3VideoModel,
     SamConfig,
     SamModel,
     Siglip2Tokenizer,
     SiglipConfig,
     SiglipModel,
+    Tipsv2Config,
+    Tipsv2Model,
+    Tipsv2Tokenizer,
 )
 
 from langsplat_core.config import (
@@ -92,14 +100,15 @@ def tiny_clip(folder: Path, half: bool = False) -> CLIPModel:
     return _saved(CLIPModel, config, folder, 0, lambda model: model.half() if half else None).float()
 
 
-def unigram_tokenizer(folder: Path) -> int:
+def unigram_tokenizer(folder: Path, template: str = "$A </s>") -> int:
     """SigLIP's: SentencePiece unigram, end and padding in one token; returns the size of its vocabulary."""
     pieces = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", -9.0), ("▁", -2.0), ("▁red", -1.0), ("▁mug", -1.0)]
-    pieces += [(letter, -3.0) for letter in ascii_lowercase]
+    pieces += [(letter, -3.0) for letter in ascii_lowercase] + [("<s>", 0.0)]
     tokenizer = Tokenizer(models.Unigram(pieces, unk_id=2, byte_fallback=False))
     tokenizer.normalizer = normalizers.Lowercase()
     tokenizer.pre_tokenizer = pre_tokenizers.Metaspace()
-    tokenizer.post_processor = processors.TemplateProcessing("$A </s>", special_tokens=[("</s>", 1)])
+    ends = [("</s>", 1), ("<s>", len(pieces) - 1)]
+    tokenizer.post_processor = processors.TemplateProcessing(template, special_tokens=ends)
     folder.mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(folder / "tokenizer.json"))
     stated = {"tokenizer_class": "SiglipTokenizer", "eos_token": "</s>", "model_max_length": 64}
@@ -135,6 +144,26 @@ def tiny_siglip(folder: Path, second: bool = False) -> SiglipModel:
         model.logit_bias.fill_(BIAS)
 
     return _saved(SiglipModel, config, folder, 3, scaled)
+
+
+def tiny_metaclip2(folder: Path, template: str = "<s> $A </s>") -> MetaClip2Model:
+    """A MetaCLIP 2 with XLM-V's marks around a phrase, or those of another `template`, as mT5's."""
+    text = TOWER | {"vocab_size": unigram_tokenizer(folder, template), "max_position_embeddings": LENGTH}
+    vision = TOWER | {"image_size": SIDE, "patch_size": 8}
+    config = MetaClip2Config(text_config=text | {"eos_token_id": 1}, vision_config=vision, projection_dim=24)
+    return _saved(MetaClip2Model, config, folder, 6, lambda model: None)
+
+
+def tiny_tipsv2(folder: Path) -> Tipsv2Model:
+    """A TIPS v2, whose phrases have no token at either end."""
+    pieces = ["<pad>", "<unk>", "▁", *ascii_lowercase, "re", "red"]
+    vocabulary = {piece: i for i, piece in enumerate(pieces)}
+    Tipsv2Tokenizer(vocab=vocabulary, merges=[("r", "e"), ("re", "d")]).save_pretrained(folder)
+    config = Tipsv2Config(
+        text_config=TOWER | {"vocab_size": len(pieces), "max_position_embeddings": LENGTH},
+        vision_config=TOWER | {"image_size": SIDE, "patch_size": 8},
+    )
+    return _saved(Tipsv2Model, config, folder, 7, lambda model: None)
 
 
 # -- segmenters, which answer every point differently --------------------------------------------------------
@@ -190,24 +219,47 @@ def tiny_sam2(folder: Path, decoder_heads: int = 2) -> Sam2Model:
     return _saved(Sam2Model, config, folder, 4, _tell_points_apart)
 
 
+MEMORY: dict[str, Any] = {
+    **{f"memory_attention_{name}": 16 for name in ("hidden_size", "feed_forward_hidden_size")},
+    **{f"memory_{name}": 16 for name in ("encoder_hidden_size", "fuser_embed_dim", "fuser_intermediate_dim")},
+    "memory_attention_num_layers": 1,
+    "memory_attention_rope_feat_sizes": [4, 4],
+    "memory_encoder_output_channels": 4,
+    "mask_downsampler_embed_dim": 16,
+    "image_size": SAM_SIDE,
+}
+
+
 def tiny_sam2_video(folder: Path) -> Sam2VideoModel:
     """The same with the memory of the video model, as the hub has SAM 2.1."""
     config = Sam2VideoConfig(
-        vision_config=_sam2_vision(),
-        prompt_encoder_config=PROMPTS,
-        mask_decoder_config=DECODER,
-        image_size=SAM_SIDE,
-        memory_attention_hidden_size=16,
-        memory_attention_num_layers=1,
-        memory_attention_feed_forward_hidden_size=16,
-        memory_attention_rope_feat_sizes=[4, 4],
-        memory_encoder_hidden_size=16,
-        memory_encoder_output_channels=4,
-        mask_downsampler_embed_dim=16,
-        memory_fuser_embed_dim=16,
-        memory_fuser_intermediate_dim=16,
+        vision_config=_sam2_vision(), prompt_encoder_config=PROMPTS, mask_decoder_config=DECODER, **MEMORY
     )
     return _saved(Sam2VideoModel, config, folder, 4, _tell_points_apart)
+
+
+def tiny_sam3(folder: Path) -> Sam3VideoModel:
+    """The whole of a SAM 3, as the hub has it: a detector, and a tracker with a neck of its own."""
+    encoder = TOWER | {"image_size": SAM_SIDE, "patch_size": 16, "window_size": 2, "global_attn_indexes": [1]}
+    vision = {
+        "backbone_config": encoder | {"model_type": "sam3_vit_model", "pretrain_image_size": SAM_SIDE // 2},
+        "backbone_feature_sizes": [[SAM_SIDE // part] * 2 for part in (4, 8, 16)],
+        "fpn_hidden_size": 16,
+    }
+    layer = {"hidden_size": 16, "num_attention_heads": 2, "num_layers": 1, "intermediate_size": 16}
+    parts = ("geometry_encoder_config", "detr_encoder_config", "detr_decoder_config", "mask_decoder_config")
+    text = TOWER | {"vocab_size": 9, "max_position_embeddings": 8}
+    detector = {"vision_config": vision, "text_config": text} | dict.fromkeys(parts, layer)
+    tracker = MEMORY | {"prompt_encoder_config": PROMPTS, "mask_decoder_config": DECODER}
+    config = Sam3VideoConfig(detector_config=detector, tracker_config=tracker | {"vision_config": vision})
+    torch.manual_seed(8)
+    model = Sam3VideoModel(config).eval()
+    with torch.no_grad():
+        _tell_points_apart(model.tracker_model)
+        model.tracker_model.no_memory_embedding.normal_()
+    config.save_pretrained(folder)  # save_pretrained of the model names what is the tracker's otherwise
+    save_file(model.state_dict(), folder / "model.safetensors", {"format": "pt"})
+    return model
 
 
 def _tell_points_apart(model: Any) -> None:

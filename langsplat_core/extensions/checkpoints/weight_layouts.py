@@ -1,6 +1,7 @@
-"""Weights in the layouts of open_clip, OpenAI, segment_anything and sam2; and the encoders of SigLIP.
+"""Weights in other layouts than Hugging Face's, and the models that transformers has beside CLIP and SAM.
 
-Tensors of other layouts are renamed to those of transformers.
+Tensors in the layouts of open_clip, OpenAI, segment_anything and sam2 are renamed to those of transformers.
+The models are SigLIP, MetaCLIP 2, TIPS v2 and SAM 3, in the classes of transformers.
 
 What a model is made of follows from the shapes of its tensors; an open_clip_config.json beside them says
 what shapes do not: the heads, and which GELU. Without one, CLIP's heads are 64 wide, those for images at
@@ -24,12 +25,22 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError
-from langsplat_core.semantics.encoders import Family, Images, ImageTower, TorchText, clean_text
+from langsplat_core.semantics.encoders import (
+    CLIP_PIXELS,
+    Family,
+    Images,
+    ImageTower,
+    TorchText,
+    clean_text,
+    clip_config,
+)
+from langsplat_core.semantics.sam import Sam
 from langsplat_core.semantics.weights import (
     OPEN_CLIP_CONFIG,
     Converted,
     Weights,
     load_config,
+    load_model,
     loading_errors,
     weight_files,
 )
@@ -41,6 +52,10 @@ Names = tuple[tuple[str, str], ...]  # patterns of another layout's names, and w
 MOBILE_SAM = (
     "a MobileSAM, whose encoder TinyViT transformers does not have; pass sam_vit_b_01ec64.pth in its place, "
     "or for speed sam2.1_hiera_tiny.pt"
+)
+TIMM = (
+    "its image tower is one of timm's, as those of PE-Core and MobileCLIP, which transformers does not have; "
+    "pass facebook/metaclip-2-worldwide-b16 in its place, or for speed google/siglip2-base-patch16-224"
 )
 HEAD_WIDTH, MOST_HEADS = 64, 16
 SAM_HEADS = 8  # of the mask decoder, which no shape tells
@@ -80,6 +95,7 @@ SAME = {
     "context_length": "max_position_embeddings", "width": "hidden_size", "layers": "num_hidden_layers",
     "image_size": "image_size", "patch_size": "patch_size", "vocab_size": "vocab_size",
 }  # fmt: skip
+WORLDWIDE = ("pool_type", "eos_id", "hf_tokenizer_name")  # of a MetaCLIP 2; its tokenizer.json says them too
 # What other settings may be without any effect.
 USUAL: tuple[object, ...] = (None, False, 0, "", {}, "tok", "argmax", "linear")
 
@@ -154,6 +170,8 @@ def converted(
             return Converted(_sam2_config(own, sizes, side), _sam2_tensors(own), {})
         if "image_encoder.patch_embed.seq.0.c.weight" in tensors:
             raise EncoderError(f"{id}: {MOBILE_SAM}")
+        if any(name.startswith("visual.trunk.") for name in tensors):
+            raise EncoderError(f"{id}: {TIMM}")
         return _clip(file, tensors) if "visual.class_embedding" in tensors else None
 
 
@@ -193,6 +211,9 @@ def _clip(file: Path, tensors: Tensors) -> Converted:
     config = _clip_config(tensors)
     if stated:
         model = stated["model_cfg"]
+        if model["text_cfg"].get("pool_type") == "eos":
+            config["model_type"] = "metaclip_2"
+            model["text_cfg"] = {k: value for k, value in model["text_cfg"].items() if k not in WORLDWIDE}
         _check(model, config)
         quick = bool(model.get("quick_gelu", False))
         config["vision_config"]["num_attention_heads"] = config["vision_config"]["hidden_size"] // int(
@@ -430,7 +451,8 @@ class SiglipText(TorchText):
     def __init__(self, weights: Weights) -> None:
         from transformers import SiglipTextModel as Model
 
-        super().__init__(Model, weights, _siglip_config(weights).text_config, "pooler_output", None)
+        config = _siglip_config(weights).text_config
+        super().__init__(Model, weights, config, "pooler_output", config.projection_size, padded=True)
         scale = _read_scalar(weights, "logit_scale")
         if not math.isfinite(scale):
             raise EncoderError(f"{weights.id}: not SigLIP weights: logit_scale is not in them")
@@ -475,3 +497,85 @@ def _read_scalar(weights: Weights, name: str) -> float:
 
 
 SIGLIP = Family(SiglipText, siglip_images)
+
+
+# MetaCLIP 2 (Chuang et al. 2025): a CLIP of 300 languages, with the tokenizer of XLM-V or mT5.
+
+
+class MetaClip2Text(TorchText):
+    """The text tower of a MetaCLIP 2, by torch."""
+
+    def __init__(self, weights: Weights) -> None:
+        from transformers import MetaClip2Config
+        from transformers import MetaClip2TextModelWithProjection as Model
+
+        config = clip_config(MetaClip2Config, weights, "text")
+        super().__init__(Model, weights, config, "text_embeds", config.projection_dim)
+        # XLM-V's marks where a phrase begins, mT5's only where it ends; the file says which.
+        self._begin = self.tokenizer.encode("").ids[:-1]
+        self._model.text_model.eos_token_id = self._end[0]  # a CLIP's where config.json states none
+
+
+def metaclip2_images(weights: Weights) -> ImageTower:
+    """Return the image tower of a MetaCLIP 2, by torch."""
+    from transformers import MetaClip2Config
+    from transformers import MetaClip2VisionModelWithProjection as Model
+
+    return Images(
+        Model, weights, clip_config(MetaClip2Config, weights, "vision"), "image_embeds", CLIP_PIXELS
+    )
+
+
+METACLIP2 = Family(MetaClip2Text, metaclip2_images)
+
+
+# TIPS v2 (Cao et al. 2026): patches of an image have vectors in the space of phrases, too.
+
+
+class Tipsv2Text(TorchText):
+    """The text tower of a TIPS v2, by torch: phrases without a token at either end."""
+
+    def __init__(self, weights: Weights) -> None:
+        from transformers import Tipsv2Config
+        from transformers import Tipsv2TextModel as Model
+
+        both = load_config(Tipsv2Config, weights, "TIPS v2")
+        config = both.text_config
+        super().__init__(Model, weights, config, "pooler_output", config.hidden_size, ends=False)
+        # Published files state it by the first name, and transformers knows the second.
+        self.temperature = SHARE_OF_SCALE / float(getattr(both, "temperature", both.temperature_init_value))
+
+    def encode(self, texts: list[str]) -> Array:
+        """Encode texts in lower case, as all of its training were."""
+        return super().encode([text.lower() for text in texts])
+
+
+def tipsv2_images(weights: Weights) -> ImageTower:
+    """Return the image tower of a TIPS v2, by torch; its pixels are not normalised."""
+    from transformers import Tipsv2Config
+    from transformers import Tipsv2VisionModel as Model
+
+    config = load_config(Tipsv2Config, weights, "TIPS v2").vision_config
+    return Images(Model, weights, config, "pooler_output", np.array([(0.0,) * 3, (1.0,) * 3]))
+
+
+TIPSV2 = Family(Tipsv2Text, tipsv2_images)
+
+
+# SAM 3 (Carion et al. 2025): the tracker, which is asked at points as a SAM 2.
+
+
+def load_sam3(weights: Weights) -> Sam:
+    """Load the half of a SAM 3 that answers points; the hub's files are of the whole model for films."""
+    from transformers import Sam3TrackerConfig, Sam3TrackerModel
+
+    config = load_config(Sam3TrackerConfig, weights, "SAM 3")
+    if hasattr(config, "tracker_config"):  # the encoder is the detector's, and its settings are stated there
+        vision = {"vision_config": config.detector_config["vision_config"]}
+        config = Sam3TrackerConfig(**config.tracker_config | vision)
+    model = load_model(Sam3TrackerModel, weights, config)
+    # The coarsest map is the detector's alone: transformers would add what stands for no memory to the last.
+    neck = model.vision_encoder.neck
+    neck.fpn_layers = neck.fpn_layers[: len(model.backbone_feature_sizes)]
+    side = int(model.config.prompt_encoder_config.image_size)
+    return Sam("SAM 3", model, side, ordered=False, statistics=((127.5,) * 3, (127.5,) * 3))

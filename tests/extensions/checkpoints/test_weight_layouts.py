@@ -7,6 +7,7 @@ import json
 import re
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Any
@@ -14,14 +15,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file, save_file
 from torch import Tensor
-from transformers import CLIPConfig, CLIPModel, CLIPTokenizer, PreTrainedTokenizerFast, Siglip2Tokenizer
+from transformers import (
+    CLIPConfig,
+    CLIPModel,
+    CLIPTokenizer,
+    PreTrainedTokenizerFast,
+    Siglip2Tokenizer,
+    Tipsv2Tokenizer,
+)
 
 from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.extensions.checkpoints.weight_layouts import Hiera, converted
-from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
+from langsplat_core.semantics.encoders import CLIP_PIXELS, load_encoder, load_text_encoder
 from langsplat_core.semantics.sam import FAMILIES, Segmenter, load_segmenter
 from langsplat_core.semantics.weights import Weights
 from tests.support.tiny_models import (
@@ -29,9 +38,13 @@ from tests.support.tiny_models import (
     SAM_SIDE,
     SCALE,
     MakesFolder,
+    tiny_clip,
+    tiny_metaclip2,
     tiny_sam,
     tiny_sam2,
+    tiny_sam3,
     tiny_siglip,
+    tiny_tipsv2,
 )
 
 pytestmark = pytest.mark.long
@@ -182,11 +195,11 @@ def crops() -> np.ndarray:
     return np.random.default_rng(2).integers(0, 256, (3, SIDE, SIDE, 3), dtype=np.uint8)
 
 
-def with_config(folder: Path, heads: int, head_width: int, quick: bool) -> Any:
+def with_config(folder: Path, heads: int, head_width: int, quick: bool, **more: object) -> Any:
     """Write the open_clip_config.json of `open_clip_tensors`."""
     half = {"width": 128, "layers": 2}
     vision = half | {"image_size": SIDE, "patch_size": PATCH, "head_width": head_width}
-    text = half | {"context_length": CONTEXT, "vocab_size": len(TOKENS), "heads": heads}
+    text = half | {"context_length": CONTEXT, "vocab_size": len(TOKENS), "heads": heads} | more
     model = {"embed_dim": SIZE, "quick_gelu": quick, "vision_cfg": vision, "text_cfg": text}
     pixels = {"mean": [0.5, 0.4, 0.3], "std": [0.2, 0.3, 0.25]}
     config = {"model_cfg": model, "preprocess_cfg": pixels}
@@ -205,6 +218,12 @@ def hub_folder_of_safetensors(folder: Path, tensors: Tensors) -> Case:
         folder / "open_clip_model.safetensors",
     )
     return folder, 2, 4, True, with_config(folder, 4, 64, quick=True)
+
+
+def worldwide(folder: Path, tensors: Tensors) -> Case:
+    torch.save(tensors, folder / "open_clip_pytorch_model.bin")
+    more = {"pool_type": "eos", "eos_id": END, "hf_tokenizer_name": "facebook/xlm-v-base"}
+    return folder, 2, 4, False, with_config(folder, 4, 64, quick=False, **more)
 
 
 def text_apart(folder: Path, tensors: Tensors) -> Case:
@@ -238,7 +257,7 @@ def openai_state(folder: Path, tensors: Tensors) -> Case:
 
 
 LAYOUTS = [
-    *(hub_folder, hub_folder_of_safetensors, text_apart),
+    *(hub_folder, hub_folder_of_safetensors, text_apart, worldwide),
     *(training_checkpoint, quick_by_name, openai_state),
 ]
 
@@ -408,39 +427,44 @@ def test_a_file_of_a_segmenter_answers_as_the_folder_does(name: str, tmp_path: P
     assert (masks[0] - masks[1]).abs().max() > 0.01
 
 
-# SigLIP and SigLIP 2.
+# CLIP, SigLIP, MetaCLIP 2 and TIPS v2 against the whole models of transformers.
 
 
-def padded_ids(tokenizer: Any, phrases: list[str]) -> torch.Tensor:
-    """As the model's own pages say: padding="max_length", and no attention mask."""
-    found = tokenizer(phrases, padding="max_length", max_length=LENGTH, truncation=True, return_tensors="pt")
-    return found.input_ids
+def plain_tokenizer(folder: Path) -> Any:
+    return PreTrainedTokenizerFast(tokenizer_file=str(folder / "tokenizer.json"), pad_token="</s>")
 
 
-def test_texts_agree_with_the_whole_siglip(tmp_path: Path) -> None:
-    model = tiny_siglip(tmp_path)
-    phrases = ["red mug", "red", "a red mug with a very long handle"]
-    written = str(tmp_path / "tokenizer.json")
-    tokenizer = PreTrainedTokenizerFast(tokenizer_file=written, pad_token="</s>", eos_token="</s>")
-    ids = padded_ids(tokenizer, phrases)
-    assert ids.shape == (3, LENGTH)
-    assert ids[0].tolist() == [4, 5] + [1] * (LENGTH - 2)  # end and padding are one token
-    want = unit(model.get_text_features(input_ids=ids).pooler_output.detach().numpy())
-    got = load_text_encoder(str(tmp_path)).encode_texts(phrases)
-    assert got.dtype == np.float32
-    np.testing.assert_allclose(got, want, atol=2e-6)
-    one_by_one = np.concatenate([load_text_encoder(str(tmp_path)).encode_texts([p]) for p in phrases])
-    np.testing.assert_allclose(got, one_by_one, atol=2e-6)  # a phrase does not depend on its neighbours
+HALVES, CLIPS = ((0.5,) * 3, (0.5,) * 3), tuple(CLIP_PIXELS)
+WHOLE: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], Any]] = {
+    "clip": (tiny_clip, CLIPTokenizer.from_pretrained, CLIPS),
+    "siglip": (tiny_siglip, plain_tokenizer, HALVES),
+    "siglip 2": (partial(tiny_siglip, second=True), Siglip2Tokenizer.from_pretrained, HALVES),
+    "metaclip 2": (tiny_metaclip2, plain_tokenizer, CLIPS),
+    "metaclip 2 of mT5": (partial(tiny_metaclip2, template="$A </s>"), plain_tokenizer, CLIPS),
+    "tips v2": (tiny_tipsv2, Tipsv2Tokenizer.from_pretrained, ((0,) * 3, (1,) * 3)),
+}
 
 
-def test_texts_agree_with_the_whole_siglip_2(tmp_path: Path) -> None:
-    model = tiny_siglip(tmp_path, second=True)
-    phrases = ["Red mug", "red", "a red mug, with a very long handle"]
-    ids = padded_ids(Siglip2Tokenizer.from_pretrained(tmp_path), phrases)
-    assert ids[1].tolist()[1:] == [1] + [0] * (LENGTH - 2)  # an end, then padding to the right
-    want = unit(model.get_text_features(input_ids=ids).pooler_output.detach().numpy())
-    got = load_text_encoder(str(tmp_path)).encode_texts(phrases)
-    np.testing.assert_allclose(got, want, atol=2e-6)
+@pytest.mark.parametrize("family", WHOLE)
+def test_vectors_agree_with_the_whole_model(family: str, tmp_path: Path) -> None:
+    make, tokenizer, (mean, deviation) = WHOLE[family]
+    model, encoder = make(tmp_path), load_encoder(str(tmp_path), "cpu", batch=2)
+    phrases = ["Red mug", "red", "a red mug with a very long handle"]
+    padded = tokenizer(tmp_path)(phrases, padding="max_length", max_length=LENGTH, return_tensors="pt")
+    assert padded.input_ids.shape == (3, LENGTH)
+    asked = {"attention_mask": padded.attention_mask} if family == "tips v2" else {}
+    texts = model.get_text_features(input_ids=padded.input_ids, **asked).pooler_output
+    pictures = np.random.default_rng(0).integers(0, 256, (5, SIDE, SIDE, 3)).astype(np.uint8)
+    pixels = ((pictures / 255 - mean) / deviation).transpose(0, 3, 1, 2).astype(np.float32)
+    images = model.get_image_features(pixel_values=torch.from_numpy(pixels)).pooler_output
+    assert (encoder.dim, encoder.image_size, encoder.id) == (texts.shape[1], SIDE, str(tmp_path))
+    np.testing.assert_allclose(encoder.encode_images(pictures), unit(images.detach().numpy()), atol=2e-6)
+    read = load_text_encoder(str(tmp_path))
+    one_by_one = [read.encode_texts([phrase])[0] for phrase in phrases]  # none depends on its neighbours
+    for got in (encoder.encode_texts(phrases), np.stack(one_by_one)):
+        assert got.dtype == np.float32
+        np.testing.assert_allclose(got, unit(texts.detach().numpy()), atol=2e-6)
+    assert abs(got[0] - got[1]).max() > 1e-3
 
 
 @pytest.mark.parametrize("second", [False, True])
@@ -454,16 +478,6 @@ def test_siglip_reads_no_case_and_only_its_second_punctuation(second: bool, tmp_
         assert read.temperature == pytest.approx(SCALE / 10)  # a tenth of the learned scale
 
 
-def test_images_agree_with_the_whole_siglip(tmp_path: Path) -> None:
-    model = tiny_siglip(tmp_path)
-    pictures = np.random.default_rng(0).integers(0, 256, (5, SIDE, SIDE, 3)).astype(np.uint8)
-    encoder = load_encoder(str(tmp_path), "cpu", batch=2)
-    assert (encoder.dim, encoder.image_size, encoder.id) == (32, SIDE, str(tmp_path))
-    pixels = torch.from_numpy((pictures / 127.5 - 1).transpose(0, 3, 1, 2).astype(np.float32))
-    want = unit(model.get_image_features(pixel_values=pixels).pooler_output.detach().numpy())
-    np.testing.assert_allclose(encoder.encode_images(pictures), want, atol=2e-6)
-
-
 def test_siglip_without_its_scale_is_refused(tmp_path: Path) -> None:
     tiny_siglip(tmp_path)
     state = load_file(tmp_path / "model.safetensors")
@@ -471,3 +485,26 @@ def test_siglip_without_its_scale_is_refused(tmp_path: Path) -> None:
     save_file(state, tmp_path / "model.safetensors", {"format": "pt"})
     with pytest.raises(EncoderError, match="logit_scale is not in them"):
         load_text_encoder(str(tmp_path))
+
+
+def test_sam_3_sees_images_as_its_tracker_does(tmp_path: Path) -> None:
+    model, image = tiny_sam3(tmp_path), crops()[0]
+    square = np.asarray(Image.fromarray(image).resize((SAM_SIDE, SAM_SIDE), Image.Resampling.BILINEAR))
+    pixels = torch.from_numpy((square / 127.5 - 1).transpose(2, 0, 1)[None].astype(np.float32))
+    with torch.inference_mode():
+        encoded = load_segmenter(str(tmp_path), "cpu").encode(image)
+        seen = model.detector_model.vision_encoder(pixels)
+        *fine, last = model.get_vision_features_for_tracker(seen)[0]
+        want = [*fine, last + model.tracker_model.no_memory_embedding]
+        ious, logits = encoded.masks_at(np.array([[5, 7], [30, 20]], np.float32))
+    for got, map in zip(encoded.seen["image_embeddings"], want, strict=True):
+        torch.testing.assert_close(got.flatten(2).permute(2, 0, 1), map, rtol=1e-5, atol=1e-5)
+    assert ious.shape == (2, 3)
+    areas = (logits > 0).flatten(2).sum(2)
+    assert (areas[:, :-1] <= areas[:, 1:]).all()
+    assert (logits[0] - logits[1]).abs().max() > 0.01
+
+
+def test_towers_of_timm_are_refused_with_another_model(tmp_path: Path) -> None:
+    torch.save({"visual.trunk.stem.weight": torch.zeros(3)}, tmp_path / "PE-Core-B-16.bin")
+    assert "pass facebook/metaclip-2" in refusal(load_encoder, tmp_path / "PE-Core-B-16.bin")
