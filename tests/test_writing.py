@@ -203,8 +203,6 @@ WRITERS: dict[str, Write] = {
     "picture": lambda folder: save_png(
         folder / "p.png", np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)
     ),
-    "film .gif": film("film.gif"),
-    "film .webp": film("film.webp"),
     "film .mp4": film("film.mp4"),
     "pictures of a film": film("film"),
     "camera path": flight,

@@ -347,7 +347,7 @@ SYNONYMS = {
     "export: map for a robot ...": "occupancy ros navigation voxels collider",
     "export: labels ...": "segmentation classes instances annotations",
     "make the path a turn around the view's centre": "turntable orbit spin rotate 360 film",
-    "save a film of the path": "video movie mp4 gif webp animation export record render",
+    "save a film of the path": "video movie mp4 animation export record render",
     "quit": "exit close leave end",
     "search": "find query ask phrase text words language where",
     "remove all queries": "clear reset delete search results answers",

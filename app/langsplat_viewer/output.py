@@ -1,4 +1,4 @@
-"""Images and films as files: PNG; MP4 by PyAV, animated WebP and GIF, or a folder of images.
+"""Images and films as files: PNG; MP4 by PyAV, or a folder of images.
 
 A file is written whole or not at all. A folder is filled image by image.
 """
@@ -27,7 +27,7 @@ from langsplat_viewer.camera.flight import Flight, camera_of, frame_times
 from langsplat_viewer.rendering.renderer import Backend, Renderer, open_renderer
 from langsplat_viewer.rendering.request import RenderRequest, why_nothing
 
-VIDEO, ANIMATIONS = ".mp4", (".webp", ".gif")
+VIDEO = ".mp4"
 SETTINGS = "film.json"  # in a folder of images: how many, and how fast
 FRAME = re.compile(r"frame-\d{5,}\.png")
 MOST_FRAMES = 100_000
@@ -80,7 +80,7 @@ Draw = Callable[[int], Array]  # (H, W, 3) uint8 image by its number from 0
 class Film:
     """A film to be written."""
 
-    out: Path  # .mp4, .webp or .gif; else a folder
+    out: Path  # .mp4, else a folder
     count: int  # images
     size: tuple[int, int]  # width and height, pixels
     fps: float
@@ -112,11 +112,11 @@ def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
         check_output_folder(out)
         _check_own(out)
         return out
-    if out.suffix.lower() not in (VIDEO, *ANIMATIONS):
-        raise InputError(f"--out {out}: a film is .mp4, .webp, .gif, or a folder of pictures")
-    if out.suffix.lower() == VIDEO and not has_video():
+    if out.suffix.lower() != VIDEO:
+        raise InputError(f"--out {out}: a film is .mp4, or a folder of pictures")
+    if not has_video():
         return check_film(out.with_suffix(""), None)
-    if out.suffix.lower() == VIDEO and size is not None and (size[0] % 2 or size[1] % 2):
+    if size is not None and (size[0] % 2 or size[1] % 2):
         even = "x".join(str(max(side - side % 2, 2)) for side in size)
         raise InputError(f"--size: the sides of a video are even numbers; choose {even}")
     check_output_file(out)
@@ -134,17 +134,14 @@ def _check_own(folder: Path) -> None:
 def write_film(film: Film, draw: Draw) -> None:
     """Draw and write all images.
 
-    Raises InputError where the library of the format fails, OSError where nothing can be written, and what
+    Raises InputError where PyAV fails, OSError where nothing can be written, and what
     `draw` does; a file is then as it was before.
     """
     if is_folder(film.out):
         _write_folder(film, draw)
         return
     with atomic_path(film.out) as temporary:
-        if film.out.suffix.lower() == VIDEO:
-            _write_video(film, draw, temporary)
-        else:
-            _write_animation(film, draw, temporary)
+        _write_video(film, draw, temporary)
 
 
 def _write_folder(film: Film, draw: Draw) -> None:
@@ -158,19 +155,6 @@ def _write_folder(film: Film, draw: Draw) -> None:
             for path in filter(lambda path: FRAME.fullmatch(path.name), list(film.out.iterdir())):
                 path.unlink()
         save_png(film.out / frame_name(number), image)
-
-
-def _write_animation(film: Film, draw: Draw, path: Path) -> None:
-    images = (Image.fromarray(draw(number)) for number in range(film.count))
-    kind = film.out.suffix[1:].upper()
-    options = {"save_all": True, "append_images": images, "duration": 1000 / film.fps, "loop": 0}
-    if kind == "WEBP":
-        options |= {"quality": 85, "duration": max(round(1000 / film.fps), 1)}
-    try:
-        next(images).save(path, format=kind, **options)
-    except (ValueError, KeyError, SystemError) as error:
-        reason = printable_line(error, 120)
-        raise InputError(f"{film.out}: {kind} cannot hold this film ({reason}); use .mp4") from None
 
 
 def _write_video(film: Film, draw: Draw, path: Path) -> None:

@@ -78,7 +78,7 @@ LOOKED_FOR = {
     "open a scene ...": "load import file browse", "start page": "home welcome recent demo close",
     "train a scene": "photos colmap reconstruct", "save a picture": "screenshot png image snapshot",
     "export: web page ...": "html browser share website", "export: mesh ...": "triangles glb",
-    "save a film of the path": "video mp4 gif movie", "export the selection ...": "extract cut",
+    "save a film of the path": "video mp4 movie", "export the selection ...": "extract cut",
     "reset the layout": "reset default restore", "delete the selection": "crop erase remove",
     "compare two displays": "split side wipe", "hide or show the panels": "fullscreen clean sidebar",
     "panel: Display": "background settings brightness", "larger text": "font bigger zoom",

@@ -185,8 +185,7 @@ def draw_record(viewer: Viewer) -> None:
     rates = {fps: f"{fps:g}" for fps in (10.0, 24.0, 25.0, 30.0, 60.0)}
     settings.put(record, fps=ui.choice(rates, record.fps))
     imgui.set_next_item_width(-1)
-    hint = "film.mp4, .webp, .gif or a folder"
-    _, typed = imgui.input_text_with_hint("##film", hint, record.film_file)
+    _, typed = imgui.input_text_with_hint("##film", "film.mp4 or a folder", record.film_file)
     ui.tip("Where the film goes; empty: a new name beside the scene")
     settings.put(record, film_file=typed)
     ui.verbs(viewer, "Save film", "Picture of this size")
