@@ -340,7 +340,7 @@ def surfaces(case: Case) -> Found:
         "voxel": Length(side),
         "where": Surface(mesh.vertices, by=1.0 * side / case.scale),
         "closed": Length(closed.areas().sum(), by=3 * loose, power=2),
-        "floor": Same(ground.floor is not None),
+        "floor": Same(ground.has_floor),
         "height": Length(np.ptp(case.scene.gaussians.means @ ground.up), by=0.05),
     }
 

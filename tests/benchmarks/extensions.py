@@ -89,7 +89,8 @@ class Maps(InRooms):
         occupancy = find_occupancy(scene_of(room), map_axes(planes, 1.0), self.resolution)
         points, to_map = true_points(room), occupancy.to_map
         true = points @ to_map[:3, :3].T + to_map[:3, 3]
-        seen = _taken(occupancy.seen, occupancy.voxels(points))
+        voxels = np.floor((true - occupancy.origin) / self.resolution).astype(np.int64)
+        seen = _taken(occupancy.seen, voxels)
         near = 1.5 * self.resolution
         solid = occupancy.origin + (np.argwhere(occupancy.occupied) + 0.5) * self.resolution
         low, band = ((z >= self.step) & (z <= self.robot_height) for z in (solid[:, 2], true[:, 2]))

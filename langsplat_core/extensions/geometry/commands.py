@@ -259,9 +259,7 @@ class Map:
             write_grid(self.out, plan)
             write_collider(self.out / "collider.obj", occupancy)
             write_voxels(self.out / "voxels.npz", occupancy, scene, engine, progress)
-        floor = (
-            "" if room.floor is not None else " (no floor was found: the ground is nearly the lowest surface)"
-        )
+        floor = "" if room.has_floor else " (no floor was found: the ground is nearly the lowest surface)"
         print(
             f"{self.out}: {plan.free.shape[0]} x {plan.free.shape[1]} cells of {self.resolution:g} m, "
             f"{100 * plan.free.mean():.0f} % free, {100 * plan.occupied.mean():.0f} % occupied, "

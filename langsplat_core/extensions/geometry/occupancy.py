@@ -54,10 +54,6 @@ class Occupancy:
         """(P, 3) points of the scene -> (P, 3) in the axes of the map."""
         return _moved(points, self.to_map)
 
-    def voxels(self, points: Array) -> Array:
-        """(P, 3) points of the scene -> (P, 3) int64 voxels, perhaps outside of the grid."""
-        return np.floor((self.metres(points) - self.origin) / self.resolution).astype(np.int64)
-
 
 @dataclass(frozen=True, eq=False)
 class FloorMap:

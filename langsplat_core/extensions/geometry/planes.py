@@ -17,6 +17,7 @@ FEWEST = 100  # Gaussians: fewer have no surface to speak of
 SAMPLES = 30_000  # points of the surface
 NEAR = 0.02  # of the scene's radius: how far from a plane its points lie
 LEAST = 0.02  # of the surface: what is less is no plane of a room
+MOST = 8  # planes that are tried
 LEVEL = 0.9  # cosine with up of the normals of a floor, at least
 BELOW = 0.05  # of the surface, that may lie below the floor: what shines through it, and floaters
 
@@ -54,56 +55,35 @@ def cloud(points: Array, normals: Array | None = None) -> "PointCloud":
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
-    """The points x with normal . x = offset."""
-
-    normal: Array  # (3,) unit, float64
-    offset: float  # world units
-    share: float  # of the scene's surface that lies in it
-
-    def heights(self, points: Array) -> Array:
-        """(P,) signed distances of (P, 3) points, world units, positive where the normal points."""
-        return np.asarray(points @ self.normal - self.offset)
-
-
-@dataclass(frozen=True, eq=False)
 class Room:
-    """The planes of a scene that matter to whoever stands in it."""
+    """The floor of a scene, for whoever stands in it."""
 
     up: Array  # (3,) unit: the floor's normal; the scene's own up where there is no floor
     ground: float  # height of the floor along `up`, world units; without one of nearly the lowest surface
-    floor: Plane | None  # its normal points up
+    has_floor: bool
 
 
-def find_planes(points: Array, near: float, least: float, seed: int = 0) -> list[Plane]:
-    """Return the planes with the most of (P, 3) points, the largest first.
+def find_room(scene: Scene) -> Room:
+    """Return up, and the largest level plane with little below it; InputError without a surface.
 
-    They are found one after the other, each among the points that the ones before it left over. near: how far
-    from a plane its points lie; least: points of a plane. Shares are of these points.
+    Planes are found one after the other, each among the level points that the ones before it left over.
     """
     import open3d
 
-    found: list[Plane] = []
-    left = points
-    open3d.utility.random.seed(seed)
-    while len(found) < 8 and len(left) >= max(least, 3):
-        (*normal, d), inside = cloud(left).segment_plane(near, 3, 1_000, 1.0)
+    points, normals = sample_surface(scene.gaussians, SAMPLES)
+    up, near, least = scene.up(), NEAR * scene.bounds()[1], max(LEAST * len(points), 3)
+    left = points[np.abs(normals @ up) >= LEVEL]
+    open3d.utility.random.seed(0)
+    for _ in range(MOST):
+        if len(left) < least:
+            break
+        (*direction, offset), inside = cloud(left).segment_plane(near, 3, 1_000, 1.0)
         if len(inside) < least:
             break
-        length = float(np.linalg.norm(normal))
-        found.append(Plane(np.array(normal) / length, -d / length, len(inside) / len(points)))
+        normal, length = np.array(direction), np.linalg.norm(direction)
+        sign = 1 if normal @ up >= 0 else -1
+        normal, ground = sign * normal / length, -sign * float(offset / length)
+        if (points @ normal - ground < -2 * near).mean() <= BELOW:
+            return Room(normal, ground, has_floor=True)
         left = np.delete(left, inside, axis=0)
-    return found
-
-
-def find_room(scene: Scene, seed: int = 0) -> Room:
-    """Return up, and the largest level plane with little below it; InputError without a surface."""
-    points, normals = sample_surface(scene.gaussians, SAMPLES, seed)
-    up, near = scene.up(), NEAR * scene.bounds()[1]
-    level = np.abs(normals @ up) >= LEVEL
-    for plane in find_planes(points[level], near, LEAST * len(points), seed):
-        sign = 1 if plane.normal @ up >= 0 else -1
-        floor = Plane(sign * plane.normal, sign * plane.offset, plane.share * float(level.mean()))
-        if (floor.heights(points) < -2 * near).mean() <= BELOW:
-            return Room(floor.normal, floor.offset, floor)
-    return Room(up, float(np.quantile(points @ up, BELOW)), None)
+    return Room(up, float(np.quantile(points @ up, BELOW)), has_floor=False)

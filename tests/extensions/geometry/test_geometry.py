@@ -195,7 +195,7 @@ def test_floor_and_up_are_found(seed, there):
     room = find_room(transform_scene(box_room(seed), there))
     up = there.rotation[:, 2]
     assert np.degrees(np.arccos(np.clip(room.up @ up, -1, 1))) < 2
-    assert room.floor is not None
+    assert room.has_floor
     ground = there.scale * FLOOR + there.translation @ up
     assert room.ground == pytest.approx(ground, abs=0.03 * there.scale * WALL)
 
@@ -205,7 +205,7 @@ def test_scene_without_floor_takes_the_up_of_its_cameras():
     ball = unit(np.random.default_rng(0).normal(size=(len(scene.gaussians), 3)))
     floating = replace(scene, gaussians=replace(scene.gaussians, means=ball))
     room = find_room(floating)
-    assert room.floor is None
+    assert not room.has_floor
     np.testing.assert_allclose(room.up, floating.up())
     assert -1.1 < room.ground < -0.7
 
@@ -404,7 +404,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, cap
 
 
 COARSE = "--resolution", 0.1, "--step", 0.15
-ROOM = Room(np.array([0.0, 0.0, 1.0]), FLOOR, None)
+ROOM = Room(np.array([0.0, 0.0, 1.0]), FLOOR, has_floor=True)
 
 
 def reference_trace(eye: Array, ends: Array, shape: tuple[int, int, int]) -> tuple[Array, Array]:
@@ -448,14 +448,14 @@ def test_rays_along_an_axis_and_of_no_length_end():
 
 def test_axes_of_a_map_are_metres_with_the_ground_at_nought():
     up = np.array([0.6, 0.0, 0.8])
-    matrix = map_axes(Room(up, 2.0, None), 3.0)
+    matrix = map_axes(Room(up, 2.0, True), 3.0)
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, 9 * np.eye(3), atol=1e-12)
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(27)
     np.testing.assert_allclose(matrix[:3, :3] @ (2.0 * up) + matrix[:3, 3], [0, 0, 0], atol=1e-12)
     tilt = np.array([0.001, 0.0, 1.0])
-    far = map_axes(Room(tilt / np.linalg.norm(tilt), 0.0, None), 3.0, np.array([5e5, 5e6, 300.0]))
+    far = map_axes(Room(tilt / np.linalg.norm(tilt), 0.0, True), 3.0, np.array([5e5, 5e6, 300.0]))
     np.testing.assert_allclose(far[:2, 3], [1.5e6, 1.5e7])  # where it is on a map of the world
-    sideways = map_axes(Room(np.array([1.0, 0, 0]), 0.0, None), 1.0)
+    sideways = map_axes(Room(np.array([1.0, 0, 0]), 0.0, True), 1.0)
     assert np.isfinite(sideways).all()
 
 
