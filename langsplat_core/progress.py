@@ -7,6 +7,8 @@ import json
 import logging
 import os
 import sys
+import time
+from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -72,6 +74,49 @@ def is_quiet() -> bool:
     return log.getEffectiveLevel() >= logging.ERROR
 
 
+@dataclass
+class TimeLeft:
+    """The time until a stage ends, by the work that it was seen to do; its text counts down.
+
+    The rate is that of the later half of the time since the first report: stages slow down, and what an
+    earlier run has done is passed at once.
+    """
+
+    clock: Callable[[], float] = time.monotonic
+    _reports: list[tuple[float, float]] = field(default_factory=list)  # seconds, fraction; both ascending
+
+    def hear(self, fraction: float) -> None:
+        """Take the fraction of the stage that is done now; one smaller than before begins it again."""
+        if self._reports and fraction < self._reports[-1][1]:
+            self._reports = []
+        if not self._reports or fraction > self._reports[-1][1]:
+            self._reports.append((self.clock(), fraction))
+
+    def seconds(self) -> float | None:
+        """Return the seconds left; None while too little was seen, and where the stage is done."""
+        reports = self._reports  # another thread shows what one hears
+        if len(reports) < 2 or reports[-1][1] >= 1:
+            return None
+        (begun, _), (_, before), (now, done) = reports[0], *reports[-2:]
+        middle = bisect_left(reports, ((begun + now) / 2, 0.0))
+        first, at_first = reports[min(middle, len(reports) - 2)]
+        waited = self.clock() - now
+        if now - first < max(2.0, waited):  # nor is anything known of work that takes longer than all before
+            return None
+        each = (now - first) / (done - at_first)
+        under_way = min(done - before, 1 - done)
+        # What is overdue takes as long again as it is late.
+        return each * (1 - done - under_way) + abs(each * under_way - waited)
+
+    def __str__(self) -> str:
+        if (seconds := self.seconds()) is None:
+            return ""
+        minutes = seconds / 60
+        if minutes < 2:
+            return f"{max(round(seconds), 1)} s left"
+        return f"{minutes:.0f} min left" if minutes < 120 else f"{minutes / 60:.1f} h left"
+
+
 class WorkCancelledError(Exception):
     """Raised by a `Progress` to stop the work; what was stored so far stays valid."""
 
@@ -104,7 +149,7 @@ class TerminalProgress:
 
     def __init__(self, lines: bool = False) -> None:
         from rich.console import Console  # a tenth of a second that nothing else needs
-        from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as RichBar
 
         self._bar = RichBar(
@@ -112,11 +157,11 @@ class TerminalProgress:
             BarColumn(),
             TextColumn("{task.percentage:>3.0f}%"),
             TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             console=Console(file=sys.stderr),
             disable=is_quiet(),
         )
-        self._tasks: dict[str, TaskID] = {}
+        self._tasks: dict[str, tuple[TaskID, TimeLeft]] = {}
         self._stage = ""  # the last one
         self._lines = lines or os.environ.get(AS_LINES) == "lines"
 
@@ -132,7 +177,9 @@ class TerminalProgress:
     def _complete(self) -> None:
         """Fill the bar of the last stage, which is over where the next one begins."""
         if self._stage in self._tasks:
-            self._bar.update(self._tasks[self._stage], completed=1.0)
+            task, left = self._tasks[self._stage]
+            left.hear(1.0)
+            self._bar.update(task, completed=1.0)
 
     def _show(self, report: Report) -> None:
         self._bar.start()
@@ -140,5 +187,8 @@ class TerminalProgress:
             self._complete()
             self._stage = report.stage
         if report.stage not in self._tasks:
-            self._tasks[report.stage] = self._bar.add_task(report.stage, total=1.0)
-        self._bar.update(self._tasks[report.stage], completed=report.fraction, description=report.text)
+            left = TimeLeft()
+            self._tasks[report.stage] = self._bar.add_task(report.stage, total=1.0, left=left), left
+        task, left = self._tasks[report.stage]
+        left.hear(report.fraction)
+        self._bar.update(task, completed=report.fraction, description=report.text)

@@ -25,7 +25,7 @@ from langsplat_core.config import CodecConfig, TrainConfig, check_settings, nume
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.train import train_scene
-from langsplat_core.progress import Progress, Report, TerminalProgress
+from langsplat_core.progress import Progress, Report, TerminalProgress, TimeLeft
 from langsplat_core.scene import Scene
 from tests.support.processes import bound_by_permissions, files_of_at_most, refusal
 from tests.support.scenes import random_gaussians
@@ -92,8 +92,60 @@ def test_bars_of_finished_stages_are_full(stopped: bool, capsys: pytest.CaptureF
             report(stage, 0.3)
         if stopped:
             raise KeyboardInterrupt
-    shares = [line.split()[-3] for line in capsys.readouterr().err.splitlines() if "%" in line]
+    shares = [line.split()[-2] for line in capsys.readouterr().err.splitlines() if "%" in line]
     assert shares == (["100%", "30%"] if stopped else ["100%"] * 2)
+
+
+@pytest.mark.parametrize(
+    ("items", "kept"),
+    [
+        ([0.1] * 2_000, 0),
+        ([20.0] * 12, 0),
+        ([*[0.5] * 50, *[1.0] * 200], 0),  # other work begins beside it
+        ([0.2 + 0.0005 * item for item in range(600)], 0),  # more to do in each
+        ([*[0.001] * 600, *[1.0] * 400], 0),  # what an earlier run has done is passed
+        ([0.5] * 400, 250),  # a run taken up begins amid its stage
+    ],
+)
+def test_time_left_is_true_from_the_second_minute_on(items: list[float], kept: int) -> None:
+    now, said = 0.0, 0
+    left = TimeLeft(clock=lambda: now)
+    for index, item in enumerate(items[kept:], kept):
+        left.hear(index / len(items))
+        for part in (0.3, 0.6):  # of the item under way
+            now, before = now + part * item, now
+            seconds, truth = left.seconds(), sum(items[index:]) - part * item
+            assert str(left) != "0 s left"
+            if seconds is not None and now > 60:
+                said += 1
+                assert abs(seconds - truth) <= 0.3 * truth + 2
+            now = before
+        now += item
+    left.hear(1.0)
+    assert said > len(items[kept:]) / 3
+    assert (left.seconds(), str(left)) == (None, "")
+
+
+def test_time_left_is_not_said_of_what_is_not_known() -> None:
+    now = 0.0
+    left = TimeLeft(clock=lambda: now)
+    for fraction, seconds, said in (
+        (0.0, 1.0, ""),
+        (0.5, 0.5, ""),
+        (0.75, 4.0, ""),  # of a second of work
+        (0.1, 20.0, ""),
+        (0.2, 20.0, "2 min left"),
+        (0.3, 20.0, "2 min left"),  # it began again
+        (0.4, 20.0, "100 s left"),
+        (0.5, 20.0, "80 s left"),
+        (0.6, 15.0, "65 s left"),
+        (0.6, 9.0, "64 s left"),
+        (0.6, 10.0, "74 s left"),
+        (0.6, 40.0, ""),  # overdue
+    ):
+        left.hear(fraction)
+        now += seconds
+        assert str(left) == said, (fraction, seconds)
 
 
 def test_progress_of_a_part_stays_within_its_share():

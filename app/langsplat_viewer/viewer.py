@@ -12,7 +12,7 @@ from typing import IO, Any, Protocol, TypeVar
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError, printable_line
-from langsplat_core.progress import AS_LINES, Progress, Report
+from langsplat_core.progress import AS_LINES, Progress, Report, TimeLeft
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
 from langsplat_core.scene import LanguageField, Scene
@@ -33,6 +33,8 @@ class ProcessProgress:
     """Progress of a command. Written by the listening thread, read by the window's."""
 
     stages: dict[str, float] = field(default_factory=dict)  # name -> fraction in [0, 1], in their order
+    stage: str = ""  # the latest
+    left: TimeLeft = field(default_factory=TimeLeft)  # of the latest
     losses: list[float] = field(default_factory=list)  # of a training, as far as it is
     said: list[str] = field(default_factory=list)  # lines that are no progress, the latest last
 
@@ -45,7 +47,11 @@ class ProcessProgress:
             if text:
                 self.said = [*self.said[1 - KEPT :], text]
             return
+        if report.stage != self.stage:
+            self.stages |= dict.fromkeys(filter(None, [self.stage]), 1.0)  # it may end before its last report
+            self.stage, self.left = report.stage, TimeLeft()
         self.stages[report.stage] = report.fraction
+        self.left.hear(report.fraction)
         loss = report.metrics.get("loss")
         if loss is not None and [loss] != self.losses[-1:]:
             self.losses = [*self.losses, loss]

@@ -184,11 +184,12 @@ class _Stages:
                 write_array(files[index], lift.view_pairs(*drawn, *self.views[index], self.formation))
         return MaskWeights([open_array(path) for path in files], len(self.gaussians))
 
-    def each(self, count: int, stage: str, begin: float = 0.0, end: float = 1.0) -> Iterator[int]:
+    def each(self, count: int, stage: str) -> Iterator[int]:
         """Yield this process's share of `count` items, report each, and wait for all processes."""
         for index in self.processes.share(range(count)):
+            self.progress(stage, index / count)
             yield index
-            self.progress(stage, begin + (end - begin) * (index + 1) / count)
+        self.progress(stage, 1.0)
         self.processes.barrier()
 
     @cached_property
@@ -303,7 +304,7 @@ UNNAMED = 2.0  # spreads above everyday phrases that the nearest name of anythin
 AREA = 0.75  # power of a node's share of the area, by which its name counts
 VIEWS = 3  # that show most of a node, in which the encoder sees it alone
 LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing
-AGREED = "describing what masks agree on"  # stage
+AGREED = "what masks agree on"  # which is drawn, named and described: stages
 VERSION = 2
 
 
@@ -336,7 +337,7 @@ def agreed_features(
     key = stage_key("tree", VERSION, *inputs)
     tree = MergeTree(**stages.processes.once(lambda: kept(work / f"{key}.npz", make)))
     drawn = [work / key / f"{index:05d}.npy" for index in range(len(views))]
-    for index in stages.each(len(views), AGREED, end=0.4):
+    for index in stages.each(len(views), f"drawing {AGREED}"):
         if not drawn[index].exists():
             view, mask = rasterizer.view(gaussians, views[index][0], formed), photographs[index][1]
             patches = draw_patches(view, gaussians, tree.patches, formed)
@@ -348,7 +349,7 @@ def agreed_features(
     cuts = [*(np.minimum(tree.cut(cost), wholes) for cost in CUTS[:2]), wholes]  # later nodes are larger
     store = FeatureStore(work / "features")
     made_by = stage_key(told, VERSION, CUTS, UNNAMED, AREA)
-    for index in stages.each(len(views), AGREED, 0.5):
+    for index in stages.each(len(views), f"describing {AGREED}"):
         name = views[index][0].name
         if not store.has(name, made_by):
             maps = nested_maps(open_array(drawn[index]), cuts, LEAST)
@@ -382,7 +383,7 @@ def _alone(
         crops = [masked_crop(image, mask, encoder.image_size) for mask in masks]
         return {"nodes": nodes, "vectors": encoder.encode_images(crops)}
 
-    for index in stages.each(len(drawn), AGREED, 0.4, 0.5):
+    for index in stages.each(len(drawn), f"naming {AGREED}"):
         kept(files[index], partial(look, index))
     vectors = np.zeros((len(members), encoder.dim), np.float32)
     for found in map(read_arrays, files):

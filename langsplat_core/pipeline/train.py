@@ -137,8 +137,9 @@ def _train(
             save_scene(run.out, scene)
             small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
             near = config.radiance.near or scene.near  # as whoever opens the scene has it
-            scores = evaluate_views(gaussians, capture, held_out, small=small, near=near) if held_out else []
-            trained = evaluate_views(gaussians, capture, reports.shown_views(train), near=near)
+            told: dict[str, Any] = {"near": near, "progress": run.progress}
+            scores = evaluate_views(gaussians, capture, held_out, small=small, **told) if held_out else []
+            trained = evaluate_views(gaussians, capture, reports.shown_views(train), **told)
         rule = f"one in {config.dataset.test_every}, "
         rule += "by name" if config.dataset.hold_out == "every" else "amid others"
         report = reports.TrainReport(

@@ -198,7 +198,8 @@ def _running(viewer: Viewer, process: Training) -> None:
     if not progress.stages:
         ui.coloured("starting")
     for label, fraction in list(progress.stages.items()):
-        ui.small_wrapped(f"{label}: done" if fraction >= 1 else label)
+        under_way = ": ".join(filter(None, [label, str(progress.left)]))
+        ui.small_wrapped(f"{label}: done" if fraction >= 1 else under_way)
         if fraction < 1:
             imgui.progress_bar(fraction, ImVec2(-1, 0))
     if len(progress.losses) > 1:

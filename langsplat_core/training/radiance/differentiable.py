@@ -16,6 +16,7 @@ from langsplat_core.arrays import Array, ViewScore, near_power, psnr
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import BackendError
+from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import gsplat
 from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
@@ -162,6 +163,7 @@ def evaluate_views(
     backend: Backend = "auto",
     small: Capture | None = None,
     near: float | None = None,
+    progress: Progress = silent,
 ) -> list[ViewScore]:
     """Draw the views at `indices` and score them against the photographs; colours are clamped to [0, 1].
 
@@ -173,6 +175,7 @@ def evaluate_views(
     parameters = parameters_of(gaussians, renderer.device)
     scores = []
     for number, index in enumerate(indices):
+        progress("measuring views", number / len(indices))
         camera, mask = capture.cameras[index], capture.mask(index)
         target = torch.tensor(capture.images[index], device=renderer.device).float().div_(255)
         with torch.no_grad():

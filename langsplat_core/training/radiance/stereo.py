@@ -69,11 +69,13 @@ def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = s
             free = np.zeros_like(depth)
             maps.append(DepthMap(small.cameras[index], depth, free, score, small.images[index]))
         progress(STAGE, (index + 1) / len(small))
-    depths = [_confirmed(one, [other for other in maps if other is not one]) for one in maps]
-    return [
-        replace(one, depth=depth, free=free_depths(one.camera, shared_depths(depth), capture.points))
-        for one, depth in zip(maps, depths, strict=True)
-    ]
+    found: list[DepthMap] = []
+    for index, one in enumerate(maps):
+        progress(f"{STAGE} that agree", index / len(maps))
+        depth = _confirmed(one, [other for other in maps if other is not one])
+        free = free_depths(one.camera, shared_depths(depth), capture.points)
+        found.append(replace(one, depth=depth, free=free))
+    return found
 
 
 def neighbouring_views(cameras: Sequence[Camera], known: Array) -> list[list[int]]:

@@ -61,6 +61,11 @@ class Schedule:
         """Return True where a round of densification and pruning ends the step."""
         return self.densify_from < step < self.densify_until and step % self.densify_every == 0
 
+    def work(self, step: int) -> float:
+        """Return the share of the work up to a step: one on a whole image takes as long as two on halves."""
+        done, whole = (count + max(count - self.coarse_until, 0) for count in (step, self.steps))
+        return done / whole
+
     def clears_free_space(self, step: int) -> bool:
         """Return True where Gaussians before surfaces go after this step; the last steps mend that."""
         return self.densify_from < step <= 0.9 * self.steps and step % self.densify_every == 0
@@ -177,7 +182,7 @@ def train_radiance(
                 # Every photograph has another loss: what is told is the mean over each 200th of the run.
                 if state.step * 200 // config.steps > (state.step - 1) * 200 // config.steps:
                     metrics, recent = {"loss": float(np.mean(recent))}, []
-                progress(STAGE, state.step / config.steps, f"{len(state)} Gaussians", **metrics)
+                progress(STAGE, run.schedule.work(state.step), f"{len(state)} Gaussians", **metrics)
                 if signals:
                     raise Terminated if signal.SIGTERM in signals else KeyboardInterrupt
                 if checkpoint and (state.step % config.checkpoint_every == 0 or state.step == config.steps):
@@ -420,21 +425,21 @@ def rehearse(
         return not found or bool(np.mean(scores(gaussians)) > np.mean(found[supported(found)]))
 
     for index, budget in enumerate(budgets):
-        part = progress.part(index, len(budgets), REHEARSING, budget_text(budget))
+        part = _steps_alone(progress, f"{REHEARSING} {budget_text(budget)}")
         at = checkpoints and checkpoints / f"{index}.safetensors"
         spent = config.spending(budget)
-        found.append(scores(train_radiance(capture, spent, train, at, _steps_alone(part), gains)))
+        found.append(scores(train_radiance(capture, spent, train, at, part, gains)))
         if index - supported(found) == 2:
             break
     return found
 
 
-def _steps_alone(progress: Progress) -> Progress:
-    """Progress of the steps alone: depths, found in seconds, would count as the whole."""
+def _steps_alone(progress: Progress, stage: str) -> Progress:
+    """Progress of the steps alone, as a stage: depths, found in seconds, would count as the whole."""
 
     def show(report: Report) -> None:
         if report.stage == STAGE:
-            progress.show(report)
+            progress.show(replace(report, stage=stage))
 
     return Progress(show)
 
