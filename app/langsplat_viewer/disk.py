@@ -1,6 +1,7 @@
 """What lies around a scene on the disk: paths, files that change, a training's checkpoints."""
 
 import os
+import shutil
 import threading
 from collections.abc import Callable
 from glob import escape, glob
@@ -13,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path, is_utf8
 from langsplat_core.io.ply import write_ply
-from langsplat_core.pipeline.report import work_folder
+from langsplat_core.pipeline.report import PREVIEW, work_folder
 from langsplat_core.scene import Gaussians
 
 # Paths that are typed.
@@ -104,7 +105,6 @@ class Watch:
 
 PARTS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
 IN_TRAINING = ".checkpoint.safetensors"
-PREVIEW = "so-far.ply"  # in the work folder of a training
 
 
 def newest(out: Path) -> Stamps:
@@ -117,8 +117,18 @@ def newest(out: Path) -> Stamps:
     return tuple(sorted(found, key=lambda file: file[1] or (0, 0))[-1:])
 
 
+def is_preview(path: Path | None) -> bool:
+    """Return True for what `write_preview` writes."""
+    return path is not None and path.name == PREVIEW
+
+
 def write_preview(checkpoint: Path) -> Path:
-    """Write the Gaussians of a checkpoint as a scene beside it. InputError where it cannot be read."""
+    """Write the Gaussians of `newest` as a scene beside them. InputError where they cannot be read."""
+    path = checkpoint.with_name(PREVIEW)
+    if not checkpoint.name.endswith(IN_TRAINING):
+        with atomic_path(path) as temporary:
+            shutil.copyfile(checkpoint, temporary)
+        return path
     try:
         with safe_open(checkpoint, framework="numpy") as file:
             held = {name: file.get_tensor(f"values.{name}") for name in PARTS}
@@ -127,7 +137,6 @@ def write_preview(checkpoint: Path) -> Path:
     except (SafetensorError, OSError, ValueError, KeyError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{checkpoint}: no Gaussians in training ({reason})") from None
-    path = checkpoint.with_name(PREVIEW)
     with atomic_path(path) as temporary:
         write_ply(temporary, gaussians)
     return path

@@ -28,6 +28,7 @@ from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import C0
 
 REPORT, PAGE = "report.json", "report.html"
+PREVIEW = "so-far.ply"  # in the work folder: what the window shows of a training under way
 APART = 10.0  # times the median step to a neighbouring camera; captures that went well have at most 5
 
 

@@ -20,6 +20,8 @@ from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainCo
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
 from langsplat_core.errors import STRICTNESS, FormatError, InputError
+from langsplat_core.io.cameras import SUFFIX as CAMERAS
+from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.files import atomic_path, check_output_folder, patiently, shown, write_json
 from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
@@ -112,6 +114,9 @@ def _train(
         capture = processes.once(lambda: _photographs(run))
         train, held_out = split_views(capture, config.dataset)
         cameras = tuple(capture.cameras[i] for i in train)
+        if processes.is_main:  # for whoever looks at the Gaussians before their scene is written
+            with atomic_path((run.work / reports.PREVIEW).with_suffix(CAMERAS)) as file:
+                write_cameras(file, cameras)
 
     if encoder is not None:
         mask_source = named_source or masks_of(capture)  # type: ignore[misc]  # one of them is there

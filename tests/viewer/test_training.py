@@ -14,11 +14,11 @@ from safetensors.numpy import save_file
 
 from langsplat_core.cli.app import parse
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.pipeline.report import REPORT
+from langsplat_core.pipeline.report import PREVIEW, REPORT
 from langsplat_core.scene import Scene
 from langsplat_viewer import viewer as training_process
 from langsplat_viewer.actions import opening, settings, viewpoint
-from langsplat_viewer.disk import IN_TRAINING, PREVIEW, write_preview
+from langsplat_viewer.disk import IN_TRAINING, write_preview
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.viewer import PREVIEW_EVERY, ProcessProgress, command
 from tests.support.fakes import blob_scene
@@ -125,8 +125,8 @@ def test_gaussians_are_shown_before_the_end(viewer, folder, begin, monkeypatch):
     work = folder.with_name("photos.work")
     work.mkdir()
     (work / "radiance-0.ply").write_bytes(b"")
-    monkeypatch.setitem(SCENES, "radiance-0.ply", SCENES["plain.ply"])
-    act(opening.look_at_training, viewer)
+    monkeypatch.setitem(SCENES, PREVIEW, SCENES["plain.ply"])
+    act(opening.watch_training, viewer)  # nothing else is open
     viewer.training.end()
     assert viewer.state.scene is SCENES["plain.ply"]
 
@@ -208,6 +208,7 @@ def test_checkpoints_are_shown_and_followed(viewer, folder, begin):
     assert len(viewer.state.scene.gaussians) == 360
     assert viewer.state.view is view
     assert errors(viewer) == []
+    assert viewer.state.scenes == ()  # what is on its way is not kept in the list
     viewer.training.end()
 
 

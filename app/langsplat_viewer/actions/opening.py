@@ -14,7 +14,7 @@ from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io.files import is_utf8, shown
 from langsplat_core.io.scenes import format_of, scene_files
-from langsplat_core.pipeline.report import stated_warnings, work_folder
+from langsplat_core.pipeline.report import PREVIEW, stated_warnings, work_folder
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Scene, surface
@@ -126,12 +126,13 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     )
     state.view, state.opening, state.leaving = viewpoint.opening_view(viewer), None, None
     state.tools, state.show_start = replace(state.tools, stroke=None), False
-    add_scenes(viewer, [path])
-    state.preferences = state.preferences.with_recent(path.absolute())
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
     viewer.watch.begin(opened.read)
     viewer.history = History()
-    _say_opened(viewer, path, opened)
+    if not disk.is_preview(path):
+        add_scenes(viewer, [path])
+        state.preferences = state.preferences.with_recent(path.absolute())
+        _say_opened(viewer, path, opened)
     if field is not None:
         viewer.run("preparing latent colours", lambda progress: latent_colours(field))  # none is needed yet
         _prepare_search(viewer)
@@ -405,10 +406,7 @@ def start_training(viewer: Viewer) -> None:
 
 
 def look_at_training(viewer: Viewer) -> None:
-    """Open the Gaussians of a training under way, before they have a language field.
-
-    While they are still trained, as they were at the last checkpoint, and from then on at the next ones.
-    """
+    """Open the Gaussians of a training as they were last written, and from then on the next ones."""
     training = viewer.training
     if training is None:
         return
@@ -417,9 +415,6 @@ def look_at_training(viewer: Viewer) -> None:
         viewer.state.say("there are no Gaussians to look at yet")
         return
     ((path, _),) = written
-    if not path.name.endswith(disk.IN_TRAINING):
-        open_scene(viewer, path)
-        return
 
     def done(preview: Path) -> None:
         if viewer.state.path == preview:  # in place of the checkpoint before
@@ -432,15 +427,18 @@ def look_at_training(viewer: Viewer) -> None:
 
 
 def watch_training(viewer: Viewer) -> None:
-    """Open the scene when its training is finished, or say why there is none; once per frame."""
+    """Show a training under way, and its scene when it is finished, or why there is none; once per frame.
+
+    Gaussians on their way are shown where they were looked at before, or nothing else is open.
+    """
     training, state = viewer.training, viewer.state
     if training is None:
         return
     if training.exit_code is None:
-        follows = state.path == work_folder(training.out) / disk.PREVIEW
-        if follows and viewer.worker.current is None:
+        follows = state.scene is None or state.path == work_folder(training.out) / PREVIEW
+        if follows and viewer.worker.current is None and state.opening is None:
             written = disk.newest(training.out)
-            if written and written != training.previewed and written[0][0].name.endswith(disk.IN_TRAINING):
+            if written and written != training.previewed:
                 look_at_training(viewer)
         return
     viewer.training = None

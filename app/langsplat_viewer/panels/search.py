@@ -12,6 +12,7 @@ from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, painted
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS
+from langsplat_viewer import disk
 from langsplat_viewer.actions import opening, queries, settings, viewpoint
 from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
@@ -274,6 +275,9 @@ LEVEL_TIPS: dict[LevelChoice, str] = {
 def draw(viewer: Viewer) -> None:
     """Draw the search box, the level and the list of queries."""
     scene = viewer.state.scene
+    if viewer.training is not None and disk.is_preview(viewer.state.path):
+        ui.small_wrapped("in training: the scene opens when its language field is done")
+        return
     if scene is not None and scene.language is None:
         ui.small_wrapped(no_field(scene))
         if ui.button("Train a language field ...", "From the photographs of this scene; it stays as it is"):
