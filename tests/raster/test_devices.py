@@ -1,7 +1,7 @@
 """The rasterizers of graphics devices.
 
-OpenGL against the reference, and what it does to its context; the CUDA backend's own code, and gsplat's above
-it, over the twin of gsplat's kernels. The slow tier runs the twin on all tests of rasterizers.
+OpenGL against the reference, and what it does to its context; the CUDA backend's own code, over the twin of
+gsplat. The slow tier runs the twin on all tests of rasterizers.
 """
 
 import os
@@ -30,7 +30,6 @@ from langsplat_core.training.radiance.differentiable import (
 )
 from langsplat_core.training.radiance.state import PARAMETERS, start
 from langsplat_core.training.radiance.trainer import train_radiance
-from tests.support import gsplat_twin as twin
 from tests.support.backends import drawn_settings, gl_state
 from tests.support.scenes import (
     find_mask_weights,
@@ -190,7 +189,7 @@ def test_a_missing_driver_is_reported_in_one_line(monkeypatch):
 
 
 # What CUDA draws, gathers, differentiates, lifts and trains is what the reference and the CPU kernels say, by
-# gsplat's kernels where there is a device, and by their twin.
+# gsplat where there is a device, and by its twin.
 
 
 @pytest.fixture(params=["twin", "device"])
@@ -310,10 +309,10 @@ def test_training_on_cuda_ends_where_the_cpu_does() -> None:
 @pytest.mark.long
 @pytest.mark.usefixtures("gsplat_twin")
 def test_a_failing_kernel_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
+    def broken(**_: object) -> None:
         raise RuntimeError("Error building extension 'gsplat_cuda'\nand a thousand lines")
 
-    monkeypatch.setattr(twin, "intersect_tile", broken)
+    monkeypatch.setattr("gsplat.rasterization", broken)
     with pytest.raises(BackendError, match=r"Error building extension 'gsplat_cuda'\); install") as caught:
         gsplat.require_device()
     assert "\n" not in str(caught.value)
