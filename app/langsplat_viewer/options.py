@@ -1,6 +1,5 @@
 """The program's arguments: options, sizes, cameras, displays. Imports no windowing library."""
 
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,7 @@ from langsplat_core.config import (
     Display,
     HeatOf,
     LevelChoice,
-    NotNegative,
     PictureConfig,
-    Positive,
     Range,
     Share,
 )
@@ -32,7 +29,6 @@ from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_viewer.camera.flight import SPAN_LIMITS
 from langsplat_viewer.projects import BUNDLED
 from langsplat_viewer.rendering.renderer import Backend
-from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.viewer import Services
 
 DisplayChoice = Literal["auto", Display]
@@ -57,10 +53,6 @@ class ViewerOptions:
     """Semantic level of the search; auto takes the one that answers best."""
     display: DisplayChoice = "auto"
     """What is shown; auto is relevancy with a query, else rgb."""
-    near_cut: Annotated[NotNegative, HEADLESS] = 0.0
-    """With --headless: depth up to which nothing is drawn, world units."""
-    far_cut: Annotated[Positive | None, HEADLESS] = None
-    """With --headless: depth beyond which nothing is drawn, world units (default: everything is)."""
     heat_scale: Annotated[tuple[Share, Share] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
     """Relevancies at the ends of the heat map, the same in every image (default: each answer's own)."""
     heat: HeatOf = PictureConfig.heat
@@ -123,10 +115,6 @@ class ViewerOptions:
     @property
     def is_film(self) -> bool:
         return self.path is not None or self.turntable is not None
-
-    @property
-    def clip(self) -> Clip:
-        return Clip(self.near_cut, math.inf if self.far_cut is None else self.far_cut)
 
 
 def parse_size(text: str) -> tuple[int, int] | None:

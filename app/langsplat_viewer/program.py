@@ -128,7 +128,6 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
         options.picture,
         level=latent_level(options.level),
         answers=results[-MAX_QUERIES:],  # as in the window, where a fourth takes the oldest one's colour
-        clip=options.clip,
     )
     if options.backend in ("auto", "cpu"):
         say_compiling(progress)

@@ -158,11 +158,7 @@ REFUSED = [  # words, and why
             (["blobs.ply", "--size", "99999x10"], "1280x720"),
             (["blobs.ply", "--headles"], "--headles"),
             (["blobs.ply", "plain.ply"], "plain.ply"),
-            (["blobs.ply", "--near-cut", "-1"], "--near-cut -1: must be 0"),
-            (["blobs.ply", "--far-cut", "0"], "--far-cut 0: must be above 0"),
-            (["blobs.ply", "--near-cut", "30"], "nothing of the scene"),
             (["blobs.ply", "--orthographic", "0"], "--orthographic 0: must be 1e-09 to 1e+09"),
-            (["blobs.ply", "--orthographic", "4", "--near-cut", "30"], "nothing of the scene"),
         ]
     ),
     *(
@@ -175,7 +171,6 @@ REFUSED = [  # words, and why
             (["--headless", "--out", "x" * 5000 + ".png"], "choose another"),
             (["--out", "a.png"], "with --headless"),
             (["--transparent"], "with --headless"),
-            (["--far-cut", "1"], "with --headless"),
         ]
     ),
 ]
