@@ -14,7 +14,7 @@ import platform
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from importlib.metadata import version
@@ -67,25 +67,24 @@ class BenchRaster:
     counts: tuple[Count, ...] = (10_000, 31_000, 100_000, 200_000, 1_000_000)
     """Sizes of the random scenes, drawn at the middle one of --sizes."""
     sizes: Annotated[tuple[Size, ...], Range(1, 65_536, some=True)] = ((320, 240), (640, 480), (960, 720))
-    """Widths and heights of the image, pixels; all are drawn with --pivot Gaussians."""
-    pivot: Count = 200_000
-    """Gaussians of the random scene that is drawn at every size."""
+    """Widths and heights of the image, pixels; the last random scene but the largest is drawn at each."""
     channels: Annotated[tuple[Channels, ...], Range(1, 4_096, some=True)] = (3, 12)
     """Values per Gaussian."""
     scenes: tuple[Path, ...] = ()
     """Real scenes to measure beside the random ones, from their first camera, else one that frames them."""
     out: OutFolder = Path("bench_out")
-    """Folder for raster.md, raster.json and raster.png."""
+    """Folder for raster.md and raster.json."""
 
     def run(self) -> None:
         for path in self.scenes:  # before the minutes that the others take
             if not exists(path):
                 raise InputError(f"{path}: no such file; check the spelling and the folder")
         with TerminalProgress() as progress:
-            for report in run_plan(self, progress):  # what there is, in files
-                figures = {"machine": report.machine, "measurements": [asdict(row) for row in report.rows]}
-                write_report(self.out, "raster", report.text, figures, partial(plot, report.rows))
-        print(report.text)
+            machine, rows = run_plan(self, progress)
+        text = report_text(machine, rows)
+        figures = {"machine": machine, "measurements": [asdict(row) for row in rows]}
+        write_report(self.out, "raster", text, figures)
+        print(text)
 
 
 # Memory of this process, as Linux tells it. Not getrusage: its maximum is inherited from the parent process.
@@ -153,30 +152,14 @@ class Measurement:
     flips: int | None = None  # pixels near a cut-off that came out on its other side
 
 
-@dataclass(frozen=True)
-class RasterReport:
-    """Results of one run of the benchmark."""
-
-    machine: dict[str, object]
-    rows: list[Measurement]
-
-    @property
-    def text(self) -> str:
-        """The machine and the rows of one image size with the most channels, as Markdown."""
-        size, most = _busiest(self.rows), max((row.channels for row in self.rows), default=0)
-        chosen = [row for row in self.rows if (row.width, row.height) == size and row.channels == most]
-        machine = "".join(f"- {name}: {value}\n" for name, value in self.machine.items())
-        return f"# Rasterizers: time against error\n\n{machine}\n{table(chosen)}\n{_NOTES}"
-
-
-def run_plan(plan: BenchRaster, progress: Progress = silent) -> Iterator[RasterReport]:
-    """Measure, for minutes; yield what there is after each scene and size, and at last all."""
+def run_plan(plan: BenchRaster, progress: Progress = silent) -> tuple[dict[str, object], list[Measurement]]:
+    """Measure, for minutes; return what is said of the machine, and the measurements."""
     machine = describe_machine()
     backends = _backends(machine)
     progress("bench: compiling", 0.0)
     warm_up(backends, plan.channels)
     rows = list[Measurement]()
-    pairs = sweep(plan.counts, plan.sizes, plan.pivot)
+    pairs = sweep(plan.counts, plan.sizes)
     total = len(plan.scenes) + len(pairs)
     for n, case in enumerate(_cases(plan, pairs)):
         name = f"bench: {case.scene} {len(case.gaussians)} at {case.camera.width}x{case.camera.height}"
@@ -186,16 +169,13 @@ def run_plan(plan: BenchRaster, progress: Progress = silent) -> Iterator[RasterR
         for step, (channels, backend) in enumerate(steps):
             progress(f"{name}, {backend.name}", (n + step / len(steps)) / total)
             rows += measure(backend, case, channels, exact)
-        yield RasterReport(machine | {"unfinished": f"{n + 1} of {total} scenes and sizes"}, list(rows))
     progress("bench: done", 1.0)
-    yield RasterReport(machine, rows)
+    return machine, rows
 
 
-def sweep(
-    counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int
-) -> list[tuple[int, tuple[int, int]]]:
-    """Return every count at the middle size and every size at `pivot`, small ones first."""
-    middle = sorted(sizes)[len(sizes) // 2]
+def sweep(counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...]) -> list[tuple[int, tuple[int, int]]]:
+    """Return every count at the middle size and every size at the last count but one, small ones first."""
+    middle, pivot = sorted(sizes)[len(sizes) // 2], sorted(counts)[-2:][0]
     pairs = {(count, middle) for count in counts} | {(pivot, size) for size in sizes}
     return sorted(pairs, key=lambda pair: (pair[0], pair[1][0] * pair[1][1]))
 
@@ -502,7 +482,19 @@ def _window(
     return ReferenceWindow(at, matrix, view.cut_off_band(_BAND))
 
 
-# Table and plot.
+# The report.
+
+
+def report_text(machine: Mapping[str, object], rows: Sequence[Measurement]) -> str:
+    """Return the machine and the rows of the size with most scenes and the most channels, as Markdown."""
+    counts: dict[tuple[int, int], set[int]] = {}
+    for row in rows:
+        counts.setdefault((row.width, row.height), set()).add(row.gaussians)
+    size = max(counts, key=lambda size: len(counts[size]), default=None)
+    most = max((row.channels for row in rows), default=0)
+    chosen = [row for row in rows if (row.width, row.height) == size and row.channels == most]
+    told = "".join(f"- {name}: {value}\n" for name, value in machine.items())
+    return f"# Rasterizers: time against error\n\n{told}\n{table(chosen)}\n{_NOTES}"
 
 
 def table(rows: Sequence[Measurement]) -> str:
@@ -521,44 +513,3 @@ def table(rows: Sequence[Measurement]) -> str:
 
 def _cell(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
-
-
-def plot(rows: Sequence[Measurement], path: Path) -> None:
-    """Draw ms over Gaussians by operation, fewest channels solid, most dashed, and errors over ms."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    size = _busiest(rows)
-    here = [r for r in rows if r.scene == "random" and (r.width, r.height) == size]
-    operations = list(dict.fromkeys(r.operation for r in here))
-    backends = list(dict.fromkeys(r.backend for r in rows))
-    ends = sorted({r.channels for r in rows})
-    figure, grid = pyplot.subplots(3, 4, figsize=(13, 10), layout="constrained", squeeze=False)
-    for panel in grid.flat[len(operations) : -1]:
-        panel.axis("off")
-    for panel, operation in zip(grid.flat, operations, strict=False):
-        for number, backend in enumerate(backends):
-            for channels, style in ((ends[0], "-"), (ends[-1], "--")):
-                key = operation, backend, channels
-                line = [r for r in here if (r.operation, r.backend, r.channels) == key]
-                points = np.array(sorted((r.gaussians, r.milliseconds) for r in line)).reshape(-1, 2)
-                panel.plot(*points.T, style, color=f"C{number}", marker="o")
-        panel.set(title=operation, xlabel="Gaussians", ylabel="ms", xscale="log", yscale="log")
-    for number, backend in enumerate(backends):
-        compared = [r for r in rows if r.backend == backend and r.error_off_cuts is not None]
-        errors = [max(r.error_off_cuts or 0, 1e-9) for r in compared]
-        grid[-1][-1].plot([r.milliseconds for r in compared], errors, "o", color=f"C{number}", label=backend)
-    grid[-1][-1].set(title="error", xlabel="ms", ylabel="largest error", xscale="log", yscale="log")
-    figure.legend(loc="outside lower center", ncols=len(backends), frameon=False)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
-
-
-def _busiest(rows: Sequence[Measurement]) -> tuple[int, int] | None:
-    """Return the image size that was measured with the most numbers of Gaussians."""
-    counts: dict[tuple[int, int], set[int]] = {}
-    for r in rows:
-        counts.setdefault((r.width, r.height), set()).add(r.gaussians)
-    return max(counts, key=lambda size: len(counts[size]), default=None)

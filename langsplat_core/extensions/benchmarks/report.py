@@ -37,17 +37,12 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine, searchable
 from langsplat_core.scene import LEVELS, Camera
 
 
-def write_report(
-    out: Path, name: str, text: str, figures: Any, plot: Callable[[Path], None] | None = None
-) -> None:
-    """Write `name`.md, .json and, with `plot`, .png into the folder `out`, each whole or not at all."""
+def write_report(out: Path, name: str, text: str, figures: Any) -> None:
+    """Write `name`.md and .json into the folder `out`, each whole or not at all."""
     with atomic_path(out / f"{name}.md") as path:
         path.write_text(text, encoding="utf-8")
     with atomic_path(out / f"{name}.json") as path:
         path.write_text(json.dumps(figures, indent=1, default=str), encoding="utf-8")
-    if plot is not None:
-        with atomic_path(out / f"{name}.png") as path:
-            plot(path)
 
 
 def markdown(head: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
