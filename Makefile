@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist
 export PIP_QUIET := 1
 .SILENT: $(STAMP) demo
 
-.PHONY: help demo quick test slow check sizes format elsewhere faults parity bench report gpu pictures site app light bundle desktop clean
+.PHONY: help demo quick test slow check sizes format elsewhere faults parity wheels others bench report gpu pictures site app light bundle desktop clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -92,6 +92,16 @@ parity: $(STAMP)  ## vectors and masks against those of open_clip, segment_anyth
 	  'pyproject.toml', 'rb'))['project']['optional-dependencies']['parity'])")
 	PYTHONPATH=$(CURDIR)/$(PARITY) $(BIN)/python -m pytest --slow tests/semantics/test_parity.py
 
+wheels: $(STAMP)  ## ask the package index for wheels of Windows and macOS, and print the table of docs/installing.md
+	$(BIN)/python packaging/outside.py wheels
+
+OTHERS := .others
+others: system  ## open what is written here in other programs, kept in .others, and print the table of docs/files.md
+	-$(BIN)/pip install --quiet --upgrade --target $(OTHERS) --no-deps gaussforge==0.6.0 gsply==0.4.6 trimesh==5.2.0
+	-$(BIN)/npm install --prefix $(OTHERS) --silent --no-audit --no-fund \
+	  @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
+	PYTHONPATH=$(CURDIR)/$(OTHERS) $(BIN)/python packaging/outside.py programs
+
 bench: system  ## speed against error, on this machine
 	$(BIN)/langsplat bench raster --out bench_out
 
@@ -157,4 +167,4 @@ desktop: $(STAMP)  ## show the viewer among this user's programs, and open scene
 	-update-desktop-database $(DATA)/applications
 
 clean:  ## remove what these targets made
-	rm -rf $(VENV) $(LIGHT) $(GPU) $(NEWER) $(PARITY) $(SITE_VENV) build demo_out elsewhere_out bench_out dist .pytest_cache .mypy_cache .ruff_cache $(NPM)
+	rm -rf $(VENV) $(LIGHT) $(GPU) $(NEWER) $(PARITY) $(OTHERS) $(SITE_VENV) build demo_out elsewhere_out bench_out dist .pytest_cache .mypy_cache .ruff_cache $(NPM)

@@ -7,11 +7,15 @@ import os
 import platform
 import subprocess
 import sys
+import webbrowser
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
+
+import tyro
 
 from langsplat_core import __version__
 from langsplat_core.cli.arguments import AnyScene, JsonOption, Needs, OutFolder
@@ -181,9 +185,7 @@ PICTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "colours.png": (),
         "latent_whole.png": ("--display", "latent", "--level", "whole"),
-        "latent_part.png": ("--display", "latent", "--level", "part"),
         "blue_gift.png": ("--query", "blue gift"),
-        "keyboard.png": ("--query", "keyboard"),
         "segmentation.png": (
             *("--query", "teddy bear", "--query", "blue gift", "--query", "burger"),
             *("--display", "segmentation"),
@@ -194,12 +196,22 @@ PICTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Demo:
-    """Render images of the bundled scene and answer phrases about it."""
+    """Make a page and pictures of the bundled scene, answer phrases, and open the page in a browser."""
 
     out: OutFolder = Path("demo_out")
     """Folder to write."""
+    open: tyro.conf.FlagCreatePairsOff[bool] = True
+    """Open the page in the browser, where there is one with a window."""
 
     def run(self) -> None:
+        from langsplat_core.cli.export import Export
+
+        page = self.out.resolve() / "room.html"
+        Export(Path(str(files("langsplat_assets") / "demo" / "scene.ply")), page).run()
+        # Not a browser of the terminal's; $BROWSER is one elsewhere, as remote editors and WSL have it.
+        windows = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY", "BROWSER"} & {*os.environ}
+        if not (self.open and windows and webbrowser.open(page.as_uri())):
+            print(f"{page}: to be opened in a browser")
         viewer = [sys.executable, "-m", "langsplat_viewer"]
         if getattr(sys, "frozen", False):  # `make bundle`: the programs lie side by side
             viewer = [str(Path(sys.executable).with_stem("langsplat-viewer"))]
@@ -207,4 +219,4 @@ class Demo:
             command = [*viewer, "--headless", "--size", "960x720", "--out", str(self.out / name), *options]
             if code := subprocess.run(command, check=False).returncode:
                 raise LangSplatError(f"{self.out / name}: not rendered; the viewer ended with code {code}")
-        print(f"The pictures are in {self.out.resolve()}")
+        print(f"The pictures are in {page.parent}")

@@ -65,19 +65,16 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             patiently(lambda: temporary.unlink(missing_ok=True))
 
 
-def patiently(step: Callable[[], object]) -> None:
+def patiently(step: Callable[[], object]) -> object:
     """Replace or remove a file; Windows refuses that as long as another program has it open.
 
     A window that looks at a training's checkpoint has it for a moment, and so have scanners for viruses.
     """
     for wait in (0.05, 0.2, 0.8) if sys.platform == "win32" else ():
-        try:
-            step()
-        except PermissionError:
-            time.sleep(wait)
-        else:
-            return
-    step()
+        with suppress(PermissionError):
+            return step()
+        time.sleep(wait)
+    return step()
 
 
 def _take_rights(temporary: Path, place: Path) -> None:

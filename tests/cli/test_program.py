@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 import warnings
+import webbrowser
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -144,13 +145,19 @@ def test_doctor_tries_an_encoder_on_the_bundled_room(monkeypatch, capsys, tmp_pa
 
 
 @pytest.mark.long
-def test_demo_renders_the_bundled_scene(tmp_path, monkeypatch, capfd):
+def test_demo_renders_the_bundled_scene_and_opens_its_page(tmp_path, monkeypatch, capfd):
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda page: opened.append(page) or True)
+    monkeypatch.setenv("DISPLAY", ":987")
     monkeypatch.setattr(scenes, "PICTURES", {"gift.png": ("--query", "blue gift")})
     assert run("demo", "--out", tmp_path) == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["gift.png"]
+    assert {path.name for path in tmp_path.iterdir()} == {"gift.png", "room.html"}
     assert "'blue gift': found" in capfd.readouterr().out
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(scenes, "PICTURES", {"gift.png": ("--camera", "absent")})
     assert run("demo", "--out", tmp_path) == 2
+    assert opened == [(tmp_path / "room.html").as_uri()]  # once: without a screen there is no browser
 
 
 # Odd values for every option and place of every command: refused in a line, or used.

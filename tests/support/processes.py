@@ -403,10 +403,7 @@ def killed_everywhere(work: Callable[[], int | None], folder: Path) -> Iterator[
 
 # Windows, as far as it can be had here.
 
-LACKING = {
-    os: "chown fork geteuid getuid killpg link mkfifo posix_fallocate sched_getaffinity symlink uname",
-    signal: "SIGALRM SIGCHLD SIGHUP SIGKILL SIGPIPE SIGUSR1 alarm setitimer",
-}
+LACKING = "chown fork geteuid getuid killpg link mkfifo posix_fallocate sched_getaffinity symlink uname"
 NO_NAME = re.compile(r"""(?i)[<>:"|?*\\]|[. ]$|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)""")
 
 
@@ -423,15 +420,10 @@ def as_on_windows() -> None:
     What is open or mapped is neither replaced nor removed, and some names are refused.
     """
     sys.modules.update(dict.fromkeys(("fcntl", "grp", "pwd", "resource", "termios")))  # type: ignore[arg-type]
-    for module, names in LACKING.items():
-        for name in names.split():
-            delattr(module, name)
+    for name in LACKING.split():
+        delattr(os, name)
     shutil._use_fd_functions = False  # type: ignore[attr-defined]  # noqa: SLF001  by opening folders
-    load, asking = ctypes.CDLL.__init__, threading.local()
-
-    def library(self: ctypes.CDLL, name: str | None, *options: Any, **others: Any) -> None:
-        assert name is not None, "Windows has no one C library"
-        load(self, name, *options, **others)
+    asking = threading.local()
 
     def refuse(event: str, given: tuple[Any, ...]) -> None:
         if event not in STEPS or not isinstance(given[0], str | os.PathLike) or hasattr(asking, "on"):
@@ -446,7 +438,6 @@ def as_on_windows() -> None:
         if ends[0].startswith(("/proc/", "/dev/shm/")):
             raise FileNotFoundError(errno.ENOENT, "no such place on Windows", ends[0])
 
-    ctypes.CDLL.__init__ = library  # type: ignore[method-assign]
     sys.addaudithook(refuse)
 
 
