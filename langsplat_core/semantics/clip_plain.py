@@ -1,12 +1,13 @@
-"""The text half of a small CLIP of few words in NumPy, from the files of its weights and tokenizer.
+"""A small CLIP of few words in NumPy, from the files of its weights and tokenizer.
 
 Written here so that search with the bundled encoder needs neither torch nor transformers nor tokenizers,
-which take seconds to import and hundreds of megabytes to install.
+which take seconds to import and hundreds of megabytes to install; training needs no transformers.
 
 The network is that of Radford et al. 2021: token and position vectors, layers of causal self-attention and a
 two-layer perceptron, each behind a layer norm and added to what came in, a last norm, and the vector at the
-end token projected. It is equal to `transformers.CLIPTextModelWithProjection` but for rounding. The tokenizer
-is CLIP's byte-pair encoding (Sennrich et al. 2016) of words of the letters a to z.
+end token projected; of an image patches are tokens, and the first of them is projected. It is equal to
+`transformers.CLIPTextModelWithProjection` and its sister for vision but for rounding. The tokenizer is CLIP's
+byte-pair encoding (Sennrich et al. 2016) of words of the letters a to z.
 """
 
 import json
@@ -30,6 +31,7 @@ TEMPERATURE = 10.0  # of LERF and LangSplat, whatever scale a checkpoint ended i
 PREFIX = "text_model."
 TOKENS, POSITIONS = (f"{PREFIX}embeddings.{name}_embedding.weight" for name in ("token", "position"))
 PROJECTION = "text_projection.weight"
+SEEN, PATCHES = "vision_model.", "vision_model.embeddings."
 
 Tensors = Mapping[str, Array]  # name -> float32
 
@@ -47,6 +49,21 @@ class TextConfig:
     layer_norm_eps: float = 1e-5
     eos_token_id: int = 49_407
     projection_dim: int = 512
+
+
+@dataclass(frozen=True)
+class VisionConfig:
+    """The same of the image half."""
+
+    hidden_size: int = 768
+    intermediate_size: int = 3_072
+    num_hidden_layers: int = 12
+    num_attention_heads: int = 12
+    num_channels: int = 3
+    image_size: int = 224
+    patch_size: int = 32
+    hidden_act: str = "quick_gelu"
+    layer_norm_eps: float = 1e-5
 
 
 def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int]) -> None:
@@ -95,7 +112,7 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
         settings = {"projection_dim": stated["projection_dim"]}
         config = msgspec.convert({**stated["text_config"], **settings}, TextConfig)
         tokenizer = read_tokenizer(weights.folder / TOKENIZER)
-        tensors = _tensors(weights.folder, config)
+        tensors = _tensors(weights.folder, config, PREFIX, PROJECTION, others=5)
         tower = PlainClipText(weights.id, config, tensors, tokenizer)
         rows = len(tensors[TOKENS]), len(tensors[POSITIONS])
         # What a later phrase would meet, and what the first word shows.
@@ -109,19 +126,58 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
         return None
 
 
-def _tensors(folder: Path, config: TextConfig) -> dict[str, Array]:
-    """Return the tensors of the text half as float32; ValueError where they are not those of its layers."""
+class PlainClipImages:
+    """An `ImageTower` in NumPy."""
+
+    def __init__(self, config: VisionConfig, tensors: Tensors, statistics: tuple[Array, Array]) -> None:
+        self.config, self.tensors, self.statistics = config, tensors, statistics
+        self.image_size = config.image_size
+
+    def encode(self, pixels: Array) -> Array:
+        config, side = self.config, self.config.image_size // self.config.patch_size
+        cut = pixels.reshape(len(pixels), config.num_channels, side, config.patch_size, side, -1)
+        patches = cut.transpose(0, 2, 4, 1, 3, 5).reshape(len(pixels) * side**2, -1)
+        weight = self.tensors[f"{PATCHES}patch_embedding.weight"].reshape(config.hidden_size, -1)
+        x = np.empty((len(pixels), 1 + side**2, config.hidden_size), np.float32)
+        x[:, 0] = self.tensors[f"{PATCHES}class_embedding"]
+        x[:, 1:] = (patches @ weight.T).reshape(len(pixels), side**2, -1)
+        x += self.tensors[f"{PATCHES}position_embedding.weight"]
+        x = _norm(self.tensors, f"{SEEN}pre_layrnorm", x, config.layer_norm_eps)  # spelt so
+        x = _layers(self.tensors, SEEN, config, x)[:, 0]
+        last = _norm(self.tensors, f"{SEEN}post_layernorm", x, config.layer_norm_eps)
+        return last @ self.tensors["visual_projection.weight"].T
+
+
+def plain_image_tower(weights: Weights, statistics: tuple[Array, Array]) -> PlainClipImages | None:
+    """Return the image half of what `plain_text_tower` takes, if it is whole; else None, for torch."""
+    if weights.converted or weights.device != "cpu" or not (weights.folder / VOCABULARY).is_file():
+        return None
+    try:
+        stated = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))["vision_config"]
+        config = msgspec.convert(stated, VisionConfig)
+        tensors = _tensors(weights.folder, config, SEEN, "visual_projection.weight", others=8)
+        tower = PlainClipImages(config, tensors, statistics)
+        tower.encode(np.zeros((1, config.num_channels, config.image_size, config.image_size), np.float32))
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError):
+        return None
+    return tower if config.hidden_act == "quick_gelu" else None
+
+
+def _tensors(
+    folder: Path, config: TextConfig | VisionConfig, prefix: str, projection: str, others: int
+) -> dict[str, Array]:
+    """Return the tensors of a half as float32; ValueError where they are not those of its layers."""
     from safetensors import SafetensorError, safe_open
 
     found: dict[str, Array] = {}
     try:
         for path in (path for pattern in SAFE for path in folder.glob(pattern)):
             with safe_open(path, framework="np") as file:
-                names = [name for name in file.keys() if name.startswith(PREFIX) or name == PROJECTION]  # noqa: SIM118
+                names = [name for name in file.keys() if name.startswith(prefix) or name == projection]  # noqa: SIM118
                 found |= {name: file.get_tensor(name).astype(np.float32) for name in names}
     except SafetensorError as error:
         raise ValueError(error) from None
-    if len(found) != 5 + 16 * config.num_hidden_layers:
+    if len(found) != others + 16 * config.num_hidden_layers:
         raise ValueError(f"{len(found)} tensors")
     return found
 
@@ -131,46 +187,60 @@ def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) 
     eps, length = config.layer_norm_eps, ids.shape[1]
     later = np.triu(np.full((length, length), -np.inf, np.float32), 1)
     x = tensors[TOKENS][ids] + tensors[POSITIONS][:length]
+    x = _layers(tensors, PREFIX, config, x, later)
+    last = _norm(tensors, f"{PREFIX}final_layer_norm", x[np.arange(len(ids)), ends], eps)
+    return last @ tensors[PROJECTION].T
+
+
+def _layers(
+    tensors: Tensors, prefix: str, config: TextConfig | VisionConfig, x: Array, later: Array | None = None
+) -> Array:
+    """(B, L, W) tokens behind all layers; `later` as of `_attention`."""
     for number in range(config.num_hidden_layers):
-        layer = f"{PREFIX}encoder.layers.{number}."
+        layer, eps = f"{prefix}encoder.layers.{number}.", config.layer_norm_eps
         before = _norm(tensors, f"{layer}layer_norm1", x, eps)
         x = x + _attention(tensors, f"{layer}self_attn.", before, later, config.num_attention_heads)
         inner = _linear(tensors, f"{layer}mlp.fc1", _norm(tensors, f"{layer}layer_norm2", x, eps))
         x = x + _linear(tensors, f"{layer}mlp.fc2", _quick_gelu(inner))
-    last = _norm(tensors, f"{PREFIX}final_layer_norm", x[np.arange(len(ids)), ends], eps)
-    return last @ tensors[PROJECTION].T
+    return x
 
 
 def _linear(tensors: Tensors, name: str, x: Array) -> Array:
     weight = tensors[f"{name}.weight"]
     # As one product of matrices: NumPy would take (B, L, W) in B small ones, ten times slower.
-    product = x.reshape(-1, x.shape[-1]) @ weight.T + tensors[f"{name}.bias"]
+    product = x.reshape(-1, x.shape[-1]) @ weight.T
+    product += tensors[f"{name}.bias"]
     return product.reshape(*x.shape[:-1], len(weight))
 
 
 def _norm(tensors: Tensors, name: str, x: Array, eps: float) -> Array:
     centred = x - x.mean(-1, keepdims=True)
-    spread = np.sqrt((centred**2).mean(-1, keepdims=True) + np.float32(eps))
-    return centred / spread * tensors[f"{name}.weight"] + tensors[f"{name}.bias"]
+    squares = np.einsum("...i,...i", centred, centred)[..., None]
+    centred /= np.sqrt(squares / np.float32(x.shape[-1]) + np.float32(eps))
+    centred *= tensors[f"{name}.weight"]
+    return centred + tensors[f"{name}.bias"]
 
 
-def _attention(tensors: Tensors, name: str, x: Array, later: Array, heads: int) -> Array:
-    """x: (B, L, W); later: (L, L), -infinity where a token comes after another one."""
+def _attention(tensors: Tensors, name: str, x: Array, later: Array | None, heads: int) -> Array:
+    """x: (B, L, W); later: (L, L), -infinity where a token comes after another one; None: all are seen."""
     batch, length, wide = x.shape
     query, key, value = (
         _linear(tensors, f"{name}{part}_proj", x).reshape(batch, length, heads, -1).transpose(0, 2, 1, 3)
         for part in "qkv"
     )
-    scores = query @ key.transpose(0, 1, 3, 2) * np.float32((wide // heads) ** -0.5) + later
-    shares = np.exp(scores - scores.max(-1, keepdims=True))
+    shares = (query * np.float32((wide // heads) ** -0.5)) @ key.transpose(0, 1, 3, 2)
+    shares += np.float32(0) if later is None else later
+    shares -= shares.max(-1, keepdims=True)
+    np.exp(shares, out=shares)
     shares /= shares.sum(-1, keepdims=True)
     return _linear(tensors, f"{name}out_proj", (shares @ value).transpose(0, 2, 1, 3).reshape(x.shape))
 
 
 def _quick_gelu(x: Array) -> Array:
     with np.errstate(over="ignore"):  # of a large negative number: 0
-        gelu: Array = x / (1 + np.exp(np.float32(-1.702) * x))
-    return gelu
+        shares = np.exp(np.float32(-1.702) * x)
+    shares += 1
+    return np.asarray(np.divide(x, shares, out=shares))
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from langsplat_core.io.files import write_json
 from langsplat_core.io.hostile import decode_json, read_text
 from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField
 from langsplat_core.semantics import weights as models
-from langsplat_core.semantics.clip_plain import TEMPERATURE, TOKENIZER, check_whole, plain_text_tower
+from langsplat_core.semantics.clip_plain import TEMPERATURE, TOKENIZER, check_whole, plain_image_tower, plain_text_tower
 from langsplat_core.semantics.weights import Weights
 
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
@@ -57,8 +57,8 @@ class ImageTower(Protocol):
     image_size: int  # side of the images it takes, px
     statistics: tuple[Array, Array]  # (3,) mean and deviation to be taken out, of values in [0, 1]
 
-    def encode(self, pixels: Any) -> Any:
-        """(B, 3, S, S) float32 tensor, normalised -> (B, D) float tensor, of any length."""
+    def encode(self, pixels: Array) -> Array:
+        """(B, 3, S, S) float32, normalised -> (B, D) float32 vectors, of any length."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class Encoder(PhraseEncoder):
 
     def __init__(self, weights: Weights, text: TextTower, images: ImageTower, batch: int) -> None:
         super().__init__(weights, text)
-        self._images, self._device, self._batch = images, weights.device, batch
+        self._images, self._batch = images, batch
         self.image_size = images.image_size  # side of the images it takes, px
 
     def encode_images(self, crops: Array | Sequence[Array]) -> Array:
@@ -212,12 +212,9 @@ class Encoder(PhraseEncoder):
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
     def _encode(self, crops: Array) -> Array:
-        import torch
-
         mean, std = self._images.statistics
         pixels = (crops.astype(np.float32) / 255 - mean) / std
-        inputs = torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(self._device)
-        return unit(inferred(lambda: self._images.encode(inputs)))
+        return unit(self._images.encode(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))))
 
 
 @models.asking_errors("the encoder")
@@ -256,11 +253,15 @@ class Images:
         usual: (2, 3) mean and standard deviation of pixels, unless preprocessor_config.json states others.
         """
         self._model, self._output = models.load_model(kind, weights, config), output
+        self._device = weights.device
         self.image_size = int(self._model.config.image_size)
         self.statistics = _pixel_statistics(weights, usual)
 
-    def encode(self, pixels: Any) -> Any:
-        return getattr(self._model(pixel_values=pixels), self._output)
+    def encode(self, pixels: Array) -> Array:
+        import torch
+
+        inputs = torch.from_numpy(pixels).to(self._device)
+        return inferred(lambda: getattr(self._model(pixel_values=inputs), self._output))
 
 
 def _pixel_statistics(weights: Weights, usual: Array) -> tuple[Array, Array]:
@@ -398,6 +399,11 @@ def torch_clip_text(weights: Weights) -> TorchText:
 
 
 def clip_images(weights: Weights) -> ImageTower:
+    """Return the image tower in NumPy where the model is small, else by torch."""
+    return plain_image_tower(weights, _pixel_statistics(weights, CLIP_PIXELS)) or torch_clip_images(weights)
+
+
+def torch_clip_images(weights: Weights) -> Images:
     """Return the image tower of a CLIP, by torch."""
     from transformers import CLIPConfig
     from transformers import CLIPVisionModelWithProjection as Model
