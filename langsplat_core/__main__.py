@@ -1,5 +1,11 @@
 """The `langsplat` command, also as ``python -m langsplat_core`` for launchers such as torchrun."""
 
+import os
+
+# Read when NumPy is imported: its products are small here, and BLAS's threads wait for one another by
+# spinning, a tenth of a training's seconds. `compiled.Workers` shares out what is large.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from langsplat_core.interrupts import end_in_a_line
 
 

@@ -161,13 +161,26 @@ class Workers:
         return self.each(compiled, [(*edge, *arguments) for edge in pairwise(edges)])
 
     def each(self, compiled: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Run compiled(*call) for every call; return what they return."""
+        """Run compiled(*call) for every call; return what they return.
+
+        The caller's thread takes calls too: handing one over and waiting for it costs more than small ones.
+        """
         if len(calls) <= 1 or self.threads <= 1:
             return [compiled(*call) for call in calls]
         if self._process != os.getpid():  # after a fork, which takes no threads along
             self._begin()
-        jobs = [self._pool.submit(compiled, *call) for call in calls]
-        return [job.result() for job in jobs]
+        left, results = iter(range(len(calls))), [None] * len(calls)
+
+        def take() -> None:
+            for number in left:
+                results[number] = compiled(*calls[number])
+
+        jobs = [self._pool.submit(take) for _ in range(min(self.threads, len(calls)) - 1)]
+        take()
+        for job in jobs:
+            if not job.cancel():  # it has not begun: others were faster
+                job.result()
+        return results
 
 
 @cache

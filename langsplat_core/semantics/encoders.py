@@ -29,7 +29,13 @@ from langsplat_core.io.files import write_json
 from langsplat_core.io.hostile import decode_json, read_text
 from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField
 from langsplat_core.semantics import weights as models
-from langsplat_core.semantics.clip_plain import TEMPERATURE, TOKENIZER, check_whole, plain_image_tower, plain_text_tower
+from langsplat_core.semantics.clip_plain import (
+    TEMPERATURE,
+    TOKENIZER,
+    check_whole,
+    plain_image_tower,
+    plain_text_tower,
+)
 from langsplat_core.semantics.weights import Weights
 
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import minimum_filter
 
 from langsplat_core.arrays import Array, unit
@@ -126,103 +125,152 @@ def sweep(
     index: int, others: Sequence[int], cameras: Sequence[Camera], greys: Sequence[Array], known: Array
 ) -> tuple[Array, Array]:
     """Return the (H, W) depths of a view by neighbours, and scores; greys: (H, W) float32 in [0, 1]."""
-    camera, grey, run = cameras[index], greys[index], shared_workers().run
-    planes = inverse_depths(camera, cameras, known)
-    best = np.full((BEST, PLANES, *grey.shape), -1, np.float32)
-    for other in others:
-        run(score_planes, PLANES, grey, greys[other], *warp(camera, cameras[other]), planes, best)
-    at, score = np.empty(grey.shape, np.float32), np.empty(grey.shape, np.float32)
-    run(_choose_planes, len(grey), best, min(BEST, len(others)), at, score)
+    planes = inverse_depths(cameras[index], cameras, known)
+    scores = plane_scores(cameras[index], greys[index], [(cameras[k], greys[k]) for k in others], planes)
+    at, score = np.empty(scores.shape[1:], np.float32), np.empty(scores.shape[1:], np.float32)
+    shared_workers().run(_choose_planes, len(at), scores, at, score)
     return 1 / (planes[0] + at.astype(np.float64) * (planes[1] - planes[0])), score
 
 
+def plane_scores(camera: Camera, grey: Array, others: Sequence[tuple[Camera, Array]], planes: Array) -> Array:
+    """Return (P, H, W) float32 means of each pixel's `BEST` correlations with other views at (P,) planes."""
+    scores = np.empty((len(planes), *grey.shape), np.float32)
+    warps = np.stack([np.column_stack(warp(camera, other)) for other, _ in others])
+    sizes, pixels = np.array([image.shape for _, image in others]), [image.ravel() for _, image in others]
+    own = np.stack([grey, *window_moments(grey)])
+    shared_workers().run(
+        _score_planes, len(planes), own, np.concatenate(pixels), sizes, warps, planes, scores
+    )
+    return scores
+
+
+def window_moments(grey: Array) -> Array:
+    """Return the (3, H, W) float32 means, variances and 1 / pixels of windows, the image's part of them."""
+    moments = np.stack([np.ones(grey.shape), grey, grey.astype(np.float64) ** 2])
+    for axis in (1, 2):
+        ends = np.arange(grey.shape[axis - 1]) + RADIUS + 1
+        sums = np.pad(moments.cumsum(axis), [(0, 0), *((side == axis, 0) for side in (1, 2))])
+        upper = sums.take(np.minimum(ends, grey.shape[axis - 1]), axis)
+        moments = upper - sums.take(np.maximum(ends - 2 * RADIUS - 1, 0), axis)
+    count, total, squares = moments
+    mean = total / count
+    return np.stack([mean, (squares / count - mean**2).clip(0), 1 / count]).astype(np.float32)
+
+
 @kernel
-def score_planes(
-    first: int, last: int, grey: Array, other: Array, turn: Array, shift: Array, planes: Array, best: Array
+def _score_planes(
+    first: int, last: int, own: Array, pixels: Array, sizes: Array, warps: Array, planes: Array, scores: Array
 ) -> None:
-    """Correlate windows at planes [first, last); `best`: (BEST, P, H, W) scores, descending."""
-    height, width = grey.shape
-    warped = np.empty((height, width), np.float32)
-    moments = np.empty((5, height, width), np.float32)  # sums of x, y, x^2, y^2, x y along rows of windows
-    sums = np.empty((5, width), np.float32)
+    """Correlate windows with those of other images at planes [first, last).
+
+    own: (4, H, W) the image and its `window_moments`; pixels: of the others, one after the other, of (K, 2)
+    `sizes`; warps: (K, 3, 4) turns and shifts; scores: (P, H, W). Loops are over plain rows, which the
+    compiler vectorises.
+    """
+    _, height, width = own.shape
+    warped, second = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    along, sums = np.empty((3, height, width), np.float32), np.empty((3, width), np.float32)
+    places, ways = np.empty(width, np.int32), np.empty((2, width), np.float32)
+    padded = np.zeros((3, width + 2 * RADIUS), np.float32)
     for plane in range(first, last):
-        _warp_image(other, turn, shift, planes[plane], warped)
-        for row in range(height):
-            _sum_along(grey[row], warped[row], moments, row)
-        for row in range(height):
-            top, bottom = max(row - RADIUS, 0), min(row + RADIUS + 1, height)
-            sums[:] = 0
-            for r in range(top, bottom):
-                for m in range(5):
-                    for x in range(width):
-                        sums[m, x] += moments[m, r, x]
-            for x in range(width):
-                across = min(x + RADIUS + 1, width) - max(x - RADIUS, 0)
-                score = _correlation(sums, x, np.float32(1) / np.float32((bottom - top) * across))
-                score = score if warped[row, x] >= 0 else np.float32(-1)
-                for k in range(BEST):
-                    if score > best[k, plane, row, x]:
-                        score, best[k, plane, row, x] = best[k, plane, row, x], score
+        best, start = scores[plane], 0
+        best[:], second[:] = -1, -1
+        for k in range(len(sizes)):
+            other = pixels[start : start + sizes[k, 0] * sizes[k, 1]].reshape(sizes[k, 0], sizes[k, 1])
+            start += other.size
+            across, down = warps[k, :, 0], warps[k, :, 1]
+            p0, step = (
+                0.5 * across + warps[k, :, 2] + planes[plane] * warps[k, :, 3],
+                across.astype(np.float32),
+            )
+            for row in range(height):
+                p = p0 + (row + 0.5) * down
+                _warp_row(other, p.astype(np.float32), step, places, ways, warped[row])
+                _sum_along(own[0, row], warped[row], padded, along[:, row])
+            for row in range(height):
+                sums[:] = 0
+                for r in range(max(row - RADIUS, 0), min(row + RADIUS + 1, height)):
+                    for m in range(3):
+                        _add(sums[m], along[m, r])
+                _keep_best(own[1:, row], sums, warped[row], best[row], second[row])
+        if len(sizes) > 1:
+            best += second
+            best *= np.float32(1 / BEST)
 
 
 @helper
-def _warp_image(other: Array, turn: Array, shift: Array, inverse_depth: float, warped: Array) -> None:
-    """Fill `warped` with the other image through the plane, bilinear; -1 outside of it."""
-    height, width = other.shape
-    for row in range(warped.shape[0]):
-        for column in range(warped.shape[1]):
-            x, y = column + 0.5, row + 0.5
-            z = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] + inverse_depth * shift[2]
-            u = (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] + inverse_depth * shift[0]) / z - 0.5
-            v = (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] + inverse_depth * shift[1]) / z - 0.5
-            if z > 0 and 0 <= u < width - 1 and 0 <= v < height - 1:
-                i, j = int(u), int(v)
-                a, b = np.float32(u - i), np.float32(v - j)
-                above = other[j, i] + a * (other[j, i + 1] - other[j, i])
-                below = other[j + 1, i] + a * (other[j + 1, i + 1] - other[j + 1, i])
-                warped[row, column] = above + b * (below - above)
-            else:
-                warped[row, column] = -1
-
-
-@helper
-def _sum_along(grey: Array, warped: Array, moments: Array, row: int) -> None:
-    """Sum along the windows of a row; beside the image there is nothing."""
+def _sum_along(grey: Array, warped: Array, padded: Array, along: Array) -> None:
+    """Sum y, y^2 and x y along windows of a row; `padded` (3, W + 2 RADIUS) has zeros at both ends."""
     width = grey.shape[0]
-    for m in range(5):
-        moments[m, row] = 0
-    for offset in range(-RADIUS, RADIUS + 1):
-        for x in range(max(-offset, 0), min(width - offset, width)):
-            a, b = grey[x + offset], warped[x + offset]
-            moments[0, row, x] += a
-            moments[1, row, x] += b
-            moments[2, row, x] += a * a
-            moments[3, row, x] += b * b
-            moments[4, row, x] += a * b
+    middle = slice(RADIUS, RADIUS + width)
+    y, squares, products = padded[0, middle], padded[1, middle], padded[2, middle]
+    for i in range(width):
+        y[i] = warped[i]
+        squares[i] = warped[i] * warped[i]
+        products[i] = grey[i] * warped[i]
+    for m in range(3):
+        along[m] = 0
+        for offset in range(2 * RADIUS + 1):
+            _add(along[m], padded[m, offset : offset + width])
 
 
 @helper
-def _correlation(sums: Array, x: int, share: float) -> float:
-    """Zero-mean normalised cross-correlation of a window; what is flat correlates with nothing."""
-    flat = np.float32(1e-5)  # added to variances, of grey values in [0, 1]
-    mean_a, mean_b = sums[0, x] * share, sums[1, x] * share
-    spread_a = max(sums[2, x] * share - mean_a * mean_a, np.float32(0)) + flat
-    spread_b = max(sums[3, x] * share - mean_b * mean_b, np.float32(0)) + flat
-    return (sums[4, x] * share - mean_a * mean_b) / np.sqrt(spread_a * spread_b)
+def _add(total: Array, values: Array) -> None:
+    for i in range(total.shape[0]):
+        total[i] += values[i]
+
+
+@helper
+def _warp_row(other: Array, p: Array, d: Array, places: Array, ways: Array, warped: Array) -> None:
+    """Fill `warped` with a row of the other image, bilinear; -1 outside of it.
+
+    p, d: (3,) float32 homogeneous pixel that the row's first one falls on, and its step; places, ways: room
+    for (W,) int32 pixels and for the (2, W) ways to the next ones, found without a branch.
+    """
+    width, flat = other.shape[1], other.reshape(-1)
+    none, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    right, bottom = np.float32(width - 1), np.float32(other.shape[0] - 1)
+    for x in range(warped.shape[0]):
+        inverse = one / (p[2] + np.float32(x) * d[2])
+        u = (p[0] + np.float32(x) * d[0]) * inverse - half
+        v = (p[1] + np.float32(x) * d[1]) * inverse - half
+        inside = (inverse > none) & (u >= none) & (u < right) & (v >= none) & (v < bottom)
+        u, v = u if inside else none, v if inside else none
+        i, j = np.int32(u), np.int32(v)
+        ways[0, x], ways[1, x] = u - np.float32(i), v - np.float32(j)
+        places[x] = j * np.int32(width) + i if inside else np.int32(-1)
+    for x in range(warped.shape[0]):
+        warped[x] = -1
+        if places[x] >= 0:
+            at, a, b = np.uint32(places[x]), ways[0, x], ways[1, x]
+            above = flat[at] + a * (flat[at + np.uint32(1)] - flat[at])
+            at += np.uint32(width)
+            below = flat[at] + a * (flat[at + np.uint32(1)] - flat[at])
+            warped[x] = above + b * (below - above)
+
+
+@helper
+def _keep_best(own: Array, sums: Array, warped: Array, best: Array, second: Array) -> None:
+    """Zero-mean normalised cross-correlation of a row's windows; what is flat correlates with nothing."""
+    flat, none = np.float32(1e-5), np.float32(0)  # added to variances, of grey values in [0, 1]
+    for x in range(best.shape[0]):
+        mean = sums[0, x] * own[2, x]
+        spread = sums[1, x] * own[2, x] - mean * mean
+        spread = (spread if spread > none else none) + flat
+        score = (sums[2, x] * own[2, x] - own[0, x] * mean) / np.sqrt((own[1, x] + flat) * spread)
+        score = score if warped[x] >= none else np.float32(-1)
+        worse = score if score < best[x] else best[x]
+        best[x] = score if score > best[x] else best[x]
+        second[x] = worse if worse > second[x] else second[x]
 
 
 @kernel
-def _choose_planes(first: int, last: int, best: Array, count: int, at: Array, score: Array) -> None:
+def _choose_planes(first: int, last: int, scores: Array, at: Array, score: Array) -> None:
     """Find the plane of every pixel of rows [first, last), between planes by a parabola, and its score."""
-    planes, width = best.shape[1], best.shape[3]
-    mean = np.empty(planes, np.float32)
+    planes, _, width = scores.shape
     for row in range(first, last):
         for x in range(width):
-            for plane in range(planes):
-                total = np.float32(0)
-                for k in range(count):
-                    total += best[k, plane, row, x]
-                mean[plane] = total / np.float32(count)
+            mean = scores[:, row, x]
             top = int(np.argmax(mean))
             inner = min(max(top, 1), planes - 2)
             bend = mean[inner - 1] - 2 * mean[inner] + mean[inner + 1]
@@ -249,10 +297,21 @@ def shared_depths(depth: Array) -> Array:
 
     What two views agree on by chance is alone, and would free a window of space behind the surface.
     """
-    size = 2 * RADIUS + 1
-    windows = sliding_window_view(np.pad(depth, RADIUS, constant_values=np.nan), (size, size))
-    alike = (np.abs(windows / depth[..., None, None] - 1) < ALIKE).sum((2, 3))
-    return np.where(alike >= LEAST_ALIKE * size**2, depth, np.nan)
+    alike = np.empty(depth.shape, np.int32)
+    shared_workers().run(_count_alike, len(depth), depth, alike)
+    return np.where(alike >= LEAST_ALIKE * (2 * RADIUS + 1) ** 2, depth, np.nan)
+
+
+@kernel
+def _count_alike(first: int, last: int, depth: Array, alike: Array) -> None:
+    """Count the pixels of the window around each of rows [first, last) that share its depth."""
+    height, width = depth.shape
+    for row in range(first, last):
+        for x in range(width):
+            alike[row, x] = 0
+            for r in range(max(row - RADIUS, 0), min(row + RADIUS + 1, height)):
+                for c in range(max(x - RADIUS, 0), min(x + RADIUS + 1, width)):
+                    alike[row, x] += abs(depth[r, c] / depth[row, x] - 1) < ALIKE
 
 
 def free_depths(camera: Camera, depth: Array, known: Array) -> Array:

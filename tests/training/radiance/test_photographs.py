@@ -12,7 +12,6 @@ from skimage.metrics import structural_similarity
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.scene import Camera, look_at
-from langsplat_core.training.radiance import stereo
 from langsplat_core.training.radiance.losses import (
     GRID,
     MOST,
@@ -28,14 +27,13 @@ from langsplat_core.training.radiance.losses import (
     with_exposure,
 )
 from langsplat_core.training.radiance.stereo import (
-    PLANES,
     RADIUS,
     find_depths,
     in_free_space,
     inverse_depths,
     neighbouring_views,
+    plane_scores,
     sweep,
-    warp,
 )
 
 
@@ -273,8 +271,7 @@ def test_sweep_scores_equal_the_reference() -> None:
     one, two = row_of_cameras()[1:3]
     greys = [picture(camera).mean(2, dtype=np.float32) / 255 for camera in (one, two)]
     planes = inverse_depths(one, [one, two], capture().points)
-    best = np.full((stereo.BEST, PLANES, *greys[0].shape), -1, np.float32)
-    stereo.score_planes(0, PLANES, *greys, *warp(one, two), planes, best)
+    scores = plane_scores(one, greys[0], [(two, greys[1])], planes)
     judged = 0
     for row, column, plane in ((20, 30, 40), (27, 36, 60), (33, 41, 5), (15, 52, 77)):
         rows, columns = range(row - RADIUS, row + RADIUS + 1), range(column - RADIUS, column + RADIUS + 1)
@@ -285,9 +282,10 @@ def test_sweep_scores_equal_the_reference() -> None:
         if np.isfinite(seen).all():
             judged += 1
             window = greys[0][rows.start : rows.stop, columns.start : columns.stop].astype(float)
-            assert best[0, plane, row, column] == pytest.approx(correlation(window, seen), abs=2e-4)
+            assert scores[plane, row, column] == pytest.approx(correlation(window, seen), abs=2e-4)
     assert judged >= 3
-    assert (best[1] == -1).all()  # one neighbour has one score
+    twice = plane_scores(one, greys[0], [(two, greys[1]), (row_of_cameras()[4], greys[1])], planes)
+    np.testing.assert_array_equal(twice, (scores - 1) / 2)  # a view that sees nothing of it
 
 
 def test_depths_lie_on_the_true_surface() -> None:
