@@ -2,6 +2,7 @@
 
 import heapq
 import json
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Protocol
@@ -179,10 +180,11 @@ class RegionGraph:
         self._labels = labels
         count = int(labels.max()) + 1
         flat = labels.ravel()
-        self._size = np.bincount(flat, minlength=count).astype(float)  # px
+        # Plain numbers: thousands of costs are asked for, one at a time.
+        self._size = np.bincount(flat, minlength=count).astype(float).tolist()  # px
         shades = colours * (0.25, 1.0, 1.0)  # shade is no other thing
         sums = [np.bincount(flat, shades[..., c].ravel(), count) for c in range(3)]
-        self._mean = np.stack(sums, axis=1) / self._size[:, None]
+        self._mean = (np.stack(sums, axis=1) / np.array(self._size)[:, None]).tolist()
         self._neighbours = _adjacency(labels, colours, count)
         self._perimeter = [sum(length for length, _ in edges.values()) for edges in self._neighbours]
         self._parent = np.arange(count)
@@ -201,7 +203,7 @@ class RegionGraph:
                 self._merge(i, j)
         alive = np.flatnonzero(self._parent == np.arange(len(self._parent)))
         while len(alive) > 1:
-            smallest = int(alive[np.argmin(self._size[alive])])
+            smallest = min(alive.tolist(), key=self._size.__getitem__)
             if self._size[smallest] >= min_fraction * self._labels.size:
                 return
             into = min(self._neighbours[smallest], key=lambda other: (self._cost(smallest, other), other))
@@ -220,17 +222,18 @@ class RegionGraph:
         smaller = min(self._size[i], self._size[j]) / self._labels.size
         shared = length / min(self._perimeter[i], self._perimeter[j])
         enclosure = 1 - 0.5 * max(0.0, 2 * shared - 1)  # half the cost for one wholly inside another
-        difference = float(np.linalg.norm(self._mean[i] - self._mean[j])) + contrast / length
+        difference = math.dist(self._mean[i], self._mean[j]) + contrast / length
         # Small regions merge more cheaply; one of a 200th of the image at its plain cost.
-        return float(difference * (smaller / 0.005) ** 0.25 * enclosure)
+        return difference * (smaller / 0.005) ** 0.25 * enclosure
 
     def _push(self, i: int, j: int) -> None:
         heapq.heappush(self._heap, (self._cost(i, j), i, j, self._version[i], self._version[j]))
 
     def _merge(self, kept: int, gone: int) -> None:
         size = self._size[kept] + self._size[gone]
-        weighted = self._mean[kept] * self._size[kept] + self._mean[gone] * self._size[gone]
-        self._mean[kept], self._size[kept] = weighted / size, size
+        share = self._size[gone] / size
+        pairs = zip(self._mean[kept], self._mean[gone], strict=True)
+        self._mean[kept], self._size[kept] = [a + share * (b - a) for a, b in pairs], size
         edges = self._neighbours[gone]
         self._perimeter[kept] += self._perimeter[gone] - 2 * edges[kept][0]
         for other, (length, contrast) in edges.items():

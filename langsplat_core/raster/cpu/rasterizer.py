@@ -320,9 +320,15 @@ class CpuView(LiftingView):
     def radii(self) -> Array:
         """(N,) float32 px: the greater half extent of each footprint; 0 where nothing is drawn."""
         radii = np.zeros(self.count, np.float32)
-        touches = np.diff(self.tiles.firsts) > 0
-        radii[self.order] = np.where(touches, self.tiles.geometry[:, projection.HALF_WIDTH :].max(1), 0)
-        return radii
+        radii[self.order] = self.tiles.geometry[:, projection.HALF_WIDTH :].max(1)
+        return np.where(self.drawn, radii, 0)
+
+    @property
+    def drawn(self) -> Array:
+        """(N,) bool: has a footprint that meets a tile."""
+        drawn = np.zeros(self.count, bool)
+        drawn[self.order] = self.tiles.firsts[1:] > self.tiles.firsts[:-1]
+        return drawn
 
     def splat(self, values: Array) -> tuple[Array, Array]:
         """Blend (N, C) finite values into (H, W, C) and alpha (H, W), float32."""

@@ -66,7 +66,7 @@ class _CpuImage(torch.autograd.Function):
         values = colours(gaussians.sh, gaussians.means, eye)
         image, alpha = view.splat(values)
         ctx.kept = (gaussians, eye, view, values)
-        visible = torch.from_numpy(view.radii > 0)
+        visible = torch.from_numpy(view.drawn)
         ctx.mark_non_differentiable(visible)
         return torch.from_numpy(image), torch.from_numpy(alpha), visible
 

@@ -103,7 +103,7 @@ class TrainingState:
     second: dict[str, Tensor]  # Adam's second moments
     grad_sum: Tensor  # (N,) norms of the gradients by the projected means, NDC, summed over `seen` views
     seen: Tensor  # (N,) float32: in how many steps since the last round the Gaussian was visible
-    exposures: Tensor  # (V, 4, 3) affine changes of colours, of the training views
+    exposures: Tensor  # (V, 4, 3) affine changes of colours, of the training views, or none
     transients: Transients  # of the training views; of none where nothing may move
     rng: np.random.Generator
     updates: dict[str, int]  # how often Adam has updated each parameter

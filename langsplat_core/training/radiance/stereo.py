@@ -178,14 +178,11 @@ def _score_planes(
         for k in range(len(sizes)):
             other = pixels[start : start + sizes[k, 0] * sizes[k, 1]].reshape(sizes[k, 0], sizes[k, 1])
             start += other.size
-            across, down = warps[k, :, 0], warps[k, :, 1]
-            p0, step = (
-                0.5 * across + warps[k, :, 2] + planes[plane] * warps[k, :, 3],
-                across.astype(np.float32),
-            )
+            step, down = warps[k, :, 0], warps[k, :, 1]
+            corner = 0.5 * step + warps[k, :, 2] + planes[plane] * warps[k, :, 3]
             for row in range(height):
-                p = p0 + (row + 0.5) * down
-                _warp_row(other, p.astype(np.float32), step, places, ways, warped[row])
+                p = corner + (row + 0.5) * down
+                _warp_row(other, p.astype(np.float32), step.astype(np.float32), places, ways, warped[row])
                 _sum_along(own[0, row], warped[row], padded, along[:, row])
             for row in range(height):
                 sums[:] = 0

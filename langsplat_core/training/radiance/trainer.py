@@ -167,7 +167,6 @@ def train_radiance(
         state = training.load_checkpoint(checkpoint, made_from, renderer.device)
     else:
         state = training.start(first, config.seed, renderer.device)
-        state.exposures = losses.no_exposures(len(views), renderer.device)
         state.transients = losses.no_transients(0 if config.transients == "off" else len(views))
 
     recent: list[float] = []  # since the last mean
@@ -255,7 +254,7 @@ class _Run:
         camera, target, mask = self.views.at(index, coarse=step <= schedule.coarse_until)
         rendered = self.renderer.render(state.values, camera, schedule.active_sh_degree(step))
         image = rendered.image
-        if exposing and step >= exposing[0]:
+        if len(state.exposures):
             image = losses.with_exposure(image, state.exposures[index])
         self.observe_transients(state, index, image, target, mask)
         loss = self.emptiness(rendered.alpha, mask)
@@ -288,7 +287,7 @@ class _Run:
         return alpha.masked_fill(mask, 0).mean() if self.views.cut_out and mask is not None else 0.0
 
     def find_exposures(self, state: TrainingState) -> Tensor:
-        """(V, 4, 3) exposures of the training views; no change where they explain too little."""
+        """(V, 4, 3) exposures of the training views; none where they explain too little."""
         pairs: list[tuple[Tensor, Tensor]] = []
         for index in range(len(self.views)):
             camera, target, mask = self.views.at(index, coarse=True)
@@ -303,7 +302,7 @@ class _Run:
         log.debug("exposures of the photographs explain %.2f dB", gain)
         if gain >= 0.35 or self.config.exposure == "on":
             return exposures
-        return losses.no_exposures(len(self.views), exposures.device)
+        return losses.no_exposures(0, exposures.device)
 
     @property
     def transients_from(self) -> int:
@@ -320,7 +319,8 @@ class _Run:
         judged = state.step == self.transients_from and self.config.transients == "auto"
         if judged and state.transients.explained() < 0.24:
             state.transients = losses.no_transients(0)
-        if len(state.transients.moving):
+        # Of older observations a sixteenth would be left: each new one counts as much as all before.
+        if len(state.transients.moving) and state.step >= self.transients_from - 4 * len(self.views):
             rendered = losses.patch_means(image)
             if mask is not None:
                 rendered[losses.patch_means(mask[..., None].float())[..., 0] < 0.5] = np.nan
