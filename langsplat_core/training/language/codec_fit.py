@@ -332,11 +332,8 @@ def _badly_fitted(distance: Array, count: int, generator: np.random.Generator) -
 
 def _means(vectors: Array, nearest: Array, count: int) -> Array:
     """(K, D) float32 directions of the sums over each centre's vectors."""
-    order = np.argsort(nearest, kind="stable")
-    used, firsts = np.unique(nearest[order], return_index=True)
-    means = np.zeros((count, vectors.shape[1]), np.float32)
-    means[used] = unit(np.add.reduceat(vectors[order], firsts, axis=0))
-    return means
+    places = nearest, np.arange(len(vectors))
+    return unit(csr_matrix((np.ones(len(vectors), np.float32), places), (count, len(vectors))) @ vectors)
 
 
 # Colours of codewords by which neighbouring things are told apart.

@@ -167,9 +167,11 @@ def find_instances(
     instances = np.full(mask_weights.count, size, np.int64)
     for number, (first, last) in enumerate(mask_weights.blocks):
         weights = mask_weights.block(number, groups)[:, level * (size + 1) : (level + 1) * (size + 1)].tocsr()
-        if weights.nnz:
-            known = np.diff(weights.indptr) > 0
-            instances[first:last] = np.where(known, np.asarray(weights.argmax(axis=1)).ravel(), size)
+        row = np.repeat(np.arange(first, last), np.diff(weights.indptr))
+        most = np.zeros(mask_weights.count, np.float32)
+        np.maximum.at(most, row, weights.data)
+        heaviest = np.flatnonzero(weights.data == most[row])[::-1]
+        instances[row[heaviest]] = weights.indices[heaviest]  # of equal ones the first, written last
     order = np.argsort(-np.bincount(instances, minlength=size + 1)[:size], kind="stable")
     rank = np.full(size + 1, NO_NODE, np.int32)
     rank[order] = np.arange(size)
