@@ -11,6 +11,7 @@ byte-pair encoding (Sennrich et al. 2016) of words of the letters a to z.
 """
 
 import json
+import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -52,18 +53,10 @@ class TextConfig:
 
 
 @dataclass(frozen=True)
-class VisionConfig:
-    """The same of the image half."""
+class VisionConfig(TextConfig):
+    """The same of the image half, where its weights do not say it either."""
 
-    hidden_size: int = 768
-    intermediate_size: int = 3_072
-    num_hidden_layers: int = 12
     num_attention_heads: int = 12
-    num_channels: int = 3
-    image_size: int = 224
-    patch_size: int = 32
-    hidden_act: str = "quick_gelu"
-    layer_norm_eps: float = 1e-5
 
 
 def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int]) -> None:
@@ -131,21 +124,20 @@ class PlainClipImages:
 
     def __init__(self, config: VisionConfig, tensors: Tensors, statistics: tuple[Array, Array]) -> None:
         self.config, self.tensors, self.statistics = config, tensors, statistics
-        self.image_size = config.image_size
+        self.patch = len(tensors[f"{PATCHES}patch_embedding.weight"][0, 0])  # px, its side
+        self.side = math.isqrt(len(tensors[f"{PATCHES}position_embedding.weight"]) - 1)  # patches
+        self.image_size = self.side * self.patch
 
     def encode(self, pixels: Array) -> Array:
-        config, side = self.config, self.config.image_size // self.config.patch_size
-        cut = pixels.reshape(len(pixels), config.num_channels, side, config.patch_size, side, -1)
-        patches = cut.transpose(0, 2, 4, 1, 3, 5).reshape(len(pixels) * side**2, -1)
-        weight = self.tensors[f"{PATCHES}patch_embedding.weight"].reshape(config.hidden_size, -1)
-        x = np.empty((len(pixels), 1 + side**2, config.hidden_size), np.float32)
-        x[:, 0] = self.tensors[f"{PATCHES}class_embedding"]
-        x[:, 1:] = (patches @ weight.T).reshape(len(pixels), side**2, -1)
-        x += self.tensors[f"{PATCHES}position_embedding.weight"]
-        x = _norm(self.tensors, f"{SEEN}pre_layrnorm", x, config.layer_norm_eps)  # spelt so
-        x = _layers(self.tensors, SEEN, config, x)[:, 0]
-        last = _norm(self.tensors, f"{SEEN}post_layernorm", x, config.layer_norm_eps)
-        return last @ self.tensors["visual_projection.weight"].T
+        tensors, eps, shape = self.tensors, self.config.layer_norm_eps, (self.side, self.patch)
+        cut = pixels.reshape(len(pixels), 3, *shape, *shape).transpose(0, 2, 4, 1, 3, 5)
+        weight = tensors[f"{PATCHES}patch_embedding.weight"]
+        patches = cut.reshape(len(pixels), self.side**2, -1) @ weight.reshape(len(weight), -1).T
+        first = np.broadcast_to(tensors[f"{PATCHES}class_embedding"], (len(pixels), 1, len(weight)))
+        x = np.concatenate([first, patches], 1) + tensors[f"{PATCHES}position_embedding.weight"]
+        x = _layers(tensors, SEEN, self.config, _norm(tensors, f"{SEEN}pre_layrnorm", x, eps))  # spelt so
+        last = _norm(tensors, f"{SEEN}post_layernorm", x[:, 0], eps)
+        return last @ tensors["visual_projection.weight"].T
 
 
 def plain_image_tower(weights: Weights, statistics: tuple[Array, Array]) -> PlainClipImages | None:
@@ -157,15 +149,13 @@ def plain_image_tower(weights: Weights, statistics: tuple[Array, Array]) -> Plai
         config = msgspec.convert(stated, VisionConfig)
         tensors = _tensors(weights.folder, config, SEEN, "visual_projection.weight", others=8)
         tower = PlainClipImages(config, tensors, statistics)
-        tower.encode(np.zeros((1, config.num_channels, config.image_size, config.image_size), np.float32))
+        fits = config.hidden_act == "quick_gelu" and tower.image_size == stated.get("image_size", 224)
+        return tower if fits and tower.encode(np.zeros((1, 3, *2 * [tower.image_size]))).any() else None
     except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError):
         return None
-    return tower if config.hidden_act == "quick_gelu" else None
 
 
-def _tensors(
-    folder: Path, config: TextConfig | VisionConfig, prefix: str, projection: str, others: int
-) -> dict[str, Array]:
+def _tensors(folder: Path, config: TextConfig, prefix: str, projection: str, others: int) -> dict[str, Array]:
     """Return the tensors of a half as float32; ValueError where they are not those of its layers."""
     from safetensors import SafetensorError, safe_open
 
@@ -192,9 +182,7 @@ def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) 
     return last @ tensors[PROJECTION].T
 
 
-def _layers(
-    tensors: Tensors, prefix: str, config: TextConfig | VisionConfig, x: Array, later: Array | None = None
-) -> Array:
+def _layers(tensors: Tensors, prefix: str, config: TextConfig, x: Array, later: Array | None = None) -> Array:
     """(B, L, W) tokens behind all layers; `later` as of `_attention`."""
     for number in range(config.num_hidden_layers):
         layer, eps = f"{prefix}encoder.layers.{number}.", config.layer_norm_eps

@@ -180,7 +180,7 @@ def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Arr
             if box is not None:  # a row of another level
                 crops[row] = masked_crop(image[box], labels[box] == row, encoder.image_size)
     number = dict[bytes, int]()  # of each picture: many a part is a whole, too
-    of = [number.setdefault(hashlib.sha256(crop).digest(), len(number)) for crop in crops]
+    of = [number.setdefault(hashlib.sha256(crop.tobytes()).digest(), len(number)) for crop in crops]
     _, first = np.unique(np.array(of, int), return_index=True)
     return encoder.encode_images(crops[first])[of] if of else encoder.encode_images(crops)
 

@@ -21,9 +21,15 @@ from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.hostile import FromFile
 from langsplat_core.scene import Calibration, PlattScaling
-from langsplat_core.semantics.clip_plain import PlainClipText, plain_text_tower, read_tokenizer
+from langsplat_core.semantics.clip_plain import (
+    PlainClipImages,
+    PlainClipText,
+    plain_text_tower,
+    read_tokenizer,
+)
 from langsplat_core.semantics.encoders import (
     PhraseEncoder,
+    clip_images,
     clip_text,
     load_encoder,
     load_text_encoder,
@@ -48,6 +54,14 @@ pytestmark = pytest.mark.long
 
 def crops(count: int) -> np.ndarray:
     return np.random.default_rng(1).integers(0, 256, (count, SIDE, SIDE, 3), dtype=np.uint8)
+
+
+def test_images_in_numpy_agree_with_torch(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    want = load_encoder(str(tmp_path), "cpu").encode_images(crops(5))
+    teach(tmp_path, "mug")
+    assert isinstance(clip_images(Weights("tiny", tmp_path, "cpu")), PlainClipImages)
+    np.testing.assert_allclose(load_encoder(str(tmp_path), "cpu").encode_images(crops(5)), want, atol=2e-6)
 
 
 def test_the_folder_may_state_its_own_normalisation(tmp_path: Path) -> None:

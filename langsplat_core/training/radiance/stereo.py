@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import minimum_filter, uniform_filter
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import helper, kernel, shared_workers
@@ -146,15 +146,12 @@ def plane_scores(camera: Camera, grey: Array, others: Sequence[tuple[Camera, Arr
 
 def window_moments(grey: Array) -> Array:
     """Return the (3, H, W) float32 means, variances and 1 / pixels of windows, the image's part of them."""
-    moments = np.stack([np.ones(grey.shape), grey, grey.astype(np.float64) ** 2])
-    for axis in (1, 2):
-        ends = np.arange(grey.shape[axis - 1]) + RADIUS + 1
-        sums = np.pad(moments.cumsum(axis), [(0, 0), *((side == axis, 0) for side in (1, 2))])
-        upper = sums.take(np.minimum(ends, grey.shape[axis - 1]), axis)
-        moments = upper - sums.take(np.maximum(ends - 2 * RADIUS - 1, 0), axis)
-    count, total, squares = moments
-    mean = total / count
-    return np.stack([mean, (squares / count - mean**2).clip(0), 1 / count]).astype(np.float32)
+    size = 2 * RADIUS + 1
+    parts = np.ones(grey.shape), grey.astype(np.float64), grey.astype(np.float64) ** 2
+    share, mean, squares = (uniform_filter(part, size, mode="constant") for part in parts)
+    mean /= share
+    moments = mean, (squares / share - mean**2).clip(0), 1 / (size**2 * share)
+    return np.stack(moments).astype(np.float32)
 
 
 @kernel
