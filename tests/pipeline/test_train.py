@@ -188,7 +188,6 @@ def test_every_lifting_mode_trains(room, tmp_path, mode):
     assert field is not None
     assert field.codec.kind == "linear"
     assert np.isfinite(field.latents).all()
-    assert field.tree.complete
     assert field.tree.votes.any() == (mode == "mean")  # averaging latents needs no mask weights
 
 
