@@ -22,6 +22,7 @@ from langsplat_core.pipeline.notebook import show
 from langsplat_core.training.language.codec_fit import train_autoencoder
 from langsplat_viewer.actions import editing, opening, outline, settings, viewpoint
 from langsplat_viewer.options import ViewerOptions, scene_path, services
+from langsplat_viewer.panels import search
 from langsplat_viewer.program import draw
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.window import Window
@@ -150,11 +151,13 @@ def _light(ctx: Any, window: Window) -> None:
 
 
 def _three_levels(ctx: Any, window: Window) -> None:
+    settings.turn_panel(window.viewer, search.TITLE, is_open=False)  # it lies over the first level
     settings.set_display(window.viewer, "latent")
     settings.toggle_levels(window.viewer)
 
 
 def _tree(ctx: Any, window: Window) -> None:
+    settings.turn_panel(window.viewer, search.TITLE, is_open=False)  # it lies over the first level
     settings.set_display(window.viewer, "tree")
     settings.toggle_levels(window.viewer)
 
