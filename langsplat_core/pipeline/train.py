@@ -39,7 +39,7 @@ from langsplat_core.training.radiance import trainer
 from langsplat_core.training.radiance.differentiable import evaluate_views
 
 FEWEST_VIEWS = 3
-VERSION = 8  # of what training and rehearsals make
+VERSION = 9  # of what training and rehearsals make
 
 Until = Literal["gaussians", "language field"]  # what a training ends with
 

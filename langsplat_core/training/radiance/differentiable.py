@@ -39,8 +39,10 @@ class DifferentiableRenderer(Protocol):
 
     device: torch.device  # where parameters and images live
 
-    def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> DifferentiableImage:
-        """Draw the raw `parameters` with harmonics up to `sh_degree`."""
+    def render(
+        self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int, focal: float | None = None
+    ) -> DifferentiableImage:
+        """Draw the raw `parameters` with harmonics up to `sh_degree`; focal: as of `RasterSettings`."""
 
 
 def _coefficients(parameters: dict[str, Tensor], sh_degree: int) -> Tensor:
@@ -93,11 +95,13 @@ class CpuRenderer:
         self.device = torch.device("cpu")
         self._settings, self._rasterizer = settings, CpuRasterizer()
 
-    def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> DifferentiableImage:
-        means = parameters["means"]
+    def render(
+        self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int, focal: float | None = None
+    ) -> DifferentiableImage:
+        means, settings = parameters["means"], replace(self._settings, focal=focal)
         probe = torch.zeros(len(means), 2, requires_grad=means.requires_grad)
         image, alpha, visible = _CpuImage.apply(
-            lambda gaussians: self._rasterizer.view(gaussians, camera, self._settings),
+            lambda gaussians: self._rasterizer.view(gaussians, camera, settings),
             camera.position,
             *(parameters[name] for name in gsplat.RAW),
             _coefficients(parameters, sh_degree),
@@ -117,9 +121,11 @@ class CudaRenderer:
         except BackendError as error:
             raise BackendError(f"backend cuda: {error}; use --backend cpu") from error
 
-    def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> DifferentiableImage:
+    def render(
+        self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int, focal: float | None = None
+    ) -> DifferentiableImage:
         values = _coefficients(parameters, sh_degree)
-        return gsplat.draw(parameters, values, camera, self._settings, sh_degree)
+        return gsplat.draw(parameters, values, camera, replace(self._settings, focal=focal), sh_degree)
 
 
 def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor], camera: Camera) -> Array:

@@ -200,7 +200,10 @@ def _visible(state: TrainingState) -> Gaussians:
 
 
 class _Views:
-    """Photographs and cameras of training views, whole and halved, on a GPU copied, else as they are."""
+    """Photographs and cameras of training views, whole and halved, on a GPU copied, else as they are.
+
+    Halved images are drawn with the whole ones' focal lengths, so that both fit the same Gaussians.
+    """
 
     def __init__(self, capture: Capture, indices: Sequence[int], device: torch.device) -> None:
         def kept(image: Array | None) -> Array | Tensor | None:
@@ -208,6 +211,7 @@ class _Views:
 
         self.cut_out = capture.cut_out
         self.cameras = [capture.cameras[i] for i in indices]
+        self.focals = [float(np.sqrt(camera.fx * camera.fy)) for camera in self.cameras]
         views = [(capture.cameras[i], capture.images[i], capture.mask(i)) for i in indices]
         self._fine, self._coarse = (
             [(camera, kept(image), kept(mask)) for camera, image, mask in sizes]
@@ -252,7 +256,8 @@ class _Run:
             state.exposures = self.find_exposures(state)
         index = state.queue.pop()
         camera, target, mask = self.views.at(index, coarse=step <= schedule.coarse_until)
-        rendered = self.renderer.render(state.values, camera, schedule.active_sh_degree(step))
+        degree, focal = schedule.active_sh_degree(step), self.views.focals[index]
+        rendered = self.renderer.render(state.values, camera, degree, focal)
         image = rendered.image
         if len(state.exposures):
             image = losses.with_exposure(image, state.exposures[index])
@@ -294,7 +299,7 @@ class _Run:
             mask = self.counted(state, index, mask, camera)
             with torch.no_grad():
                 degree = self.schedule.active_sh_degree(state.step)
-                image = self.renderer.render(state.values, camera, degree).image
+                image = self.renderer.render(state.values, camera, degree, self.views.focals[index]).image
             counted = (slice(None), slice(None)) if mask is None else mask
             # One pixel in seven tells the exposure.
             pairs.append((image[counted].reshape(-1, 3)[::7], target[counted].reshape(-1, 3)[::7]))
