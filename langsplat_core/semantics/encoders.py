@@ -73,6 +73,7 @@ class Family:
 
     text: Callable[[Weights], TextTower]
     images: Callable[[Weights], ImageTower]
+    encoder: "type[Encoder] | None" = None  # of its own, such as one that is a `features.RegionEncoder`
 
 
 class _Beside(Struct, forbid_unknown_fields=True):
@@ -217,10 +218,11 @@ class Encoder(PhraseEncoder):
         parts = [self._encode(np.stack(list(crops[i : i + self._batch]))) for i in starts]
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
-    def _encode(self, crops: Array) -> Array:
+    def _encode(self, images: Array, forward: Callable[[Array], Array] | None = None) -> Array:
+        """(B, H, W, 3) uint8 -> unit vectors that `forward`, if not the tower itself, has for pixels."""
         mean, std = self._images.statistics
-        pixels = (crops.astype(np.float32) / 255 - mean) / std
-        return unit(self._images.encode(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))))
+        pixels = (images.astype(np.float32) / 255 - mean) / std
+        return unit((forward or self._images.encode)(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))))
 
 
 @models.asking_errors("the encoder")
@@ -264,10 +266,14 @@ class Images:
         self.statistics = _pixel_statistics(weights, usual)
 
     def encode(self, pixels: Array) -> Array:
+        return self.infer(pixels, self._output)
+
+    def infer(self, pixels: Array, output: str) -> Array:
+        """Return what the model calls `output`, of pixels (B, 3, H, W)."""
         import torch
 
         inputs = torch.from_numpy(pixels).to(self._device)
-        return inferred(lambda: getattr(self._model(pixel_values=inputs), self._output))
+        return inferred(lambda: getattr(self._model(pixel_values=inputs), output))
 
 
 def _pixel_statistics(weights: Weights, usual: Array) -> tuple[Array, Array]:
@@ -454,7 +460,7 @@ def load_encoder(model: str, device: str = "auto", batch: int = 32, option: str 
     """Load both halves of `model`, as `load_text_encoder` does; batch: images per forward pass."""
     weights = models.open_weights(model, model_path(model, option), device)
     family = models.family_of(weights, FAMILIES, "encoders")
-    return Encoder(weights, family.text(weights), family.images(weights), batch)
+    return (family.encoder or Encoder)(weights, family.text(weights), family.images(weights), batch)
 
 
 def model_path(model: str, option: str) -> Path:

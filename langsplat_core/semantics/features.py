@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 from urllib.parse import quote
 
 import numpy as np
@@ -168,12 +168,22 @@ def masked_crop(image: Array, mask: Array, size: int) -> Array:
     return np.asarray(Image.fromarray(square).resize((size, size), Image.Resampling.BILINEAR))
 
 
+@runtime_checkable
+class RegionEncoder(ImageEncoder, Protocol):
+    """An encoder that describes regions without crops of them."""
+
+    def encode_regions(self, image: Array, label_maps: Array) -> Array:
+        """See `embed_regions`."""
+
+
 def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Array:
     """Return (M, D) float32 unit vectors of the M regions that `label_maps` numbers.
 
     image: (H, W, 3) uint8; label_maps: (3, H, W) int32 as of `masks.label_maps`. A region is shown as it is
     visible in its map, on black; where masks of one level overlap, LangSplat shows the covered part too.
     """
+    if isinstance(encoder, RegionEncoder):
+        return encoder.encode_regions(image, label_maps)
     crops = np.zeros((int(label_maps.max()) + 1, encoder.image_size, encoder.image_size, 3), np.uint8)
     for labels in label_maps:
         for row, box in enumerate(ndimage.find_objects(labels + 1)):

@@ -19,14 +19,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from PIL import Image
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.encoders import (
     CLIP_PIXELS,
+    Encoder,
     Family,
     Images,
     ImageTower,
@@ -550,16 +552,46 @@ class Tipsv2Text(TorchText):
         return super().encode([text.lower() for text in texts])
 
 
-def tipsv2_images(weights: Weights) -> ImageTower:
-    """Return the image tower of a TIPS v2, by torch; its pixels are not normalised."""
-    from transformers import Tipsv2Config
-    from transformers import Tipsv2VisionModel as Model
+class Tipsv2Images(Images):
+    """The image tower of a TIPS v2, by torch; its pixels are not normalised."""
 
-    config = load_config(Tipsv2Config, weights, "TIPS v2").vision_config
-    return Images(Model, weights, config, "pooler_output", np.array([(0.0,) * 3, (1.0,) * 3]))
+    def __init__(self, weights: Weights) -> None:
+        from transformers import Tipsv2Config
+        from transformers import Tipsv2VisionModel as Model
+
+        config = load_config(Tipsv2Config, weights, "TIPS v2").vision_config
+        super().__init__(Model, weights, config, "pooler_output", np.array([(0.0,) * 3, (1.0,) * 3]))
+        self.patch, self._before = int(config.patch_size), 1 + int(config.num_register_tokens)
+
+    def patches(self, pixels: Array) -> Array:
+        """(1, 3, H, W) float32, sides multiples of a patch's -> (P, D) of its patches, row by row."""
+        return self.infer(pixels, "last_hidden_state")[0, self._before :]
 
 
-TIPSV2 = Family(Tipsv2Text, tipsv2_images)
+class Tipsv2Encoder(Encoder):
+    """Both halves of a TIPS v2: a region's vector is the mean of its pixels', which are those of patches.
+
+    An image is seen once, its shorter side as long as images of the training. Three hundred crops, each of as
+    many patches, take a hundred times as long.
+    """
+
+    def encode_regions(self, image: Array, label_maps: Array) -> Array:
+        """See `features.embed_regions`."""
+        tower = cast("Tipsv2Images", self._images)
+        scale = self.image_size / min(image.shape[:2]) / tower.patch
+        grid = [max(1, round(side * scale)) for side in image.shape[:2]]
+        size = grid[1] * tower.patch, grid[0] * tower.patch
+        seen = Image.fromarray(image).resize(size, Image.Resampling.BILINEAR)
+        patches = self._encode(np.asarray(seen)[None], tower.patches)
+        rows, columns = (np.arange(side) * n // side for side, n in zip(image.shape[:2], grid, strict=True))
+        cells = rows[:, None] * grid[1] + columns
+        shape = int(label_maps.max()) + 1, len(patches)
+        places = (labels[labels >= 0] * shape[1] + cells[labels >= 0] for labels in label_maps)
+        pixels = sum(np.bincount(some, minlength=shape[0] * shape[1]) for some in places)
+        return unit(np.asarray(pixels, np.float32).reshape(shape) @ patches)
+
+
+TIPSV2 = Family(Tipsv2Text, Tipsv2Images, Tipsv2Encoder)
 
 
 # SAM 3 (Carion et al. 2025): the tracker, which is asked at points as a SAM 2.

@@ -31,6 +31,7 @@ from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.extensions.checkpoints.weight_layouts import Hiera, converted
 from langsplat_core.semantics.encoders import CLIP_PIXELS, load_encoder, load_text_encoder
+from langsplat_core.semantics.features import embed_regions
 from langsplat_core.semantics.sam import FAMILIES, Segmenter, load_segmenter
 from langsplat_core.semantics.weights import Weights
 from tests.support.tiny_models import (
@@ -485,6 +486,20 @@ def test_siglip_without_its_scale_is_refused(tmp_path: Path) -> None:
     save_file(state, tmp_path / "model.safetensors", {"format": "pt"})
     with pytest.raises(EncoderError, match="logit_scale is not in them"):
         load_text_encoder(str(tmp_path))
+
+
+def test_regions_of_tips_v2_are_means_of_their_patches(tmp_path: Path) -> None:
+    model, encoder = tiny_tipsv2(tmp_path), load_encoder(str(tmp_path), "cpu")
+    image = np.random.default_rng(4).integers(0, 256, (SIDE, 2 * SIDE, 3), dtype=np.uint8)
+    pixels = torch.from_numpy((image / 255).transpose(2, 0, 1)[None].astype(np.float32))
+    with torch.inference_mode():
+        grid = model.vision_model(pixels).last_hidden_state[0, 2:].numpy().reshape(4, 8, -1)  # 8 px a patch
+    maps = np.full((3, SIDE, 2 * SIDE), -1, np.int32)
+    maps[0, :8, :16], maps[1, :, 32:], maps[2, 4:12, :8] = 0, 1, 2
+    got = embed_regions(image, maps, encoder)
+    want = [unit(some).mean((0, 1)) for some in (grid[:1, :2], grid[:, 4:], grid[:2, :1])]
+    np.testing.assert_allclose(got, unit(np.stack(want)), atol=2e-6)
+    assert embed_regions(image, np.full_like(maps, -1), encoder).shape == (0, encoder.dim)
 
 
 def test_sam_3_sees_images_as_its_tracker_does(tmp_path: Path) -> None:
