@@ -357,7 +357,7 @@ def _tokenizer(weights: Weights, vocabulary: int) -> Any:
     if not path.is_file():
         raise EncoderError(
             f"{weights.id}: no {TOKENIZER} in {weights.folder}, which reads its phrases; put it there: all "
-            "CLIPs share that of openai/clip-vit-base-patch32 on the Hugging Face hub"
+            "CLIPs share that of openai/clip-vit-base-patch32 on the Hugging Face hub, others have their own"
         )
     try:
         if _LONG.search(path.read_bytes()):

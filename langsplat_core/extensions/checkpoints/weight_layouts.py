@@ -544,8 +544,7 @@ class Tipsv2Text(TorchText):
         both = load_config(Tipsv2Config, weights, "TIPS v2")
         config = both.text_config
         super().__init__(Model, weights, config, "pooler_output", config.hidden_size, ends=False)
-        # Published files state it by the first name, and transformers knows the second.
-        self.temperature = SHARE_OF_SCALE / float(getattr(both, "temperature", both.temperature_init_value))
+        self.temperature = SHARE_OF_SCALE / both.temperature_init_value  # the weights do not hold it
 
     def encode(self, texts: list[str]) -> Array:
         """Encode texts in lower case, as all of its training were."""
