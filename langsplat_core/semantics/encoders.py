@@ -305,33 +305,27 @@ class TorchText:
     add around it (which side is padded, whether an end token is there) differs between its versions.
     """
 
+    ends = True  # whether a token marks the end of every phrase
+    padded = False  # whether phrases are padded to the length of training, not that of the longest of a batch
+
     def __init__(
-        self,
-        kind: Any,
-        weights: Weights,
-        config: Any,
-        output: str,
-        dim: int,
-        begin: str = "",
-        ends: bool = True,
-        padded: bool = False,
+        self, kind: Any, weights: Weights, config: Any, output: str, dim: int, begin: str = ""
     ) -> None:
         """kind: class of transformers; output: name of the vectors in what it returns; dim: their length.
 
-        begin: token that every phrase begins with, if one does; ends: whether a token ends it; padded:
-        whether it is padded to the length of training, instead of that of the longest phrase beside it.
+        begin: token that every phrase begins with, if one does.
         """
         self.dim = dim
         self.temperature = TEMPERATURE
         self._device, self._output = weights.device, output
-        self._length, self._padded = int(config.max_position_embeddings), padded
+        self._length = int(config.max_position_embeddings)
         self._model: Any = models.load_model(kind, weights, config)
         self.tokenizer = _tokenizer(weights, int(config.vocab_size))
         special = partial(_special_token, weights, self.tokenizer)
         self._begin = [special("bos_token", (begin,))] if begin else []
-        self._end = [special("eos_token", ("<|endoftext|>", "</s>", "<eos>"))] if ends else []
-        own_pad = padded or not ends
-        self._pad = special("pad_token", ("<pad>", "</s>")) if own_pad else self._end[0]
+        self._end = [special("eos_token", ("<|endoftext|>", "</s>", "<eos>"))] if self.ends else []
+        own = self.padded or not self.ends
+        self._pad = special("pad_token", ("<pad>", "</s>")) if own else self._end[0]
 
     def encode(self, texts: list[str]) -> Array:
         import torch
@@ -343,9 +337,9 @@ class TorchText:
         for text, row in zip(plain, found, strict=True):
             check_whole(text, row.ids, room, {*self._end, self._pad})
         # What follows the end token of a CLIP is not seen by it; without one, padding is masked.
-        length = self._length if self._padded else max(map(len, rows))
+        length = self._length if self.padded else max(map(len, rows))
         ids = torch.tensor([row + [self._pad] * (length - len(row)) for row in rows]).to(self._device)
-        mask = {} if self._end else {"attention_mask": (ids != self._pad).long()}
+        mask = {} if self.ends else {"attention_mask": (ids != self._pad).long()}
         return inferred(lambda: getattr(self._model(input_ids=ids, **mask), self._output))
 
 
@@ -398,16 +392,15 @@ CLIP_PIXELS = np.array([  # mean and standard deviation of OpenAI's CLIP, kept b
 
 def clip_text(weights: Weights) -> TextTower:
     """Return the text tower in NumPy where the model is small, else by torch."""
-    return plain_text_tower(weights) or torch_clip_text(weights)
+    return plain_text_tower(weights) or ClipText(weights)
 
 
-def torch_clip_text(weights: Weights) -> TorchText:
-    """Return the text tower of a CLIP, by torch."""
-    from transformers import CLIPConfig
-    from transformers import CLIPTextModelWithProjection as Model
+class ClipText(TorchText):
+    """The text tower of a CLIP, by torch; `name`: what its classes in transformers begin with."""
 
-    config = clip_config(CLIPConfig, weights, "text")
-    return TorchText(Model, weights, config, "text_embeds", config.projection_dim, "<|startoftext|>")
+    def __init__(self, weights: Weights, name: str = "CLIP", begin: str = "<|startoftext|>") -> None:
+        kind, config = clip_tower(weights, name, "Text")
+        super().__init__(kind, weights, config, "text_embeds", config.projection_dim, begin)
 
 
 def clip_images(weights: Weights) -> ImageTower:
@@ -415,20 +408,20 @@ def clip_images(weights: Weights) -> ImageTower:
     return plain_image_tower(weights, _pixel_statistics(weights, CLIP_PIXELS)) or torch_clip_images(weights)
 
 
-def torch_clip_images(weights: Weights) -> Images:
-    """Return the image tower of a CLIP, by torch."""
-    from transformers import CLIPConfig
-    from transformers import CLIPVisionModelWithProjection as Model
-
-    return Images(Model, weights, clip_config(CLIPConfig, weights, "vision"), "image_embeds", CLIP_PIXELS)
+def torch_clip_images(weights: Weights, name: str = "CLIP") -> Images:
+    """Return the image tower of a CLIP, by torch; `name` as of `ClipText`."""
+    kind, config = clip_tower(weights, name, "Vision")
+    return Images(kind, weights, config, "image_embeds", CLIP_PIXELS)
 
 
-def clip_config(kind: Any, weights: Weights, tower: Literal["text", "vision"]) -> Any:
-    """Return the configuration of one tower with its projection; kind: class of transformers for both."""
-    config = models.load_config(kind, weights, "CLIP")
-    tower_config = getattr(config, f"{tower}_config")
+def clip_tower(weights: Weights, name: str, tower: Literal["Text", "Vision"]) -> tuple[Any, Any]:
+    """Return the class of one tower with its projection, and its configuration."""
+    import transformers
+
+    config = models.load_config(getattr(transformers, f"{name}Config"), weights, name)
+    tower_config = getattr(config, f"{tower.lower()}_config")
     tower_config.projection_dim = config.projection_dim  # some files state it for the pair only
-    return tower_config
+    return getattr(transformers, f"{name}{tower}ModelWithProjection"), tower_config
 
 
 # Loading by hub id, folder or file: a new family is two towers, and a row here or in an extension.

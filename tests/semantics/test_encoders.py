@@ -28,12 +28,12 @@ from langsplat_core.semantics.clip_plain import (
     read_tokenizer,
 )
 from langsplat_core.semantics.encoders import (
+    ClipText,
     PhraseEncoder,
     clip_images,
     clip_text,
     load_encoder,
     load_text_encoder,
-    torch_clip_text,
 )
 from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary, read_vocabulary
 from langsplat_core.semantics.sam import load_segmenter
@@ -259,7 +259,7 @@ def test_random_weights_agree_with_float64(tmp_path: Path, half: bool) -> None:
     want = by_transformers(tmp_path, phrases)
     np.testing.assert_allclose(unit(tower.encode(phrases)), want, atol=CLOSE)
     np.testing.assert_allclose(load_encoder(str(tmp_path), "cpu").encode_texts(phrases), want, atol=CLOSE)
-    by_torch = torch_clip_text(Weights("tiny", tmp_path, "cpu"))
+    by_torch = ClipText(Weights("tiny", tmp_path, "cpu"))
     np.testing.assert_allclose(tower.encode(phrases), by_torch.encode(phrases), rtol=1e-4, atol=CLOSE)
     assert tower.dim == by_torch.dim == 24
 
@@ -293,7 +293,7 @@ def test_long_phrases_are_refused_and_not_cut(tmp_path: Path, plain: bool) -> No
     tiny_clip(tmp_path)
     teach(tmp_path, "red")
     weights = Weights("tiny", tmp_path, "cpu")
-    tower = clip_text(weights) if plain else torch_clip_text(weights)
+    tower = clip_text(weights) if plain else ClipText(weights)
     assert isinstance(tower, PlainClipText) == plain
     for phrase in ("red-mug", '"red"', "mug ☕ mug", "red <|endoftext|> mug"):
         with pytest.raises(EncoderError, match="marks that this encoder cannot read"):

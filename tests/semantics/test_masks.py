@@ -429,17 +429,6 @@ def test_sam_decoder_norms_have_the_published_epsilon(tmp_path: Path) -> None:
     assert torch.equal(answers[0][1], answers[1][1])
 
 
-def test_sam_2_masks_are_ordered_by_size_at_each_point() -> None:
-    logits = -torch.ones(2, 3, 4, 4)
-    for point, sizes in enumerate([(3, 1, 2), (2, 2, 1)]):
-        for k, size in enumerate(sizes):
-            logits[point, k, :size] = 1 + k
-    ious, ordered = sam.by_area(torch.tensor([[0.3, 0.1, 0.2], [0.5, 0.6, 0.4]]), logits)
-    np.testing.assert_allclose(ious, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])  # of equals the first stays first
-    assert (ordered > 0).flatten(2).sum(2).tolist() == [[4, 8, 12], [4, 8, 8]]
-    assert ordered[:, :, 0, 0].tolist() == [[2, 3, 1], [3, 1, 2]]
-
-
 def test_batches_do_not_change_the_masks(config: MaskConfig) -> None:
     one, many = (load_mask_source(replace(config, points_per_batch=count), "cpu") for count in (1, 64))
     assert one.key == many.key

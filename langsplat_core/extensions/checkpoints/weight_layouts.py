@@ -1,7 +1,6 @@
-"""Weights in other layouts than Hugging Face's, and the models that transformers has beside CLIP and SAM.
+"""Weights in other layouts than Hugging Face's; SigLIP, MetaCLIP 2, TIPS v2 and SAM 3 by transformers.
 
 Tensors in the layouts of open_clip, OpenAI, segment_anything and sam2 are renamed to those of transformers.
-The models are SigLIP, MetaCLIP 2, TIPS v2 and SAM 3, in the classes of transformers.
 
 What a model is made of follows from the shapes of its tensors; an open_clip_config.json beside them says
 what shapes do not: the heads, and which GELU. Without one, CLIP's heads are 64 wide, those for images at
@@ -17,6 +16,7 @@ import string
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
@@ -27,14 +27,14 @@ from PIL import Image
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.encoders import (
-    CLIP_PIXELS,
+    ClipText,
     Encoder,
     Family,
     Images,
     ImageTower,
     TorchText,
     clean_text,
-    clip_config,
+    torch_clip_images,
 )
 from langsplat_core.semantics.sam import Sam
 from langsplat_core.semantics.weights import (
@@ -55,10 +55,7 @@ MOBILE_SAM = (
     "a MobileSAM, whose encoder TinyViT transformers does not have; pass sam_vit_b_01ec64.pth in its place, "
     "or for speed sam2.1_hiera_tiny.pt"
 )
-TIMM = (
-    "its image tower is one of timm's, as those of PE-Core and MobileCLIP, which transformers does not have; "
-    "pass facebook/metaclip-2-worldwide-b16 in its place, or for speed google/siglip2-base-patch16-224"
-)
+TIMM = "its image tower is timm's (PE-Core, MobileCLIP); pass facebook/metaclip-2-worldwide-b16 in its place"
 HEAD_WIDTH, MOST_HEADS = 64, 16
 SAM_HEADS = 8  # of the mask decoder, which no shape tells
 NOT_OURS = "open_clip's {part} states {name} {value!r}, which is not computed here"
@@ -450,11 +447,13 @@ SHARE_OF_SCALE = 0.1
 class SiglipText(TorchText):
     """The text tower of a SigLIP, by torch."""
 
+    padded = True
+
     def __init__(self, weights: Weights) -> None:
         from transformers import SiglipTextModel as Model
 
         config = _siglip_config(weights).text_config
-        super().__init__(Model, weights, config, "pooler_output", config.projection_size, padded=True)
+        super().__init__(Model, weights, config, "pooler_output", config.projection_size)
         scale = _read_scalar(weights, "logit_scale")
         if not math.isfinite(scale):
             raise EncoderError(f"{weights.id}: not SigLIP weights: logit_scale is not in them")
@@ -501,49 +500,30 @@ def _read_scalar(weights: Weights, name: str) -> float:
 SIGLIP = Family(SiglipText, siglip_images)
 
 
-# MetaCLIP 2 (Chuang et al. 2025): a CLIP of 300 languages, with the tokenizer of XLM-V or mT5.
-
-
-class MetaClip2Text(TorchText):
-    """The text tower of a MetaCLIP 2, by torch."""
+class MetaClip2Text(ClipText):
+    """The text tower of a MetaCLIP 2 (Chuang et al. 2025): a CLIP of 300 languages."""
 
     def __init__(self, weights: Weights) -> None:
-        from transformers import MetaClip2Config
-        from transformers import MetaClip2TextModelWithProjection as Model
-
-        config = clip_config(MetaClip2Config, weights, "text")
-        super().__init__(Model, weights, config, "text_embeds", config.projection_dim)
-        # XLM-V's marks where a phrase begins, mT5's only where it ends; the file says which.
+        super().__init__(weights, "MetaClip2", "")
+        # XLM-V's tokenizer marks where a phrase begins, mT5's only where it ends; the file says which.
         self._begin = self.tokenizer.encode("").ids[:-1]
         self._model.text_model.eos_token_id = self._end[0]  # a CLIP's where config.json states none
 
 
-def metaclip2_images(weights: Weights) -> ImageTower:
-    """Return the image tower of a MetaCLIP 2, by torch."""
-    from transformers import MetaClip2Config
-    from transformers import MetaClip2VisionModelWithProjection as Model
-
-    return Images(
-        Model, weights, clip_config(MetaClip2Config, weights, "vision"), "image_embeds", CLIP_PIXELS
-    )
-
-
-METACLIP2 = Family(MetaClip2Text, metaclip2_images)
-
-
-# TIPS v2 (Cao et al. 2026): patches of an image have vectors in the space of phrases, too.
+METACLIP2 = Family(MetaClip2Text, partial(torch_clip_images, name="MetaClip2"))
 
 
 class Tipsv2Text(TorchText):
-    """The text tower of a TIPS v2, by torch: phrases without a token at either end."""
+    """The text tower of a TIPS v2 (Cao et al. 2026), by torch."""
+
+    ends = False
 
     def __init__(self, weights: Weights) -> None:
-        from transformers import Tipsv2Config
-        from transformers import Tipsv2TextModel as Model
+        from transformers import Tipsv2TextModel
 
-        both = load_config(Tipsv2Config, weights, "TIPS v2")
-        config = both.text_config
-        super().__init__(Model, weights, config, "pooler_output", config.hidden_size, ends=False)
+        both = _tipsv2_config(weights)
+        text = both.text_config
+        super().__init__(Tipsv2TextModel, weights, text, "pooler_output", text.hidden_size)
         self.temperature = SHARE_OF_SCALE / both.temperature_init_value  # the weights do not hold it
 
     def encode(self, texts: list[str]) -> Array:
@@ -555,11 +535,11 @@ class Tipsv2Images(Images):
     """The image tower of a TIPS v2, by torch; its pixels are not normalised."""
 
     def __init__(self, weights: Weights) -> None:
-        from transformers import Tipsv2Config
-        from transformers import Tipsv2VisionModel as Model
+        from transformers import Tipsv2VisionModel
 
-        config = load_config(Tipsv2Config, weights, "TIPS v2").vision_config
-        super().__init__(Model, weights, config, "pooler_output", np.array([(0.0,) * 3, (1.0,) * 3]))
+        config = _tipsv2_config(weights).vision_config
+        usual = np.array([[0.0] * 3, [1.0] * 3])
+        super().__init__(Tipsv2VisionModel, weights, config, "pooler_output", usual)
         self.patch, self._before = int(config.patch_size), 1 + int(config.num_register_tokens)
 
     def patches(self, pixels: Array) -> Array:
@@ -567,11 +547,16 @@ class Tipsv2Images(Images):
         return self.infer(pixels, "last_hidden_state")[0, self._before :]
 
 
+def _tipsv2_config(weights: Weights) -> Any:
+    from transformers import Tipsv2Config
+
+    return load_config(Tipsv2Config, weights, "TIPS v2")
+
+
 class Tipsv2Encoder(Encoder):
     """Both halves of a TIPS v2: a region's vector is the mean of its pixels', which are those of patches.
 
-    An image is seen once, its shorter side as long as images of the training. Three hundred crops, each of as
-    many patches, take a hundred times as long.
+    An image is seen once, its shorter side as long as in training; each of its crops had as many patches.
     """
 
     def encode_regions(self, image: Array, label_maps: Array) -> Array:
@@ -593,11 +578,8 @@ class Tipsv2Encoder(Encoder):
 TIPSV2 = Family(Tipsv2Text, Tipsv2Images, Tipsv2Encoder)
 
 
-# SAM 3 (Carion et al. 2025): the tracker, which is asked at points as a SAM 2.
-
-
 def load_sam3(weights: Weights) -> Sam:
-    """Load the half of a SAM 3 that answers points; the hub's files are of the whole model for films."""
+    """Load the half of a SAM 3 (Carion et al. 2025) that answers points, out of the model for films."""
     from transformers import Sam3TrackerConfig, Sam3TrackerModel
 
     config = load_config(Sam3TrackerConfig, weights, "SAM 3")
