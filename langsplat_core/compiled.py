@@ -146,7 +146,7 @@ class Workers:
 
     def __init__(self, threads: int | None = None) -> None:
         """`threads` defaults to the number of cores this process may use."""
-        self.threads = threads or _cores()
+        self.threads = threads or numba.config.NUMBA_DEFAULT_NUM_THREADS
         self._begin()
 
     def _begin(self) -> None:
@@ -187,9 +187,3 @@ class Workers:
 def shared_workers(threads: int | None = None) -> Workers:
     """One pool per number of threads for the whole process, however many rasterizers there are."""
     return Workers(threads)
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return max(len(os.sched_getaffinity(0)), 1)
-    return os.cpu_count() or 1

@@ -479,7 +479,7 @@ def write_metres(path: Path | str, metres_per_unit: float) -> None:
         raise InputError(f"{metres_per_unit:g} metres per unit: must be above 0 and finite")
     with open_ply(path) as ply:
         size = ply.header_size
-    with path.open("rb") as file, atomic_path(path) as temporary, temporary.open("wb") as out:
+    with atomic_path(path) as temporary, path.open("rb") as file, temporary.open("wb") as out:
         *lines, last = file.read(size).splitlines(keepends=True)
         end = b"\r\n" if last.endswith(b"\r\n") else b"\n"
         ours = [b"comment", METRES.encode()]

@@ -458,6 +458,7 @@ def use_on_windows(folder: Path) -> None:
         0.5, saved.with_suffix(".langsplat.safetensors").open("rb").close
     ).start()  # another program
     assert run("teach", saved, "--at", "412,230", "--name", duck) == 0
+    assert run("scale", saved, "--metres-per-unit", "2") == 0
     assert run("query", saved, duck, "blue gift") == 0
     assert run("select", scene, "blue gift", "--out", folder / "gift.ply") == 0
     assert run("export", folder / "gift.ply", folder / "gift.html") == 0
