@@ -256,7 +256,7 @@ class MaskConfig:
     """Source of masks, and which are kept (paper section 3.1 and the method's public code)."""
 
     source: str = "auto"  # sam, graph or an extension's; auto: sam when `sam` names weights, else graph
-    # hub id, folder or file of SAM or SAM 2 weights, e.g. facebook/sam-vit-huge
+    # hub id, folder or file of SAM, SAM 2 or SAM 3 weights, e.g. facebook/sam-vit-huge
     sam: str = ""
     # layers of crops that SAM sees beside the whole image, 2 x 2 in the first: 0 as the paper's text,
     # 1 as its code, which takes five times as long
@@ -275,7 +275,7 @@ class MaskConfig:
 
 @dataclass(frozen=True)
 class ClipConfig:
-    """The vision-language encoder: CLIP, SigLIP or SigLIP 2."""
+    """The vision-language encoder: CLIP, SigLIP, MetaCLIP 2 or TIPS v2."""
 
     model: str = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"  # hub id, folder, or "demo" for the bundled one
     batch: Count = 32  # images per forward pass

@@ -45,8 +45,11 @@ from tests.support.tiny_models import (
     MakesFolder,
     change_json,
     tiny_clip,
+    tiny_metaclip2,
     tiny_sam,
     tiny_sam2,
+    tiny_sam3,
+    tiny_tipsv2,
 )
 
 pytestmark = pytest.mark.long
@@ -386,6 +389,9 @@ FOLDERS: dict[str, tuple[Callable[[Path], object], Callable[[str], Any]]] = {
     "CLIP": (tiny_clip, load_encoder),
     "SAM": (tiny_sam, load_segmenter),
     "SAM 2": (tiny_sam2, load_segmenter),
+    "SAM 3": (tiny_sam3, load_segmenter),
+    "MetaCLIP 2": (tiny_metaclip2, load_encoder),
+    "TIPS v2": (tiny_tipsv2, load_encoder),
 }
 
 

@@ -519,9 +519,9 @@ class Tipsv2Text(TorchText):
     ends = False
 
     def __init__(self, weights: Weights) -> None:
-        from transformers import Tipsv2TextModel
+        from transformers import Tipsv2Config, Tipsv2TextModel
 
-        both = _tipsv2_config(weights)
+        both = load_config(Tipsv2Config, weights, "TIPS v2")
         text = both.text_config
         super().__init__(Tipsv2TextModel, weights, text, "pooler_output", text.hidden_size)
         self.temperature = SHARE_OF_SCALE / both.temperature_init_value  # the weights do not hold it
@@ -535,9 +535,9 @@ class Tipsv2Images(Images):
     """The image tower of a TIPS v2, by torch; its pixels are not normalised."""
 
     def __init__(self, weights: Weights) -> None:
-        from transformers import Tipsv2VisionModel
+        from transformers import Tipsv2Config, Tipsv2VisionModel
 
-        config = _tipsv2_config(weights).vision_config
+        config = load_config(Tipsv2Config, weights, "TIPS v2").vision_config
         usual = np.array([[0.0] * 3, [1.0] * 3])
         super().__init__(Tipsv2VisionModel, weights, config, "pooler_output", usual)
         self.patch, self._before = int(config.patch_size), 1 + int(config.num_register_tokens)
@@ -547,27 +547,24 @@ class Tipsv2Images(Images):
         return self.infer(pixels, "last_hidden_state")[0, self._before :]
 
 
-def _tipsv2_config(weights: Weights) -> Any:
-    from transformers import Tipsv2Config
-
-    return load_config(Tipsv2Config, weights, "TIPS v2")
-
-
 class Tipsv2Encoder(Encoder):
     """Both halves of a TIPS v2: a region's vector is the mean of its pixels', which are those of patches.
 
-    An image is seen once, its shorter side as long as in training; each of its crops had as many patches.
+    An image is seen once, its shorter side as long as in training, that of a panorama shorter.
     """
 
     def encode_regions(self, image: Array, label_maps: Array) -> Array:
         """See `features.embed_regions`."""
         tower = cast("Tipsv2Images", self._images)
-        scale = self.image_size / min(image.shape[:2]) / tower.patch
-        grid = [max(1, round(side * scale)) for side in image.shape[:2]]
+        height, width = image.shape[:2]
+        scale = (
+            self.image_size / max(min(height, width), max(height, width) / 4) / tower.patch
+        )  # of panoramas
+        grid = [max(1, round(side * scale)) for side in (height, width)]
         size = grid[1] * tower.patch, grid[0] * tower.patch
         seen = Image.fromarray(image).resize(size, Image.Resampling.BILINEAR)
         patches = self._encode(np.asarray(seen)[None], tower.patches)
-        rows, columns = (np.arange(side) * n // side for side, n in zip(image.shape[:2], grid, strict=True))
+        rows, columns = (np.arange(side) * n // side for side, n in zip((height, width), grid, strict=True))
         cells = rows[:, None] * grid[1] + columns
         shape = int(label_maps.max()) + 1, len(patches)
         places = (labels[labels >= 0] * shape[1] + cells[labels >= 0] for labels in label_maps)
@@ -584,8 +581,9 @@ def load_sam3(weights: Weights) -> Sam:
 
     config = load_config(Sam3TrackerConfig, weights, "SAM 3")
     if hasattr(config, "tracker_config"):  # the encoder is the detector's, and its settings are stated there
-        vision = {"vision_config": config.detector_config["vision_config"]}
-        config = Sam3TrackerConfig(**config.tracker_config | vision)
+        with loading_errors(weights.id, "SAM 3"):
+            vision = {"vision_config": config.detector_config["vision_config"]}
+            config = Sam3TrackerConfig(**config.tracker_config | vision)
     model = load_model(Sam3TrackerModel, weights, config)
     # The coarsest map is the detector's alone: transformers would add what stands for no memory to the last.
     neck = model.vision_encoder.neck
