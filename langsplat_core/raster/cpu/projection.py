@@ -396,6 +396,9 @@ def _backward(
 ) -> None:
     b, h = np.empty(sh.shape[1]), np.empty(sh.shape[1])
     for n in range(first, last):
+        if colour_grad[n, 0] == 0 and colour_grad[n, 1] == 0 and colour_grad[n, 2] == 0:
+            sh_grad[n] = 0  # as half of them, which the view does not show
+            continue
         x, y, z, inverse = _direction(means[n], position)
         _basis(x, y, z, b)
         h[:] = 0
