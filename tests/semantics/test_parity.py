@@ -146,7 +146,7 @@ def test_a_clip_of_open_clip(name: str, field: SimpleNamespace, tmp_path: Path, 
     stated, phrases = field.open_clip.get_model_config(name), PLAIN + MARKED
     length = stated["text_cfg"]["context_length"]
     if name == WORLDWIDE:
-        from tests.support.tiny_models import unigram_tokenizer  # after torchvision, as transformers wants it
+        from tests.support.tiny_models import unigram_tokenizer  # after torchvision
 
         stated["text_cfg"] |= {"vocab_size": unigram_tokenizer(tmp_path, "<s> $A </s>"), "eos_id": 1}
         del stated["text_cfg"]["tokenizer_kwargs"]  # which Meta's own models do not have
