@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.config import DatasetConfig, check_settings
-from langsplat_core.datasets.capture import Capture, centred, metres_of, split_views
+from langsplat_core.datasets.capture import Capture, centred, split_views, with_taken
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.datasets.photos import photo_folder
+from langsplat_core.datasets.photos import photo_folder, say_unread
 from langsplat_core.datasets.sfm import add_points, load_photos
 from langsplat_core.datasets.video import kept_frames
 from langsplat_core.errors import STRICTNESS, InputError
@@ -37,8 +37,8 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     InputError where nothing usable remains.
     """
     capture = load_photographs(path, config, work, progress)
-    metres = config.metres_per_unit or capture.metres_per_unit or metres_of(capture)
-    capture = replace(capture, metres_per_unit=metres)
+    metres = config.metres_per_unit or capture.metres_per_unit
+    capture = with_taken(replace(capture, metres_per_unit=metres))
     if len(capture.points):
         return capture
     return add_points(capture, split_views(capture, config)[0], work, progress)
@@ -64,6 +64,7 @@ def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Pr
         folder, photos = photo_folder(path)
         if not photos:
             raise InputError(f"{path} is no dataset; expected {ACCEPTED}")
+        say_unread(folder, photos)
         return load_photos(folder, photos, config, work, progress)
     except PermissionError as error:
         raise InputError(f"{error.filename}: may not be read ({error.strerror}); see to its rights") from None

@@ -26,7 +26,7 @@ from langsplat_core.datasets.photos import (
     View,
     counted,
     developer,
-    place,
+    exif_facts,
     stray_masks,
     unique_names,
 )
@@ -56,6 +56,7 @@ class Capture:
     cut_out: bool = False  # pixels that do not count are empty, rather than not known
     matches: Matches | None = None  # of all photographs, where cameras came from structure from motion
     origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) what cameras and points are relative to
+    taken: str = ""  # the span of its photographs' dates and places, in words; as EXIF data say
 
     def __post_init__(self) -> None:
         lists = {"photographs": self.images, "files": self.photos, "masks": self.masks}
@@ -365,17 +366,31 @@ FEWEST_PLACES = 5  # photographs that name one
 EQUATOR, FLATTENED = 6_378_137.0, 6.694_379_990_14e-3  # of WGS 84: radius in metres, squared eccentricity
 
 
-def metres_of(capture: Capture) -> float | None:
-    """Return the metres of a unit of `capture` by its photographs' places; None where they are unsure."""
-    places = np.array([place(photo.path) for photo in capture.photos]).reshape(-1, 2)
-    named = np.isfinite(places).all(1)
-    if named.sum() < FEWEST_PLACES:
-        return None
+def with_taken(capture: Capture) -> Capture:
+    """Return the capture with what its photographs say of their dates and places, and a scale by these.
+
+    The scale is that of the dataset where it has one; none where the places are unsure.
+    """
+    facts = [exif_facts(photo.path) for photo in capture.photos]
+    dates = sorted(each.taken for each in facts if each.taken)
+    places = np.array([each.place for each in facts]).reshape(-1, 2)
+    named, said = np.isfinite(places).all(1), []
+    if dates:
+        first, last = (f"{date:%Y-%m-%d %H:%M}" for date in (dates[0], dates[-1]))
+        said.append(first if last == first else f"{first} to {last[11 * (last[:11] == first[:11]) :]}")
+    if named.any():
+        span = pdist(on_ground(places[named])).max(initial=0)
+        said.append(f"places (GPS) within {span:.0f} m")
+    if said:
+        log.info("taken: %s", ", ".join(said))
+    capture = replace(capture, taken=", ".join(said))
+    if capture.metres_per_unit or named.sum() < FEWEST_PLACES:
+        return capture
     eyes = np.array([camera.position for camera in capture.cameras])[named]
     metres = metres_per_unit(eyes, places[named])
-    said = "of no length that they agree on" if metres is None else f"about {metres:.3g} m long"
-    log.info("a unit is %s, by the places (GPS) of %d photographs", said, named.sum())
-    return metres
+    length = "of no length that they agree on" if metres is None else f"about {metres:.3g} m long"
+    log.info("a unit is %s, by the places (GPS) of %d photographs", length, named.sum())
+    return replace(capture, metres_per_unit=metres)
 
 
 def metres_per_unit(eyes: Array, places: Array) -> float | None:
@@ -390,13 +405,17 @@ def metres_per_unit(eyes: Array, places: Array) -> float | None:
     if not apart.any():
         return None
     far = apart >= apart.max() / 2
+    low, middle, high = np.quantile(pdist(on_ground(places))[far] / apart[far], [0.25, 0.5, 0.75])
+    return float(middle) if middle > 0 and high - low <= middle / 5 else None
+
+
+def on_ground(places: Array) -> Array:
+    """Return (K, 2) metres east and north of the first of (K, 2) latitudes and longitudes, degrees."""
     latitude, longitude = np.radians(places).T
     east = (longitude - longitude[0] + math.pi) % (2 * math.pi) - math.pi  # also over the date line
     bend = 1 - FLATTENED * math.sin(latitude[0]) ** 2
     along = EQUATOR / math.sqrt(bend) * math.cos(latitude[0]) * east
-    ground = np.stack([along, EQUATOR * (1 - FLATTENED) / bend**1.5 * (latitude - latitude[0])], 1)
-    low, middle, high = np.quantile(pdist(ground)[far] / apart[far], [0.25, 0.5, 0.75])
-    return float(middle) if middle > 0 and high - low <= middle / 5 else None
+    return np.stack([along, EQUATOR * (1 - FLATTENED) / bend**1.5 * (latitude - latitude[0])], 1)
 
 
 # Points where the cameras look, for want of better ones.

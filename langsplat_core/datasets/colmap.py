@@ -344,7 +344,7 @@ def load_colmap(folder: Path, model_folder: Path, config: DatasetConfig, progres
     if missing:
         share = f"{len(missing)} of {len(photos)} photographs of the model"
         report_loss("%s do not exist and are left out: %s", share, shortened(missing))
-    present = find_photos(images) or find_photos(images, below=images.name == "images")
+    present = find_photos(images) or find_photos(images, below=int(images.name == "images"))
     if without := {path.name for path in present} - {photo.path.name for photo in there}:
         share = f"cameras for only {len(there)} of the {len(present)} photographs beside it"
         lost = shortened(without)

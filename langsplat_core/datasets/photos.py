@@ -4,7 +4,9 @@ import logging
 import math
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cache, lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -17,7 +19,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.colour import as_srgb, coded_as
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics, pinhole_for, resample, source_positions
-from langsplat_core.errors import InputError, Tell
+from langsplat_core.errors import InputError, Tell, shortened
 from langsplat_core.io import hostile
 from langsplat_core.scene import Camera
 
@@ -43,15 +45,18 @@ class Photo:
 # Finding them.
 
 
-def find_photos(folder: Path, below: bool = False) -> list[Path]:
-    """Return photographs directly in `folder`, by name, or `below` it, in its folders; no hidden files."""
+DEEP = 3  # levels of folders: a phone's photographs lie in DCIM/100APPLE
+
+
+def find_photos(folder: Path, below: int = 0) -> list[Path]:
+    """Return photographs in `folder`, by name, and in so many levels of folders `below` it; none hidden."""
     if not folder.is_dir():
         return []
     listed = sorted(path for path in folder.iterdir() if path.name[0] != ".")
-    if below:
-        inside = (find_photos(path) for path in listed if path.name != "masks")
-        return [photo for photos in inside for photo in photos]
-    return [path for path in listed if path.suffix.lower() in hostile.PHOTO_SUFFIXES and path.is_file()]
+    found = [path for path in listed if path.suffix.lower() in hostile.PHOTO_SUFFIXES and path.is_file()]
+    # Work folders hold copies of photographs.
+    inside = (path for path in listed if below and path.name != "masks" and path.suffix != ".work")
+    return found + [photo for path in inside for photo in find_photos(path, below - 1)]
 
 
 def photo_folder(folder: Path) -> tuple[Path, list[Path]]:
@@ -60,7 +65,7 @@ def photo_folder(folder: Path) -> tuple[Path, list[Path]]:
     That is `folder` itself or a folder "images" or "photos" in it; else photographs lie in folders of those.
     """
     named = folder / "images", folder / "photos"
-    for below, candidates in ((False, (folder, *named)), (True, (*named, folder))):
+    for below, candidates in ((0, (folder, *named)), (DEEP, (*named, folder))):
         for candidate in candidates:
             if photos := find_photos(candidate, below):
                 return candidate, photos
@@ -76,6 +81,26 @@ def count_photographs(dataset: Path) -> int:
         return len(find_photos(folder / "images") or photo_folder(folder)[1])
     except OSError:
         return 0
+
+
+def say_unread(folder: Path, photos: Sequence[Path]) -> None:
+    """Say which photographs and videos among `photos`, and in folders of `folder`, are not read."""
+    known, stems = set(photos), {photo.with_suffix("") for photo in photos}
+    more = [path.relative_to(folder).as_posix() for path in find_photos(folder, DEEP) if path not in known]
+    beside = [
+        path for at in {photo.parent for photo in photos} for path in at.iterdir() if hostile.is_video(path)
+    ]
+    live = [path for path in beside if path.with_suffix("") in stems]
+    videos = sorted(path.name for path in beside if path not in live)
+    if live:
+        log.info("%d videos of Live Photos are not read, their stills are", len(live))
+    if videos:
+        log.warning("%d videos are not read, train each by itself: %s", len(videos), shortened(videos))
+    if more:
+        remedy = "move them beside the others if they belong to them"
+        log.warning(
+            "%d photographs in other folders are not read: %s; %s", len(more), shortened(more), remedy
+        )
 
 
 def finder(folder: Path) -> Callable[[str], Path]:
@@ -135,10 +160,10 @@ def unique_names(labels: Sequence[str]) -> list[str]:
     return [label.replace("/", "_").replace(".", "_") for label in labels]
 
 
-# EXIF data: the focal length, as COLMAP learns of it, and the place (GPS).
+# EXIF data: the focal length, as COLMAP learns of it, and when, where (GPS) and by what it was taken.
 
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
-_MAKER, _MODEL = 0x010F, 0x0110
+_MAKER, _MODEL, _CHANGED, _TAKEN = 0x010F, 0x0110, 0x0132, 0x9003
 _FOCAL, _FOCAL_ON_FILM = 0x920A, 0xA405  # mm; mm of a lens with the same view on film of 36 x 24 mm
 _PLANE_X, _PLANE_UNIT, _WIDTH = 0xA20E, 0xA210, 0xA002  # pixels per unit on the sensor; the unit; pixels
 _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of the unit
@@ -178,22 +203,34 @@ def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:
     return {_FOCAL_ON_FILM: round(length)} if 1 <= length <= 5_000 else {}  # mm, of any lens that is sold
 
 
-def place(path: Path) -> tuple[float, float]:
-    """Return latitude and longitude of a photograph, degrees, north and east positive; NaN without them."""
-    try:
-        with hostile.opened(path) as image:
-            # What stands behind a PNG's pixels is read by decoding them all.
-            tags = image.getexif().get_ifd(GPS_IFD) if image.format != "PNG" or "exif" in image.info else {}
-            latitude, longitude = (
-                sum(float(part) / by for by, part in zip((1, 60, 3600), tags[tag], strict=True))
-                * signs[tags[tag - 1]]
-                for tag, signs in ((2, {"N": 1, "S": -1}), (4, {"E": 1, "W": -1}))
-            )
-    # Absent, or not what the standard says.
-    except (hostile.PictureError, KeyError, TypeError, ValueError, ZeroDivisionError):
-        return math.nan, math.nan
-    known = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0, 0)
-    return (latitude, longitude) if known else (math.nan, math.nan)
+@dataclass(frozen=True)
+class ExifFacts:
+    """When, where and by what a photograph was taken, as far as its EXIF data say."""
+
+    taken: datetime | None = None  # by the camera's clock
+    place: tuple[float, float] = (math.nan, math.nan)  # latitude, longitude: degrees, north and east positive
+    camera: str = ""  # maker and model
+
+
+def exif_facts(path: Path) -> ExifFacts:
+    """Return what a photograph's EXIF data say of how it was taken; nothing of what cannot be read."""
+    exif, inner, places = Image.Exif(), dict[int, Any](), dict[int, Any]()
+    with suppress(hostile.PictureError), hostile.opened(path) as image:
+        if image.format != "PNG" or "exif" in image.info:  # behind a PNG's pixels it is read by decoding them
+            exif = image.getexif()
+            inner, places = exif.get_ifd(EXIF_IFD), exif.get_ifd(GPS_IFD)
+    taken, place = None, (math.nan, math.nan)
+    with suppress(TypeError, ValueError):  # absent, or not what the standard says
+        taken = datetime.strptime(str(inner.get(_TAKEN) or exif.get(_CHANGED)), "%Y:%m:%d %H:%M:%S")
+    with suppress(KeyError, TypeError, ValueError, ZeroDivisionError):
+        latitude, longitude = (
+            sum(float(part) / by for by, part in zip((1, 60, 3600), places[tag], strict=True))
+            * signs[places[tag - 1]]
+            for tag, signs in ((2, {"N": 1, "S": -1}), (4, {"E": 1, "W": -1}))
+        )
+        if abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0, 0):
+            place = latitude, longitude
+    return ExifFacts(taken, place, " ".join(str(exif[tag]) for tag in (_MAKER, _MODEL) if tag in exif))
 
 
 # Reading them.

@@ -65,7 +65,7 @@ def load_photos(
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
         raise InputError(
             f"only {found} of {len(files)} photographs could be located together "
-            f"({_listed(lost, 10)}); {matches.joined()}{matches.advice()}{anyway}"
+            f"({_listed(lost, 10)}); {matches.advice()}{anyway}"
         )
     unread = lost.pop(workspaces.UNREADABLE, [])
     if before and unread:  # else the process has told of them, with the reasons

@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from langsplat_core.datasets.photos import ExifFacts, exif_facts
 from langsplat_core.errors import FormatError, printable_line, shortened
 from langsplat_core.io import apart
 from langsplat_core.progress import Progress
@@ -85,7 +86,6 @@ def disk_full(folder: Path) -> OSError:
 
 FEWEST_MATCHES = 15  # that COLMAP's mapper works with
 FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
-MOST_TOLD = 3  # groups and gaps in a message
 UNREADABLE = "cannot be read"  # why a photograph has no camera
 
 
@@ -97,6 +97,7 @@ class Matches:
     features: tuple[int, ...]  # of each; -1 where the file could not be read
     pairs: tuple[tuple[int, int, int], ...]  # rows of two photographs, and their verified matches
     located: frozenset[int]  # rows of those that have a camera
+    exif: tuple[ExifFacts, ...] = ()  # how each was taken; (): unknown
 
     @cached_property
     def shared(self) -> dict[tuple[int, int], int]:
@@ -118,6 +119,38 @@ class Matches:
         others = sorted(found.values(), key=len, reverse=True)
         return [sorted(self.located), *others] if self.located else others
 
+    @cached_property
+    def captures(self) -> list[list[int]]:
+        """Rows in groups that may be captures of their own: the first of `groups`, and others unlike it.
+
+        These are groups of three and more that share no matches with the first, or else all other
+        photographs, where they were taken at another time or by another camera; one group where all may
+        belong together.
+        """
+        first, *others = self.groups or [[]]
+        joins = (pair for pair, count in self.shared.items() if count >= FEWEST_MATCHES)
+        near = {row for pair in joins if set(first) & set(pair) for row in pair}
+        alone = [group for group in others if len(group) > 2 and not near & set(group)]
+        rest = sorted(row for group in others for row in group if self.features[row] >= 0)
+        if not alone and min(len(first), len(rest)) > 2 and self.apart([first, rest]):
+            alone = [rest]
+        return [first, *alone]
+
+    def apart(self, groups: Sequence[Sequence[int]]) -> str:
+        """Return in words what tells groups of rows apart beside matches; empty where nothing does."""
+        exif, found = self.exif or (ExifFacts(),) * len(self.names), []
+        facts: dict[str, list[object]] = {
+            "on other days": [each.taken and each.taken.date() for each in exif],
+            "by other cameras": [each.camera or None for each in exif],
+            "in other folders": [name.rpartition("/")[0] for name in self.names],
+        }
+        for kind, of in facts.items():
+            seen = [{of[row] for row in group} for group in groups]
+            every = set().union(*seen)
+            if None not in every and len(every) == sum(map(len, seen)):
+                found.append(kind)
+        return ", ".join(found)
+
     def why(self, row: int) -> str:
         """Return the reason why a photograph has no camera."""
         if self.features[row] < 0:
@@ -133,44 +166,38 @@ class Matches:
             return "matches only others that have no camera"
         return "matched, but from one and the same place, or without enough overlap"
 
-    def gaps(self) -> list[tuple[int, int]]:
-        """Return pairs of rows between which more photographs would join one more group to those before.
+    @cached_property
+    def gap(self) -> tuple[int, int] | None:
+        """Rows of two photographs, of which one is in the first group, between which more would join others.
 
-        Of two groups that is the pair that shares most, or the neighbours in name order where none shares
-        enough. At most `MOST_TOLD`; photographs without features have no part in them.
+        That is the pair that shares most, or the neighbours in name order where none shares enough.
+        Photographs without features have no part in it.
         """
-        useful = [[row for row in group if self.features[row] >= FEWEST_FEATURES] for group in self.groups]
-        joined, *apart = [group for group in useful if group] or [[]]
-        found: list[tuple[int, int]] = []
+        first, *others = (
+            [row for row in group if self.features[row] >= FEWEST_FEATURES] for group in self.groups or [[]]
+        )
+        across = ((min(a, b), max(a, b)) for a in first for group in others for b in group)
 
         def width(pair: tuple[int, int]) -> tuple[int, int]:
             shared = self.shared.get(pair, 0)
             return (-shared if shared >= FEWEST_MATCHES else 0), pair[1] - pair[0]
 
-        while joined and apart and len(found) < MOST_TOLD:
-            across = ((min(a, b), max(a, b)) for a in joined for group in apart for b in group)
-            gap = min(across, key=width)
-            found.append(gap)
-            new = next(group for group in apart if set(gap) & set(group))
-            joined, apart = joined + new, [group for group in apart if group is not new]
-        return found
-
-    def joined(self) -> str:
-        """Return the groups that matches join, in words; empty where there are none."""
-        large = [self._listed(group) for group in self.groups if len(group) > 1][:MOST_TOLD]
-        return f"matches join {', '.join(large)}; " if large else ""
+        return min(across, key=width, default=None)
 
     def advice(self) -> str:
-        """Return advice in words where to take more photographs."""
-        between = [
-            f"between {self._name(a)} and {self._name(b)} ({self.shared.get((a, b), 0) or 'no'} matches)"
-            for a, b in self.gaps()
-        ]
-        if between:
-            return f"take more photographs {', '.join(between)}"
-        if self.joined() and not self.located:
-            return "they all match, but nothing tells depth: step aside between photographs, do not only turn"
-        return "take more photographs, each sharing at least two thirds of its view with the next"
+        """Return advice in words: where to take more photographs, or to train captures apart."""
+        more = "take more photographs, each sharing at least two thirds of its view with the next"
+        if self.gap:
+            ends, count = " and ".join(map(self._name, self.gap)), self.shared.get(self.gap) or "no"
+            more = f"take more photographs between {ends} ({count} matches)"
+        elif not self.located and any(len(group) > 1 for group in self.groups):
+            more = "they all match, but nothing tells depth: step aside between photographs, do not only turn"
+        if len(self.captures) < 2:
+            return more
+        listed = " and ".join(map(self._listed, self.captures[:3]))
+        if apart := self.apart(self.captures):
+            return f"{listed} look like captures of their own ({apart}): train each from its own folder"
+        return f"if {listed} are captures of their own, train each from its own folder; else {more}"
 
     def _listed(self, group: list[int]) -> str:
         if group == list(range(group[0], group[-1] + 1)) and len(group) > 2:
@@ -188,12 +215,11 @@ def read_matches(folder: Path, files: dict[str, Path], located: Collection[str])
     except ValueError as error:
         raise FormatError(f"{folder}: its matches are damaged ({error}); delete it and run again") from None
     row = {name: index for index, name in enumerate(files)}
-    names, unlike = (
-        tuple(path.relative_to(path.parents[level]).as_posix() for path in files.values()) for level in (0, 1)
-    )
+    root = os.path.commonpath([path.parent for path in files.values()])
     return Matches(
-        names=names if len(set(names)) == len(names) else unlike,
+        names=tuple(path.relative_to(root).as_posix() for path in files.values()),
         features=tuple(kept["features"].get(name, -1) for name in files),
         pairs=tuple((row[a], row[b], count) for a, b, count in kept["pairs"]),
         located=frozenset(row[name] for name in located),
+        exif=tuple(map(exif_facts, files.values())),
     )

@@ -213,7 +213,7 @@ def kept_photographs(
 
 def _stated_dataset(path: Path, work: Path) -> Path:
     """Return the dataset that the report of a training names, if it is still there."""
-    place = stated_figures(work).get("dataset")
+    place = stated_figures(work / REPORT).get("dataset")
     if isinstance(place, str) and place and exists(Path(place)):
         return Path(place)
     where = f"not in {place}" if isinstance(place, str) and place else f"not named in {work / REPORT}"

@@ -1,9 +1,10 @@
 """Report of a training: `report.json` and the page `report.html` in its work folder; read without torch.
 
-The page is one file without scripts: photographs beside what the scene shows, cameras from above, warnings
-and figures.
+The page is one file, whose only script moves the line between a photograph and what the scene shows there:
+its content is allowed by its hash. Names and other text of whatever origin are escaped.
 """
 
+import hashlib
 import html
 import io
 import json
@@ -41,7 +42,7 @@ class TrainReport:
     gaussians: int
     psnr: float | None  # mean over held-out views, dB; None without held-out views
     warnings: tuple[str, ...]  # quality warnings, each with its remedy
-    seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
+    seconds: dict[str, float]  # per stage, of all processes that worked on it, interrupted ones too
     masks: str = ""  # name of the mask source; "" without a language field, as what follows
     encoder: str = ""
     mask_count: int = 0
@@ -58,6 +59,7 @@ class TrainReport:
     rehearsed: dict[str, list[float]] = field(default_factory=dict)
     psnr_trained: float | None = None  # mean over the views that were trained on, 48 of them at most
     held_out_rule: str = ""  # which views are held out, in words
+    taken: str = ""  # the span of the photographs' dates and places, in words
 
 
 def rehearsals_in_words(rehearsed: Mapping[str, Sequence[float]]) -> str:
@@ -80,10 +82,10 @@ def read_report(work: Path) -> TrainReport:
     return TrainReport(**stated | {"warnings": tuple(stated["warnings"]), "held_out_views": scores})
 
 
-def stated_figures(work: Path) -> dict[str, Any]:
+def stated_figures(path: Path) -> dict[str, Any]:
     """Return what a report of whatever origin says; nothing where there is none or it cannot be read."""
     try:
-        stated = read_json_file(work / REPORT, limit=1_000_000)
+        stated = read_json_file(path, limit=1_000_000)
     except (InputError, FormatError):
         return {}
     return stated if isinstance(stated, dict) else {}
@@ -91,7 +93,7 @@ def stated_figures(work: Path) -> dict[str, Any]:
 
 def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
     """Return the first quality warnings of the report beside a scene, if it has as many Gaussians."""
-    stated = stated_figures(work_folder(scene))
+    stated = stated_figures(work_folder(scene) / REPORT)
     lines = stated.get("warnings") if stated.get("gaussians") == gaussians else None
     if not isinstance(lines, list):
         return ()
@@ -161,6 +163,7 @@ MOST_VIEWS = 48  # on the page, held-out ones first
 SIDE = 400  # px, longer side of an image
 PLOT = 640  # units of a drawing's side
 CELLS = 220  # of the map, along its longer side
+SLIDE = 'oninput = ({ target }) => target.parentNode.style.setProperty("--at", target.value + "%");'
 
 
 def shown_views(train: Sequence[int]) -> list[int]:
@@ -181,13 +184,15 @@ def write_reports(
     views = (_view(capture, scene, rows[score.name], score, score.name in held_out) for score in scores)
     more = len(capture) - len(scores)
     head = files("langsplat_core").joinpath("web", "report.html").read_text(encoding="utf-8")
+    digest = b64encode(hashlib.sha256(SLIDE.encode()).digest()).decode()
+    head = head.replace("{{SCRIPT}}", SLIDE).replace("{{DIGEST}}", digest)
     parts = [
         head.replace("{{TITLE}}", _text(Path(report.dataset).name or "Training")),
         _tiles(report), *_warnings(report.warnings), "<div class=halves>",
         _section("Cameras from above", _from_above(scene, held_out)), _figures(report, capture.matches),
         "</div><h2>Photographs, and what the scene shows there</h2>",
-        "<p class=soft>Left the photograph, right the scene. Held-out photographs, which were not trained "
-        f"on, come first{f'; {more} more are not shown' if more else ''}.</p>",
+        "<p class=soft>Left of the line the photograph, right the scene: drag it. Held-out photographs, not "
+        f"trained on, come first{f'; {more} more are not shown' if more else ''}.</p>",
         "<div class=views>", *views, "</div>",
     ]  # fmt: skip
     with atomic_path(work / PAGE) as temporary:
@@ -221,17 +226,18 @@ def _tiles(report: TrainReport) -> str:
         "held-out SSIM": f"{np.mean([s.ssim for s in scores]):.3f}" if scores else "none",
         "Gaussians": f"{report.gaussians:,}",
         "masks": f"{report.mask_count:,}",
-        "in all": f"{sum(report.seconds.values()):.0f} s",
+        "in all runs": f"{sum(report.seconds.values()):.0f} s",
     }
     cards = "".join(f"<div class=card><b>{value}</b>{name}</div>" for name, value in tiles.items())
-    return f"<p class=soft>{_text(report.dataset, 400)}</p><div class='tiles soft'>{cards}</div>"
+    about = "<br>".join(_text(line, 400) for line in (report.dataset, report.taken) if line)
+    return f"<p class=soft>{about}</p><div class='tiles soft'>{cards}</div>"
 
 
 def _figures(report: TrainReport, matches: Matches | None) -> str:
     found = "not sought: cameras were given"
     if matches is not None:
         found = f"{len(matches.located)} of {len(matches.names)} photographs are located"
-        found += f"; to join the others, {matches.advice()}" if matches.gaps() else ""
+        found += f"; {matches.advice()}" if matches.gap else ""
     figures = {name: f"{seconds:.1f} s" for name, seconds in report.seconds.items()}
     figures |= {
         "matches": found,
@@ -260,8 +266,8 @@ def _view(capture: Capture, scene: Scene, index: int, score: ViewScore, held: bo
     return (
         f"<div class='card{' held' if held else ''}'><div class=name><span>{_text(camera.name)}{badge}</span>"
         f"<span class=soft>{score.psnr:.1f} dB, SSIM {score.ssim:.3f}</span></div>"
-        f"<div class=pair><img alt=photograph src='{_uri(photograph)}'>"
-        f"<img alt=scene src='{_uri(_image(drawn))}'></div></div>"
+        f"<div class=pair><img alt=photograph src='{_uri(photograph)}'><img alt=scene "
+        f"src='{_uri(_image(drawn))}'><input type=range aria-label='where the scene begins'></div></div>"
     )
 
 
@@ -276,19 +282,17 @@ def _uri(image: Image.Image) -> str:
 
 
 def _from_above(scene: Scene, held_out: Container[str]) -> str:
-    """Draw the cameras and the Gaussians from above, with the cameras' longest way across the page."""
+    """Draw the cameras and most Gaussians from above, with the cameras' longest way across the page."""
     up, eyes = scene.up(), np.array([camera.position for camera in scene.cameras])
     flat = (eyes - eyes.mean(0)) - np.outer((eyes - eyes.mean(0)) @ up, up)
     right = np.linalg.svd(flat)[2][0]
     axes = np.stack([right - (right @ up) * up, np.cross(up, right)])  # right and, on the page, up
     gaussians = scene.gaussians.take(np.flatnonzero(scene.gaussians.valid()))
     points, places = gaussians.means.astype(np.float64) @ axes.T, eyes @ axes.T
-    low, high = places.min(0), places.max(0)
-    margin = max(float((high - low).max()), 1e-30)
-    if len(points):
-        near, far = np.quantile(points, (0.05, 0.95), axis=0)
-        low, high = np.clip(near, low - margin, low), np.clip(far, high, high + margin)
-    low, high = low - 0.06 * margin, high + 0.06 * margin
+    most = np.quantile(points, (0.02, 0.98), axis=0) if len(points) else places
+    low, high = np.minimum(places.min(0), most[0]), np.maximum(places.max(0), most[-1])
+    margin = max(0.06 * float((high - low).max()), 1e-30)
+    low, high = low - margin, high + margin
     scale = PLOT / float((high - low).max())
     width, height = (high - low) * scale
 

@@ -6,11 +6,13 @@ continues where it stopped and a changed setting recomputes only what depends on
 
 import json
 import logging
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,7 +29,7 @@ from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.pipeline import language_field
 from langsplat_core.pipeline import report as reports
-from langsplat_core.pipeline.stages import ProcessGroup, digest_of, sole_use, stage_key
+from langsplat_core.pipeline.stages import LOCK, ProcessGroup, digest_of, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Gaussians, LanguageField, Scene
 from langsplat_core.scene.transform import place_scene
@@ -89,15 +91,30 @@ class _Run:
     progress: Progress
     processes: ProcessGroup
     until: Until
-    seconds: dict[str, float] = field(default_factory=dict)  # that each stage took
+
+    @property
+    def seconds_file(self) -> Path:
+        """The file of `seconds`, one for each dataset and settings."""
+        return self.work / f"{stage_key('seconds', 1, str(self.dataset.resolve()), self.config)}.json"
+
+    @cached_property
+    def seconds(self) -> dict[str, float]:
+        """Seconds that each stage took, in this process and in earlier ones that were interrupted."""
+        return reports.stated_figures(self.seconds_file)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Note the seconds that a stage takes."""
+        """Add the seconds of a stage, also of one that is interrupted, to those of earlier runs."""
         began = time.perf_counter()
-        yield
-        self.seconds[stage] = round(time.perf_counter() - began, 1)
-        log.debug("%s: %.1f s", stage, self.seconds[stage])
+        try:
+            yield
+        finally:
+            took = time.perf_counter() - began
+            self.seconds[stage] = round(self.seconds.get(stage, 0.0) + took, 1)
+            log.debug("%s: %.1f s", stage, took)
+            with suppress(OSError):
+                if set(os.listdir(self.work)) - {LOCK}:  # else the folder goes with what was refused
+                    write_json(self.seconds_file, self.seconds)
 
 
 def _train(
@@ -156,6 +173,7 @@ def _train(
             warnings=reports.quality_warnings(capture, train, scores, trained),
             seconds=run.seconds,
             dataset=str(run.dataset.resolve()),
+            taken=capture.taken,
             held_out_views=tuple(scores),
             rehearsed=rehearsed,
             psnr_trained=_mean(score.psnr for score in trained),

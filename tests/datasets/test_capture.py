@@ -1,6 +1,7 @@
 """Captures: digests, held-out views, the length of a unit, random points."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from langsplat_core.datasets.capture import (
     surrounded_views,
 )
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
-from langsplat_core.datasets.photos import place
+from langsplat_core.datasets.photos import ExifFacts, exif_facts
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.scene.transform import moving, rotating, scaling
@@ -168,11 +169,15 @@ def located(metres: Array, unit: float) -> Array:
 
 
 def tagged(
-    path: Path, latitude: object, longitude: object, signs: tuple[object, object] = ("N", "E")
+    path: Path,
+    latitude: object,
+    longitude: object,
+    signs: tuple[object, object] = ("N", "E"),
+    date: str = "2026:05:03 14:02:59",
 ) -> Path:
     """A photograph's copy that names a place."""
     exif = Image.Exif()
-    exif[0x0112] = 1  # else Pillow takes it for empty
+    exif[0x0132] = date
     exif.get_ifd(0x8825).update({1: signs[0], 2: latitude, 3: signs[1], 4: longitude})
     with Image.open(path) as picture:
         picture.copy().save(path, exif=exif)
@@ -212,10 +217,11 @@ def photo(tmp_path: Path) -> Path:
 
 
 def test_the_place_of_a_photograph(photo: Path) -> None:
+    there = exif_facts(tagged(photo, parts(33.9), parts(18.4), ("S", "W"))).place
+    np.testing.assert_allclose(there, (-33.9, -18.4), atol=1e-7)
     np.testing.assert_allclose(
-        place(tagged(photo, parts(33.9), parts(18.4), ("S", "W"))), (-33.9, -18.4), atol=1e-7
+        exif_facts(tagged(photo, parts(HERE[0]), parts(HERE[1]))).place, HERE, atol=1e-7
     )
-    np.testing.assert_allclose(place(tagged(photo, parts(HERE[0]), parts(HERE[1]))), HERE, atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -228,10 +234,10 @@ def test_the_place_of_a_photograph(photo: Path) -> None:
     ],
 )
 def test_implausible_exif_places_are_unknown(photo: Path, latitude: object, north: str) -> None:
-    assert all(map(math.isnan, place(photo)))
-    assert all(map(math.isnan, place(tagged(photo, latitude, parts(8.0), (north, "E")))))
+    tagged(photo, latitude, parts(8.0), (north, "E"), date="some day in May")
+    assert repr(exif_facts(photo)) == repr(ExifFacts())  # NaN is not itself
     photo.write_bytes(b"no photograph")
-    assert all(map(math.isnan, place(photo)))
+    assert repr(exif_facts(photo)) == repr(ExifFacts())
 
 
 def test_a_capture_gets_its_scale_from_its_photographs(tmp_path: Path) -> None:
@@ -245,7 +251,7 @@ def test_a_capture_gets_its_scale_from_its_photographs(tmp_path: Path) -> None:
         return load_capture(tmp_path, config, tmp_path / "work").metres_per_unit
 
     capture = load_capture(tmp_path, config, tmp_path / "work")
-    assert capture.metres_per_unit is None
+    assert (capture.metres_per_unit, capture.taken) == (None, "")
     eyes = np.array([camera.position for camera in capture.cameras])
     level = np.linalg.svd(eyes - eyes.mean(0))[2][:2]  # the plane that they lie in
     for photo, (latitude, longitude) in zip(
@@ -253,6 +259,9 @@ def test_a_capture_gets_its_scale_from_its_photographs(tmp_path: Path) -> None:
     ):
         tagged(photo.path, parts(latitude), parts(longitude))
     assert loaded(config) == pytest.approx(20, rel=0.01)
+    tagged(capture.photos[3].path, parts(90.0), parts(0.0), ("N", "N"), "2026:05:04 09:00:00")  # no place
+    taken = load_capture(tmp_path, config, tmp_path / "work").taken
+    assert re.fullmatch(r"2026-05-03 14:02 to 2026-05-04 09:00, places \(GPS\) within \d+ m", taken)
     assert loaded(DatasetConfig(metres_per_unit=3.0)) == 3.0
 
 

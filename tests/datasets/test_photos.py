@@ -29,6 +29,7 @@ from langsplat_core.datasets.photos import (
     optics,
     photo_folder,
     read_photo,
+    say_unread,
     unique_names,
 )
 from langsplat_core.datasets.video import extract_frames, kept_frames
@@ -113,6 +114,24 @@ def test_photographs_are_counted_where_they_lie(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     assert photo_folder(tmp_path) == (tmp_path, [tmp_path / "left/1.jpg", tmp_path / "right/1.jpg"])
+    (tmp_path / "right").rename(tmp_path / "left/right")
+    (tmp_path / "left").rename(tmp_path / "scene.work")
+    assert count_photographs(tmp_path) == 0  # of its own copies
+    (tmp_path / "scene.work").rename(tmp_path / "DCIM")
+    assert count_photographs(tmp_path) == 2
+
+
+def test_what_lies_among_photographs_and_is_not_read_is_said(tmp_path: Path, caplog) -> None:
+    for name in ("IMG_1.HEIC", "IMG_1.MOV", "IMG_2.heic", "IMG_2.mov", "walk.mp4", "edited/IMG_1.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    caplog.set_level(logging.INFO, "langsplat")
+    say_unread(*photo_folder(tmp_path))
+    assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
+        "2 videos of Live Photos are not read, their stills are",
+        "1 videos are not read, train each by itself",
+        "1 photographs in other folders are not read",
+    ]
 
 
 @pytest.mark.parametrize("name", ["large.jpg", "large.png"])

@@ -3,6 +3,7 @@
 import logging
 from contextlib import suppress
 from dataclasses import replace
+from datetime import datetime
 from functools import cache
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture, reconstruction, sfm
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
-from langsplat_core.datasets.photos import find_photos
+from langsplat_core.datasets.photos import ExifFacts, find_photos
 from langsplat_core.datasets.sfm import add_points, neighbouring_pairs, pairs_by_name
 from langsplat_core.datasets.workspace import ROOM, Matches, read_matches
 from langsplat_core.errors import InputError
@@ -435,22 +436,40 @@ def chain(rows: range, shared: int = 100) -> list[tuple[int, int, int]]:
 def test_groups_and_the_gaps_between_them():
     matches = graph(12, chain(range(5)) + chain(range(5, 9)) + chain(range(9, 12)) + [(8, 9, 7)], range(5, 9))
     assert matches.groups == [[5, 6, 7, 8], [0, 1, 2, 3, 4], [9, 10, 11]]
-    assert matches.gaps() == [(4, 5), (8, 9)]
-    assert matches.joined() == (
-        "matches join IMG_05.jpg to IMG_08.jpg (4), IMG_00.jpg to IMG_04.jpg (5), "
-        "IMG_09.jpg to IMG_11.jpg (3); "
-    )
+    assert matches.gap == (4, 5)
     assert matches.advice() == (
-        "take more photographs between IMG_04.jpg and IMG_05.jpg (no matches), "
-        "between IMG_08.jpg and IMG_09.jpg (7 matches)"
+        "if IMG_05.jpg to IMG_08.jpg (4) and IMG_00.jpg to IMG_04.jpg (5) and IMG_09.jpg to IMG_11.jpg (3) "
+        "are captures of their own, train each from its own folder; else take more photographs between "
+        "IMG_04.jpg and IMG_05.jpg (no matches)"
     )
     assert matches.why(4) == "matches only others that have no camera"
 
 
-def test_gaps_join_photographs_where_they_match_most():
+def test_a_gap_joins_photographs_where_they_match_most():
     matches = graph(5, chain(range(4)) + [(1, 4, 20), (2, 4, 31), (3, 4, 3)], range(4))
-    assert matches.gaps() == [(2, 4)]
+    assert matches.gap == (2, 4)
     assert "without enough overlap" in matches.why(4)
+
+
+MAY = ExifFacts(datetime(2026, 5, 3), camera="K")
+
+
+@pytest.mark.parametrize(("second", "folder", "told"), [
+    (replace(MAY, taken=datetime(2026, 5, 9)), "a", "on other days"),
+    (replace(MAY, camera="L"), "a", "by other cameras"),
+    (MAY, "b", "in other folders"),
+    (ExifFacts(), "a", ""),
+])  # fmt: skip
+@pytest.mark.parametrize("matched", [True, False])
+def test_two_captures_in_one_folder_are_told_apart(
+    second: ExifFacts, folder: str, told: str, matched: bool
+) -> None:
+    matches = graph(7, chain(range(4)) + chain(range(4, 7)) * matched, range(4))
+    names = tuple(f"{'a' if row < 4 else folder}/{row}.jpg" for row in range(7))
+    matches = replace(matches, names=names, exif=(MAY,) * 4 + (second,) * 3)
+    assert matches.captures == [[0, 1, 2, 3], [4, 5, 6]][: 2 if told or matched else 1]
+    assert (f"captures of their own ({told})" in matches.advice()) == bool(told)
+    assert ("if a/0.jpg to a/3.jpg (4) and a/4.jpg" in matches.advice()) == (matched and not told)
 
 
 def test_no_feature_is_sought_where_a_mask_is_black(tmp_path: Path) -> None:

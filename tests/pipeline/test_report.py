@@ -25,6 +25,7 @@ from langsplat_core.pipeline.report import (
     write_reports,
 )
 from langsplat_core.scene import Camera, Gaussians, look_at
+from tests.support.processes import open_browser
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -154,6 +155,7 @@ def report(held_out: Sequence[str], **fields: object) -> TrainReport:
     return TrainReport(**stated | fields)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path) -> None:
     names = [f"{number}{HOSTILE}" for number in range(8)]
     matches = Matches(tuple(names), (900,) * 8, ((0, 1, 80), (1, 2, 20), (5, 6, 3)), frozenset(range(7)))
@@ -169,7 +171,8 @@ def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path)
     write_reports(tmp_path, warned, capture(names, matches=matches), gaussians(), others)
     assert read_report(tmp_path) == warned
     page = Read(tmp_path / PAGE)
-    assert not {"script", "link", "iframe", "light"} & {tag for tag, _ in page.tags}
+    assert not {"link", "iframe", "light"} & {tag for tag, _ in page.tags}
+    assert page.of("script") == [{}]  # the page's own
     sources = [image["src"] or "" for image in page.of("img")] + [i["href"] or "" for i in page.of("image")]
     assert len(page.of("img")) == 16
     assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
@@ -186,3 +189,15 @@ def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path)
     ):
         assert words in page.text
     assert len(page.of("polygon")) == 8  # cameras from above
+    with open_browser() as browser:
+        tab = browser.new_context(offline=True, viewport={"width": 390, "height": 800}).new_page()
+        asked: list[str] = []
+        tab.on("request", lambda request: asked.append(request.url))
+        tab.on("dialog", lambda dialog: asked.append(dialog.message))
+        tab.goto((tmp_path / PAGE).as_uri())
+        assert asked[0].startswith("file:")
+        assert all(url.startswith("data:") for url in asked[1:])
+        assert tab.evaluate("document.documentElement.scrollWidth") == 390
+        tab.locator("input").first.fill("20")
+        shown = "getComputedStyle(document.querySelector('.pair img + img')).clipPath"
+        assert tab.evaluate(shown) == "inset(0px 0px 0px 20%)"

@@ -22,6 +22,7 @@ from langsplat_core.config import (
     TrainConfig,
 )
 from langsplat_core.errors import EncoderError, FormatError, InputError
+from langsplat_core.io.files import write_json
 from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.report import read_report
@@ -197,7 +198,10 @@ def test_a_run_interrupted_in_every_stage_ends_with_the_same_bytes(room, whole, 
         with pytest.raises(WorkCancelledError):
             train_scene(room, tmp_path / "scene.ply", tiny_settings(room), progress=stop_at(stage, 0.1))
         assert scene_in(tmp_path) == {}
-    train_scene(room, tmp_path / "scene.ply", tiny_settings(room))
+    (seconds,) = tmp_path.glob("scene.work/seconds-*.json")
+    write_json(seconds, json.loads(seconds.read_bytes()) | {"radiance": 1_000.0})
+    report = train_scene(room, tmp_path / "scene.ply", tiny_settings(room))
+    assert report.seconds["radiance"] >= 1_000
     assert scene_in(tmp_path) == scene_in(whole)
 
 

@@ -36,7 +36,7 @@ from langsplat_core.config import DatasetConfig, check_settings
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.datasets.photos import optics, place, read_photo
+from langsplat_core.datasets.photos import exif_facts, optics, read_photo
 from langsplat_core.datasets.video import extract_frames
 from langsplat_core.display.displays import latent_colours
 from langsplat_core.errors import InputError, LangSplatError, printable_line
@@ -754,7 +754,7 @@ def photograph(path: Path) -> float:
         picture = read_photo(path, upright)
         assert picture.mode in ("RGB", "RGBA")
         assert {*picture.size} == {width, height}
-    optics(path), place(path)
+    optics(path), exif_facts(path)
     return 1.0
 
 
