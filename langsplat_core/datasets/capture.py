@@ -376,8 +376,7 @@ def with_taken(capture: Capture) -> Capture:
     places = np.array([each.place for each in facts]).reshape(-1, 2)
     named, said = np.isfinite(places).all(1), []
     if dates:
-        first, last = (f"{date:%Y-%m-%d %H:%M}" for date in (dates[0], dates[-1]))
-        said.append(first if last == first else f"{first} to {last[11 * (last[:11] == first[:11]) :]}")
+        said.append(f"{dates[0]:%Y-%m-%d %H:%M} to {dates[-1]:%Y-%m-%d %H:%M}")
     if named.any():
         span = pdist(on_ground(places[named])).max(initial=0)
         said.append(f"places (GPS) within {span:.0f} m")

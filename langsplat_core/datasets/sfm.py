@@ -5,7 +5,7 @@ Both by structure from motion in a process of its own (`reconstruction`), kept i
 
 import hashlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,7 +59,7 @@ def load_photos(
     matches = workspaces.read_matches(
         workspace, files, {image.name for image in model.images} if model else ()
     )
-    lost = _left_out(matches, contents)
+    lost = _left_out(matches, labels.values())
     found = len(matches.located)
     if model is None or (found < max(MIN_PHOTOS, FEWEST * len(files)) and not config.allow_few_cameras):
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
@@ -96,16 +96,12 @@ def _content(path: Path) -> str:
         return ""
 
 
-def _left_out(matches: workspaces.Matches, contents: Sequence[tuple[str, str]]) -> dict[str, list[str]]:
-    """Return photographs without a camera by the reason; contents: names and digests of all photographs."""
-    first: dict[str, str] = {}
+def _left_out(matches: workspaces.Matches, names: Iterable[str]) -> dict[str, list[str]]:
+    """Return the names of photographs without a camera by the reason."""
     groups: dict[str, list[str]] = {}
-    for row, (name, content) in enumerate(contents):
-        twin = first.setdefault(content, name)
+    for row, name in enumerate(names):
         if row not in matches.located:
-            again = twin != name and matches.features[row] >= 0
-            why = f"the same picture as {twin}" if again else matches.why(row)
-            groups.setdefault(why, []).append(name)
+            groups.setdefault(matches.why(row), []).append(name)
     return groups
 
 
