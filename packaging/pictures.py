@@ -20,6 +20,7 @@ from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.notebook import show
 from langsplat_core.training.language.codec_fit import train_autoencoder
+from langsplat_viewer import disk
 from langsplat_viewer.actions import editing, opening, outline, settings, viewpoint
 from langsplat_viewer.options import ViewerOptions, scene_path, services
 from langsplat_viewer.panels import search
@@ -204,11 +205,15 @@ def _trained(ctx: Any, window: Window) -> None:
     room = ["dataset", "--seed", "3", "--views", "12", "--out", str(folder / "room")]
     subprocess.run([sys.executable, "-m", "assets.making", *room], check=True)
     settings.open_panel(viewer, "Train")
-    viewer.state.training_form = TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick")
+    form = TrainingForm(str(folder / "room"), out=str(folder / "room.ply"), preset="quick")
+    viewer.state.training_form = form
     opening.start_training(viewer)
     process = viewer.training
     assert process is not None
     while process.exit_code is None and len(process.progress.losses) < 120:
+        looks = disk.is_preview(viewer.state.path) or viewer.state.opening is not None
+        if not looks and viewer.worker.current is None and disk.newest(process.out):
+            opening.look_at_training(viewer)
         ctx.yield_()
     viewer.state.wanted_panel = "Train"
     ctx.yield_(5)

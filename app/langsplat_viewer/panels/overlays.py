@@ -50,13 +50,16 @@ def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Textur
         if place:
             paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), SHADE, 4.0)
             paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), WHITE, 1.5)
-    gap, card = hello_imgui.em_size(0.6), imgui.internal.find_window_by_name("Search")
+    cards = map(imgui.internal.find_window_by_name, ("Search", "search button"))  # open, or folded
+    gap, card = hello_imgui.em_size(0.6), next((card for card in cards if card and card.active), None)
     for place, (part, name) in enumerate(zip(parts, names, strict=False) if len(parts) > 1 else ()):
         is_left = split.has_line and not place  # and ends at the line
         x = part.left + (part.width - gap - ui.width_of(name) if is_left else gap)
         x = max(x, area.left + hello_imgui.em_size(TOOLS_EM))
-        is_under = card is not None and card.active and x < card.pos.x + card.size.x
-        text_on_shade(name, x, (card.pos.y + card.size.y if is_under else area.top) + gap, area)
+        top = area.top
+        if card is not None and x < card.pos.x + card.size.x:
+            top = card.pos.y + card.size.y
+        text_on_shade(name, x, top + gap, area)
 
 
 def parts_of(area: ui.Area, split: Split) -> list[ui.Area]:
