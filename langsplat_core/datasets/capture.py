@@ -311,13 +311,13 @@ def split_views(capture: Capture, config: DatasetConfig) -> tuple[list[int], lis
     return [index for index in range(len(capture)) if index not in held_out], held_out
 
 
-def surrounded_views(cameras: Sequence[Camera], every: int, beside: Sequence[int] = ()) -> list[int]:
+def surrounded_views(cameras: Sequence[Camera], every: int) -> list[int]:
     """Return indices of one view in `every`, in ascending order, of which each lies among training views.
 
     Those at the ends of a walk show what no other photograph does, and tell nothing of the training. One
     after the other that view is taken which lies best in the middle of its nearest training views, by place
     and direction, measured by how far those are away. Its own nearest ones are then left to training, so that
-    the views come from all over the capture. None of fewer than `FEWEST_VIEWS`, and none of those `beside`.
+    the views come from all over the capture. None of fewer than `FEWEST_VIEWS`.
     """
     count = len(cameras)
     if every < 2 or count < FEWEST_VIEWS:
@@ -326,7 +326,6 @@ def surrounded_views(cameras: Sequence[Camera], every: int, beside: Sequence[int
     apart = np.linalg.norm(stands[:, None] - stands[None], axis=2)
     found: list[int] = []
     free = np.ones(count, bool)  # that may be held out
-    free[list(beside)] = False
     for _ in range(max(1, round(count / every))):
         training = np.setdiff1d(np.arange(count), found)
         lean = {int(index): _lean(stands, apart, training, index) for index in training if free[index]}
