@@ -68,7 +68,7 @@ class Backend:
         gsplat's backward pass begins with a pixel's transmittance as 1 - alpha, of which 6e-8 / 1e-4 may be
         lost where the pixel is full; its twin in PyTorch keeps it.
         """
-        return {"reference": 1e-12, "cuda": 6e-4, "cuda-twin": 2e-5}.get(self.name, 1e-5)
+        return {"reference": 1e-12, "cuda": 6e-4}.get(self.name, 1e-5)
 
     def promises(self, gaussians: Gaussians, settings: RasterSettings) -> bool:
         """Whether `tolerance` holds. Not for gsplat's needles, whose covariances are formed in 3D in float32,
