@@ -83,7 +83,7 @@ class Marked:
         return Marked(**{name: getattr(self, name) if new is old else pack(new) for name, new, old in kept})
 
     def masks(self, before: "Marked", marks: Marks) -> Marks:
-        """Return the masks.
+        """Unpack these bits into masks, (count,) bool each.
 
         Those of `marks`, which are the masks of `before`, are used as far as both mark the same: nothing is
         drawn anew for them.

@@ -40,7 +40,7 @@ class Dataset:
     """lerf-ovs, 3d-ovs: the photographs in OUT/room, and every eighth labelled as in that benchmark."""
 
     def run(self) -> None:
-        """Write the dataset."""
+        """Write the room's photographs, with their ground truth, into `out`."""
         from assets.making.dataset import write_labelled
 
         with TerminalProgress() as progress:
@@ -77,7 +77,7 @@ class Build:
     """Keep the Gaussians of this scene of the same room, and make only their language field again."""
 
     def run(self) -> None:
-        """Build the scene."""
+        """Render, train and compact the demo scene, and write it to `out`."""
         from assets.making.dataset import build_scene
 
         with TerminalProgress() as progress:

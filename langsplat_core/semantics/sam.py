@@ -131,7 +131,7 @@ class Sam:
 
 
 def load_sam(weights: Weights) -> Sam:
-    """Load a SAM."""
+    """Load a SAM from the classes of transformers; its three masks of a point are ordered."""
     from transformers import SamConfig, SamModel
 
     settings = models.load_config(SamConfig, weights, "SAM")

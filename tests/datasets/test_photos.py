@@ -121,7 +121,7 @@ def test_photographs_are_counted_where_they_lie(tmp_path: Path) -> None:
     assert count_photographs(tmp_path) == 2
 
 
-def test_what_lies_among_photographs_and_is_not_read_is_said(tmp_path: Path, caplog) -> None:
+def test_unread_files_beside_photographs_are_named(tmp_path: Path, caplog) -> None:
     for name in ("IMG_1.HEIC", "IMG_1.MOV", "IMG_2.heic", "IMG_2.mov", "walk.mp4", "edited/IMG_1.jpg"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")

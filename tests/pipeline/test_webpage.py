@@ -115,9 +115,11 @@ def compare(measured: Measure, what: str, ours: Array, theirs: Array) -> None:
     assert np.quantile(error, 0.999) <= 4
 
 
-@pytest.mark.parametrize("view", [0, 11, 30])
-def test_page_draws_the_bundled_scene_as_opengl_does(tab, demo, gl, measured, view):
+@pytest.mark.parametrize(("view", "size"), [(0, 1), (11, 1.5), (30, 0.5)])
+def test_page_draws_the_bundled_scene_as_opengl_does(tab, demo, gl, measured, view, size):
+    """At the photographs' size, in a larger image and in a smaller one, which dilate by other amounts."""
     camera = demo.cameras[view]
+    camera = camera.resized(round(size * camera.width), round(size * camera.height))
     ours = tab.image(camera, demo.bounds()[0])
     compare(measured, "demo, colours", ours, drawn(gl, demo, camera))
 
