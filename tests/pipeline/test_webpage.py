@@ -1,6 +1,7 @@
 """Exported pages in a real browser: images against the OpenGL backend's, answers against Python's, and what a
 hostile scene can do."""
 
+import itertools
 import re
 import zlib
 from collections.abc import Iterator
@@ -451,8 +452,9 @@ SLOW_PAINTER = """async () => {
   const { page } = await langsplat;
   const paint = page.painter.paint.bind(page.painter);
   const full = page.controls.camera(devicePixelRatio).width;
-  globalThis.widths = [], globalThis.drawn = [];
+  globalThis.widths = [], globalThis.drawn = [], globalThis.moving = [];
   page.painter.paint = (camera, appearance) => {
+    moving.push(page.moving);
     const began = performance.now();
     paint(camera, appearance);
     while (performance.now() - began < 500 * (camera.width / full) ** 2);
@@ -472,10 +474,11 @@ def test_page_draws_coarsely_however_slow_it_is(browser: Any, thin: Path) -> Non
             tab.page.mouse.move(155 + 5 * step, 160)
         tab.page.mouse.up()
         tab.page.wait_for_function("() => widths.length > 2 && widths.at(-1) === 1")  # once it rests
-        widths = tab.run("() => widths")
+        widths, moving = tab.run("() => [widths, moving]")
         assert min(widths) < 0.5
         tab.page.wait_for_function("() => drawn.at(-1) > 2 * Math.min(...drawn)")  # the large ones first
-        assert sum(width == 1 for width in widths) <= 3  # at first, and at rest
+        full = [width == 1 and moves for width, moves in zip(widths, moving, strict=True)]
+        assert not any(first and second for first, second in itertools.pairwise(full))
 
 
 @pytest.mark.parametrize("size", [(390, 844), (844, 390), (1280, 720)])
