@@ -33,6 +33,7 @@ from langsplat_core.cli.app import parse
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.agents.commands import Door
+from langsplat_core.extensions.checkpoints.langsplat_files import write_checkpoint
 from langsplat_core.extensions.compaction.clean import CleanConfig, clean
 from langsplat_core.extensions.compaction.compact import BudgetConfig, choose_views, find_reduction
 from langsplat_core.extensions.library.changes import changes
@@ -557,8 +558,10 @@ def exported(case: Case) -> Found:
     unpacked = zlib.decompress(b64decode(packed))
     size = int.from_bytes(unpacked[:8], "little")
     meta = json.loads(json.loads(unpacked[8 : 8 + size])["__metadata__"]["page"])
-    case.run("convert", path, folder / "occam", "--to", "occam")
-    files_ = sorted((folder / "occam").glob("*.pth"))
+    scene, files_ = load_scene(path), [folder / f"chkpnt30000_langfeat_{level}.pth" for level in (1, 2, 3)]
+    for file in files_:
+        vectors = np.full((len(scene.gaussians), 512), 512**-0.5, np.float32)
+        write_checkpoint(file, scene.gaussians, vectors, scene.origin)
     case.run("convert", *files_, folder / "again.ply", "--encoder", "demo")
     again = load_scene(folder / "again.ply")
     return {

@@ -18,7 +18,6 @@ from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import (
     ORIGIN_SUFFIX,
     Exporter,
-    ExportRequest,
     Importer,
     ImportRequest,
     check_writable,
@@ -98,9 +97,8 @@ class Convert:
     rematch: Path | None = None
     """A language sidecar (*.langsplat.safetensors) made before the Gaussians were edited: its field is
     carried over to the Gaussians of SOURCE by nearest position."""
-    to: Annotated[str, tyro.conf.arg(metavar="scene|langsplat|occam")] = "scene"
-    """langsplat: a folder with LangSplat's three checkpoints and its autoencoder. occam: with Occam's LGS's
-    three checkpoints of whole vectors."""
+    to: Annotated[str, tyro.conf.arg(metavar="scene|langsplat")] = "scene"
+    """langsplat: a folder with LangSplat's three checkpoints and its autoencoder."""
     encoder: str | None = None
     """Text encoder of the checkpoints' vectors: hub id, folder or "demo" (default: LangSplat's OpenCLIP,
     laion/CLIP-ViT-B-16-laion2B-s34B-b88K). With a single .ply: its semantic_* are read."""
@@ -193,14 +191,10 @@ class Convert:
             raise InputError(f"--to {self.to}: choose one of {', '.join(('scene', *exporters))}")
         exporter: Exporter = registry.part("exporters", self.to)
         check_output_folder(self.out)
-
-        def load() -> Scene:
-            scene = replace(self._read(), path=self.source)
-            report_left_out(self.out, scene, "checkpoints", exporter.loses, f"*{ORIGIN_SUFFIX}")
-            return scene
-
+        scene = replace(self._read(), path=self.source)
+        report_left_out(self.out, scene, "checkpoints", exporter.loses, f"*{ORIGIN_SUFFIX}")
         with TerminalProgress() as progress:
-            lines = exporter.write(ExportRequest(self.sources, load, self.out), progress)
+            lines = exporter.write(scene, self.out, progress)
         print(*lines, sep="\n")
 
 

@@ -374,19 +374,10 @@ class Importer:
 
 
 @dataclass(frozen=True)
-class ExportRequest:
-    """A scene to be written for another program."""
-
-    sources: tuple[Path, ...]  # files or folders that the command line named, one at least
-    load: Callable[[], Scene]  # reads `sources` as a scene
-    out: Path  # folder to write, which can be written to
-
-
-@dataclass(frozen=True)
 class Exporter:
     """A writer of files for another program: a word of `langsplat convert --to`."""
 
-    write: Callable[[ExportRequest, Progress], tuple[str, ...]]  # returns lines to print
+    write: Callable[[Scene, Path, Progress], tuple[str, ...]]  # into a folder; returns lines to print
     loses: tuple[str, ...] = ()  # as of `SceneFormat`
 
 

@@ -5,7 +5,7 @@ from langsplat_core.registry import Extension
 _HERE = "langsplat_core.extensions.checkpoints"
 EXTENSION = Extension(
     importers={"checkpoints": f"{_HERE}.convert:IMPORTER"},
-    exporters={name: f"{_HERE}.convert:{name.upper()}" for name in ("langsplat", "occam")},
+    exporters={"langsplat": f"{_HERE}.convert:LANGSPLAT"},
     encoders={
         name: f"{_HERE}.weight_layouts:{name.upper().replace('_', '')}"
         for name in ("siglip", "metaclip_2", "tipsv2")

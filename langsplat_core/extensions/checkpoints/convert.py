@@ -1,16 +1,17 @@
 """What `langsplat convert` reads and writes of other methods."""
 
+from pathlib import Path
+
 import numpy as np
 
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.checkpoints.langsplat_files import write_autoencoder, write_checkpoint
-from langsplat_core.io.scenes import Exporter, ExportRequest, Importer, ImportRequest
+from langsplat_core.io.scenes import Exporter, Importer, ImportRequest
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import LEVELS, AutoencoderCodec, LanguageField, Scene
+from langsplat_core.scene import LEVELS, AutoencoderCodec, Scene
 from langsplat_core.scene.codec import SHORTEST
 
 LANGSPLAT_LATENT = 3  # numbers per Gaussian that its rasterizer is compiled for
-BLOCK = 16_384  # Gaussians decoded at a time
 
 
 def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[str, ...]]:
@@ -44,19 +45,19 @@ def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[st
     return scene, tuple(lines)
 
 
-def export_langsplat(request: ExportRequest, progress: Progress = silent) -> tuple[str, ...]:
+def export_langsplat(scene: Scene, folder: Path, progress: Progress = silent) -> tuple[str, ...]:
     """Write `NAME_{1,2,3}/chkpnt30000.pth` with latents and `best_ckpt.pth`; return what was written.
 
     Raises InputError for a scene whose codec is not an autoencoder of 3 numbers.
     """
-    scene, folder, name = request.load(), request.out, request.sources[0].stem
-    language = _language(scene)
+    language, name = scene.language, scene.path.stem if scene.path else "scene"
+    if language is None:
+        raise InputError(f"{scene.path}: has no language field to write; 'langsplat train' makes one")
     codec = language.codec
     if not isinstance(codec, AutoencoderCodec) or codec.latent_dim != LANGSPLAT_LATENT:
         raise InputError(
             f"{scene.path}: its codec, {codec.kind} of {codec.size}, is not "
-            "LangSplat's autoencoder of 3 numbers; write vectors by --to occam, or train with "
-            "--codec.kind autoencoder"
+            "LangSplat's autoencoder of 3 numbers; train with --codec.kind autoencoder"
         )
     latents = np.where(language.known[..., None], language.latents, np.float32(0))
     written = [folder / f"{name}_{level + 1}" / "chkpnt30000.pth" for level in range(len(LEVELS))]
@@ -66,34 +67,6 @@ def export_langsplat(request: ExportRequest, progress: Progress = silent) -> tup
     return (*map(str, written), str(folder / "best_ckpt.pth"))
 
 
-def export_occam(request: ExportRequest, progress: Progress = silent) -> tuple[str, ...]:
-    """Write `chkpnt30000_langfeat_{1,2,3}.pth` with (N, D) unit vectors, zero for no meaning.
-
-    Return what was written. One level is held in memory at a time: 5 GB for 2.5 million Gaussians.
-    """
-    scene = request.load()
-    language = _language(scene)
-    written = []
-    for level in range(len(LEVELS)):
-        path = request.out / f"chkpnt30000_langfeat_{level + 1}.pth"
-        progress("decoding", level / len(LEVELS))
-        vectors = np.zeros((len(language), language.codec.vector_dim), np.float32)
-        known = np.flatnonzero(language.known[level])
-        for start in range(0, len(known), BLOCK):
-            rows = known[start : start + BLOCK]
-            vectors[rows] = language.codec.decode(language.latents[level, rows])
-        write_checkpoint(path, scene.gaussians, vectors, scene.origin)
-        written.append(str(path))
-    progress("decoding", 1.0)
-    return tuple(written)
-
-
-def _language(scene: Scene) -> LanguageField:
-    if scene.language is None:
-        raise InputError(f"{scene.path}: has no language field to write; 'langsplat train' makes one")
-    return scene.language
-
-
 IMPORTER = Importer((".pth", ".pt", ".ckpt", ".npz"), _import)
 LOSES = ("cameras", "metres per unit", "antialiasing", "extra properties", "taught words", "origin")
-LANGSPLAT, OCCAM = Exporter(export_langsplat, LOSES), Exporter(export_occam, LOSES)
+LANGSPLAT = Exporter(export_langsplat, LOSES)

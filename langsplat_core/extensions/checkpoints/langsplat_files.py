@@ -140,7 +140,7 @@ def gaussians_of(elements: tuple[Any, ...], path: Path) -> Gaussians:
     return Gaussians(means, log_scales, quats, logits[:, 0], np.concatenate([base, rest], axis=1))
 
 
-# Checkpoints as LangSplat and Occam's LGS read them: element 7 holds the features, and what an optimiser
+# Checkpoints as LangSplat reads them: element 7 holds the features, and what an optimiser
 # would need is empty.
 
 

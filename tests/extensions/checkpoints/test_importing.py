@@ -16,10 +16,10 @@ import torch
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig
 from langsplat_core.errors import STRICTNESS, EncoderError, FormatError, InputError
-from langsplat_core.extensions.checkpoints.convert import IMPORTER, export_langsplat, export_occam
+from langsplat_core.extensions.checkpoints.convert import IMPORTER, export_langsplat
 from langsplat_core.extensions.checkpoints.importing import ForeignScene, import_scene, read_foreign
 from langsplat_core.io.ply import write_ply
-from langsplat_core.io.scenes import ExportRequest, ImportRequest, load_scene, save_scene
+from langsplat_core.io.scenes import ImportRequest, load_scene, save_scene
 from langsplat_core.progress import silent
 from langsplat_core.scene import CANONICAL_PHRASES, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -28,7 +28,6 @@ from tests.support.file_samples import (
     assert_same,
     autoencoder,
     geometry,
-    random_field,
     save_model,
     tensor,
     training_state,
@@ -445,10 +444,6 @@ def test_many_vectors_keep_the_stated_error(tmp_path, clip):
     np.testing.assert_allclose(decoded(linear.language, 2), vectors, atol=1e-5)
 
 
-def asked(scene: Scene, out: Path) -> ExportRequest:
-    return ExportRequest((Path("case.ply"),), lambda: scene, out)
-
-
 def langsplat_levels(folder: Path) -> tuple[list[Path], Array, torch.nn.Module]:
     network = autoencoder(D)
     with torch.no_grad():
@@ -466,7 +461,7 @@ def test_langsplat_there_and_back(tmp_path, clip):
     trained, request = langsplat_levels(tmp_path / "a")[0], ImportRequest((), clip, (), (), CodecConfig())
     scene, lines = IMPORTER.read(replace(request, paths=tuple(trained)), silent)
     assert "brought to length 1" in lines[-1]
-    written = [Path(name) for name in export_langsplat(asked(scene, tmp_path / "b"))]
+    written = [Path(name) for name in export_langsplat(replace(scene, path=Path("case.ply")), tmp_path / "b")]
     assert [str(path.relative_to(tmp_path / "b")) for path in written] == [
         *(f"case_{level}/chkpnt30000.pth" for level in (1, 2, 3)),
         "best_ckpt.pth",
@@ -490,17 +485,6 @@ def test_langsplat_there_and_back(tmp_path, clip):
     with torch.no_grad():
         theirs = network.eval().encode(torch.from_numpy(FEATURES)).numpy()
     np.testing.assert_allclose(theirs, first.codec.encode(FEATURES), atol=1e-5)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
-def test_every_codec_is_written_as_vectors(tmp_path, kind):
-    field = random_field(COUNT, kind)
-    export_occam(asked(Scene(GAUSSIANS, field), tmp_path))
-    for level in range(3):
-        (elements, _) = torch.load(tmp_path / f"chkpnt30000_langfeat_{level + 1}.pth", weights_only=True)
-        want = np.where(field.known[level][:, None], decoded(field, level), 0)
-        np.testing.assert_allclose(elements[7].numpy(), want, atol=1e-6)
 
 
 @pytest.mark.long
@@ -552,7 +536,7 @@ def checkpoints(tmp_path: Path) -> list[Path]:
 
 
 @pytest.mark.long
-def test_checkpoints_become_a_scene_and_back(tmp_path, checkpoints, capsys):
+def test_checkpoints_become_a_scene(tmp_path, checkpoints, capsys):
     read = ("--encoder", "demo", "--phrases", "apple", "red mug")
     assert run("convert", *checkpoints, tmp_path / "a.ply", *read) == 0
     printed = capsys.readouterr().out
@@ -563,7 +547,5 @@ def test_checkpoints_become_a_scene_and_back(tmp_path, checkpoints, capsys):
     assert scene.language is not None
     assert set(scene.language.phrasebook) == {"apple", "red mug"}
     assert (scene.language.confidence == 1).all()
-    assert run("convert", tmp_path / "a.ply", tmp_path / "out", "--to", "occam") == 0
-    assert len(list((tmp_path / "out").glob("chkpnt30000_langfeat_[123].pth"))) == 3
     words = ("convert", tmp_path / "a.ply", tmp_path / "out", "--to", "langsplat")
-    assert "--to occam" in refusal(capsys, *words)
+    assert "--codec.kind autoencoder" in refusal(capsys, *words)
