@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist
 export PIP_QUIET := 1
 .SILENT: $(STAMP) demo
 
-.PHONY: help demo quick test slow check sizes format elsewhere faults parity wheels others bench report gpu pictures site app light bundle desktop clean
+.PHONY: help demo quick test slow check sizes format elsewhere faults parity wheels others notebook bench report gpu pictures site app light bundle desktop clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -101,6 +101,12 @@ others: system  ## open what is written here in other programs, kept in .others,
 	-$(BIN)/npm install --prefix $(OTHERS) --silent --no-audit --no-fund \
 	  @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
 	PYTHONPATH=$(CURDIR)/$(OTHERS) $(BIN)/python packaging/outside.py programs
+
+NOTEBOOK := docs/examples/06_in_a_notebook.ipynb
+notebook: system  ## run the cells of docs/examples/06_in_a_notebook.ipynb again, and keep what they show
+	$(BIN)/pip install --quiet --upgrade --target $(OTHERS) nbconvert==7.17.2 ipykernel==7.4.0
+	PYTHONPATH=$(CURDIR)/$(OTHERS) $(BIN)/python -m nbconvert --to notebook --execute --inplace $(NOTEBOOK) \
+	  --ExecutePreprocessor.record_timing=False --log-level ERROR
 
 bench: system  ## speed against error, on this machine
 	$(BIN)/langsplat bench raster --out bench_out

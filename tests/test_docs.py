@@ -16,13 +16,13 @@ import pytest
 from PIL import Image
 
 from assets.making.__main__ import parse as parse_making
+from langsplat_core import load_ipython_extension
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.arguments import Runnable
 from langsplat_core.cli.run import main
 from langsplat_viewer.program import parse as parse_viewer
 from tests.benchmarks.__main__ import parse as parse_benchmarks
-from tests.support.file_samples import compressed_ply
-from tests.support.scenes import DEMO, random_gaussians
+from tests.support.scenes import DEMO
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -91,36 +91,12 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert [t for t in targets if "://" not in t and not (page.parent / t).exists()] == []
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working folder: the files that the README's commands name."""
-    for path in DEMO.parent.glob("scene.*"):
-        shutil.copy(path, tmp_path / path.name)
-    (tmp_path / "guitar.compressed.ply").write_bytes(compressed_ply(random_gaussians(300)))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def run(start: list[str], more: tuple[str, ...] = ()) -> None:
-    """The README's command that starts so."""
-    every = [words for words in commands(README.read_text()) if words[: len(start)] == start]
-    (words,) = [words for words in every if words[-1] != start[-1]]
-    assert main(words[0], lambda: PARSERS[words[0]]([*words[1:], *more])) == 0
-
-
 @pytest.mark.long
 def test_site_has_every_page() -> None:
     nav = (ROOT / "packaging" / "site" / "mkdocs.yml").read_text().split("\nnav:\n")[1]
     listed = set(re.findall(r"[\w/]+\.md", nav))
     own = {path.name for path in (ROOT / "packaging" / "site").glob("*.md")}
     assert listed - own - {"index.md", "pages.md"} == {p.name for p in ROOT.glob("docs/*.md")} - {"README.md"}
-
-
-def test_readme_query_runs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(["langsplat", "query"])
-    answers = json.loads(capsys.readouterr().out)
-    assert [answer["phrase"] for answer in answers] == ["lid of the teapot"]
-    assert all(len(answer["pixel"]) == 2 for answer in answers)
 
 
 ROWS = re.compile(r"^\| ([a-z][^|]*) \| [a-z0-9][^|]*  [^|]* \|", re.MULTILINE)  # phrase, reading
@@ -156,9 +132,18 @@ def test_every_example_is_found_in_the_bundled_scene(capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.long
-def test_readme_headless_viewer_runs(folder: Path) -> None:
-    run(["langsplat-viewer", "scene.ply", "--headless"], ("--size", "160x120"))
-    assert Image.open(folder / "heat.png").size == (160, 120)
+def test_readme_query_and_headless_viewer_run(tmp_path, monkeypatch, capsys) -> None:
+    for path in DEMO.parent.glob("scene.*"):
+        shutil.copy(path, tmp_path / path.name)
+    monkeypatch.chdir(tmp_path)
+    said = {}
+    for program, *words in commands(README.read_text()):
+        if "--headless" in words or (program, words[0], len(words) > 1) == ("langsplat", "query", True):
+            assert main(program, lambda: PARSERS[program](words)) == 0  # noqa: B023  called at once
+            said[program] = capsys.readouterr().out
+    (answer,) = json.loads(said["langsplat"])
+    assert (answer["phrase"], len(answer["pixel"])) == ("lid of the teapot", 2)
+    assert np.asarray(Image.open(tmp_path / "heat.png")).std() > 15
 
 
 BLOCKS = [
@@ -176,6 +161,30 @@ def test_python_blocks_run(block: str, capsys: pytest.CaptureFixture[str]) -> No
     shapes, answer = capsys.readouterr().out.splitlines()
     assert shapes == "(240, 320, 3) (240, 320)"
     assert answer.startswith("True [")
+
+
+@pytest.mark.long
+def test_notebook_says_and_shows_what_it_keeps() -> None:
+    """Up to numbers, and images by their kinds; where it does not, `make notebook` keeps it anew."""
+    shell = pytest.importorskip("IPython.core.interactiveshell").InteractiveShell.instance()
+    path = ROOT / "docs" / "examples" / "06_in_a_notebook.ipynb"
+    assert path.stat().st_size < 1.5e6
+    try:
+        load_ipython_extension(shell)
+        for cell in json.loads(path.read_text())["cells"]:
+            with redirect_stdout(StringIO()) as said:
+                done = shell.run_cell("".join(cell["source"]) if cell["cell_type"] == "code" else "")
+            done.raise_error()
+            shown = {*shell.display_formatter.format(done.result)[0]} if done.result is not None else set()
+            words, outputs = said.getvalue().split("Out[")[0], cell.get("outputs", ())
+            kept = "".join(line for output in outputs for line in output.get("text", ()))
+            assert re.sub(r"\d+", "", words) == re.sub(r"\d+", "", kept)
+            assert shown == {kind for output in outputs for kind in output.get("data", ())}
+        scene = shell.display_formatter.format(shell.user_ns["toys"])[0]
+    finally:
+        type(shell).clear_instance()
+    assert scene["text/html"].startswith("<iframe")
+    assert len(scene["text/plain"]) < 200
 
 
 # Examples: what each prints, and the files that it draws.

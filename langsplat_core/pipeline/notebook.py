@@ -5,7 +5,8 @@ where the notebook is read without Python. In IPython a `Scene` at the end of a 
 """
 
 import html
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -43,19 +44,28 @@ class NotebookPage:
 
 
 def show(
-    source: Scene | QueryEngine, phrase: str = "", height: int = 540, at_most: int = 100_000
+    source: Scene | QueryEngine,
+    phrase: str = "",
+    height: int = 540,
+    at_most: int = 100_000,
+    phrases: Sequence[str] = (),
 ) -> NotebookPage:
     """Return the page of a scene, or of the scene of an engine, in which `phrase` is asked.
 
     at_most: Gaussians that are drawn, those that cover most, so that a notebook stays small (the bundled
-    scene's 81 288 are 6.5 MB); answers are those of the whole scene.
+    scene's 81 288 are 6.5 MB); answers are those of the whole scene. phrases: with some the page has no
+    encoder (2 MB of the bundled scene's), and knows these, in combinations too, and what was taught.
     """
-    scene = source if isinstance(source, Scene) else source.scene
-    engine = source if isinstance(source, QueryEngine) else None
-    if engine is None and scene.language is not None:
-        engine = QueryEngine(scene, load_text_encoder)
-    title = scene.path.stem if scene.path else "scene"
-    return NotebookPage(*make_page(scene, engine, title, phrase=phrase, at_most=at_most), height)
+    engine = source if isinstance(source, QueryEngine) else QueryEngine(source, load_text_encoder)
+    scene = engine.scene
+    if phrases:
+        known = [name for name in (phrase, *phrases) if name]
+        book = dict(zip(known, engine.text_vectors(known), strict=True))
+        own = replace(engine.field, phrasebook=book, taught=tuple(engine.taught.values()))
+        scene = replace(scene, language=own)
+        engine = QueryEngine(scene)
+    title, asked = scene.path.stem if scene.path else "scene", None if scene.language is None else engine
+    return NotebookPage(*make_page(scene, asked, title, phrase=phrase, at_most=at_most), height)
 
 
 def draw(scene: Scene, size: tuple[int, int] = (960, 540), answer: QueryResult | None = None) -> Image.Image:

@@ -5,7 +5,6 @@ import json
 import os
 import re
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +18,6 @@ from langsplat_core.scene import Scene, TaughtWord
 from tests.support.file_samples import assert_same_extras, random_field, sog_files, write_folder
 from tests.support.processes import contents, refusal, run
 from tests.support.scenes import random_camera, random_extras, random_gaussians, tree_of_wholes
-
-DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"
 
 
 def full_scene(n: int = 30) -> Scene:

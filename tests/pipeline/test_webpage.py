@@ -2,11 +2,11 @@
 hostile scene can do."""
 
 import itertools
+import json
 import re
 import zlib
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from langsplat_core import load_ipython_extension, show
+from langsplat_core import show
 from langsplat_core.arrays import Array, psnr, unit
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.export import Export
@@ -35,11 +35,10 @@ from langsplat_core.semantics.encoders import load_text_encoder
 from tests.support.backends import Measure
 from tests.support.file_samples import random_field
 from tests.support.processes import Tab, open_browser, open_tab
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import DEMO, random_camera, random_gaussians
 
 pytestmark = pytest.mark.long
 
-DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"
 THINGS = """teddy bear,laptop,hamburger,candle,rocket,teapot,toy duck,penguin,ball,sofa,table,chair,present,
 fruit basket,aeroplane,snail,car,painting,rug,potted plant,stool,floor,wall,apple,orange,mug,lamp,guitar,
 umbrella,hat,train,robot,cactus,castle,drum,headphones,fish,flag,clock,camera,backpack,shoe,windmill,snowman,globe"""
@@ -639,29 +638,31 @@ def test_export_command_writes_a_page(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "<title>Über &lt;b&gt;</title>" in (tmp_path / "room.html").read_text(encoding="utf-8")
 
 
-def test_notebooks_show_a_page_that_was_asked(browser, demo, tmp_path):
+def frame_of_docs() -> str:
+    """What the notebook of the docs keeps of its last cell, see `make notebook`."""
+    path = Path(__file__).parents[2] / "docs" / "examples" / "06_in_a_notebook.ipynb"
+    return "".join(json.loads(path.read_text())["cells"][-1]["outputs"][0]["data"]["text/html"])
+
+
+@pytest.mark.parametrize("phrases", [(), ("laptop",), None])
+def test_notebooks_show_a_page_that_was_asked(browser, demo, engine, tmp_path, phrases):
     """In a frame without rights, as a cell has it: bounded, answered over all Gaussians, searchable."""
-    shown = show(demo, "teddy bear", at_most=5000)
-    assert shown.report.gaussians == 5000
-    (tmp_path / "cell.html").write_text(f"<!doctype html><p>Out [1]</p>{shown._repr_html_()}")
+    if phrases is None:
+        asked, other, shown = "duck", "penguin", frame_of_docs()
+    else:
+        page = show(demo, asked := "teddy bear", at_most=5000, phrases=phrases)
+        other, shown = "laptop", page._repr_html_()
+        assert page.report.gaussians == 5000
+        assert page.report.free_text is (phrases == ())
+        assert page.report.bytes < (1.3e6 if phrases else 3.2e6)
+    (tmp_path / "cell.html").write_text(f"<!doctype html><p>Out [1]</p>{shown}")
     tab = browser.new_page(offline=True)
     tab.goto((tmp_path / "cell.html").as_uri())
     frame = tab.frames[1]
-    said = QueryEngine(demo, load_text_encoder).run("teddy bear").said
+    said = engine.run(asked).said
     frame.wait_for_function("said => document.body.innerText.includes(said)", arg=said)
     assert frame.evaluate("async () => (await langsplat).page.display") == "relevancy"
-    frame.fill("#phrase", "laptop")
+    frame.fill("#phrase", other)
     frame.press("#phrase", "Enter")
-    frame.wait_for_function("async () => (await langsplat).page.answers[0]?.phrase === 'laptop'")
+    frame.wait_for_function("async (other) => (await langsplat).page.answers[0]?.phrase === other", arg=other)
     tab.close()
-
-
-def test_ipython_shows_scenes_as_pages(monkeypatch, demo):
-    shell = pytest.importorskip("IPython.core.interactiveshell").InteractiveShell.instance()
-    try:
-        load_ipython_extension(shell)
-        shown, _ = shell.display_formatter.format(demo.take(np.arange(50)))
-    finally:
-        type(shell).clear_instance()
-    assert shown["text/html"].startswith("<iframe")
-    assert len(shown["text/plain"]) < 200
