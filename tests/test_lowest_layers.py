@@ -27,7 +27,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Progress, Report, TerminalProgress, TimeLeft
 from langsplat_core.scene import Scene
-from tests.support.processes import bound_by_permissions, files_of_at_most, refusal
+from tests.support.processes import files_of_at_most, python, refusal
 from tests.support.scenes import random_gaussians
 
 
@@ -208,15 +208,8 @@ def test_kernels_compile_without_a_writable_folder(home: str, tmp_path: Path) ->
     for folder in (package, closed):
         folder.chmod(0o555)
     environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", CALL],
-        env=environment | {"HOME": str(tmp_path / home)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=bound_by_permissions(),
-    )
+    home_there = environment | {"HOME": str(tmp_path / home)}
+    done = python("-c", CALL, env=home_there, cwd=tmp_path, bound=True)
     for folder in (package, closed):
         folder.chmod(0o755)
     assert done.stdout.strip() == "[2. 3. 4.]", done.stderr
@@ -283,13 +276,7 @@ OWN = sorted(registry.extensions())
 def langsplat(site: Path, *words: object) -> subprocess.CompletedProcess[str]:
     """Run `langsplat` with the packages in the folder `site` beside those that are installed."""
     paths = os.pathsep.join([str(site), *sys.path])
-    return subprocess.run(
-        [sys.executable, "-m", "langsplat_core", *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": paths},
-    )
+    return python("-m", "langsplat_core", *words, env={**os.environ, "PYTHONPATH": paths})
 
 
 @pytest.fixture(scope="module")

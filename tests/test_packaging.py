@@ -1,11 +1,13 @@
 """The wheel without extras; what a desktop is told of the viewer; `make gpu`, over a twin of gsplat."""
 
 import importlib.util
+import json
 import os
 import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import venv
 from configparser import ConfigParser
 from importlib.metadata import Distribution, distribution
@@ -26,7 +28,8 @@ from langsplat_core.raster.opengl.rasterizer import create_egl_context
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.viewer import command
 
-PACKAGING = Path(__file__).resolve().parents[1] / "packaging"
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGING = ROOT / "packaging"
 DESKTOP, GPU = PACKAGING / "desktop", PACKAGING / "gpu"
 NAMESPACE = "{http://www.freedesktop.org/standards/shared-mime-info}"
 
@@ -153,7 +156,7 @@ def test_gpu_run_without_a_gpu_writes_nothing(tmp_path, runner, monkeypatch, cap
 
 
 def test_gpu_sections_have_functions_and_docs(runner: ModuleType, sections: ModuleType) -> None:
-    page = (PACKAGING.parent / "docs" / "speed.md").read_text()
+    page = (ROOT / "docs" / "speed.md").read_text()
     for name, limit in runner.SECTIONS.items():
         assert callable(getattr(sections, f"measure_{name}"))
         assert f"| {name} | {limit} |" in page
@@ -176,12 +179,31 @@ def test_container_has_what_the_makefile_installs_and_no_rights(monkeypatch):
     assert text.index("\nUSER viewer\n") < text.index('\nENTRYPOINT ["langsplat"]\n')
 
 
-def test_workflow_names_what_there_is() -> None:
+def test_workflow_and_devcontainer_name_what_there_is() -> None:
     text = (PACKAGING / "workflow.yml").read_text()
     assert pytest.importorskip("yaml").safe_load(text)["jobs"]["systems"]["steps"]
-    paths = [PACKAGING.parent / name for name in re.findall(r"(?:packaging|tests)/[\w./]+", text)]
-    assert len(paths) > 4
+    command = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())["onCreateCommand"]
+    paths = [ROOT / name for name in re.findall(r"(?:packaging|tests)/[\w./]+", text + command)]
+    assert len(paths) > 5
     assert [path for path in paths if not path.exists()] == []
+    for target in re.findall(r"make (\w+)", command) or [""]:
+        assert f"    make {target} " in (ROOT / "README.md").read_text()
+
+
+def test_conda_recipe_asks_for_what_the_wheel_asks_for() -> None:
+    recipe = pytest.importorskip("yaml").safe_load((PACKAGING / "conda" / "recipe.yaml").read_text())
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project, asked = wheel["project"], recipe["requirements"]
+    there = [
+        f"python{project['requires-python']}",
+        *project["dependencies"],
+        *wheel["build-system"]["requires"],
+    ]
+    wanted = sorted(re.sub("^glfw", "pyglfw", one) for one in there)
+    assert sorted(one.replace(" ", "") for one in {*asked["run"], *asked["host"]} - {"pip"}) == wanted
+    assert recipe["package"] == {"name": project["name"], "version": project["version"]}
+    scripts = [f"{name} = {function}" for name, function in project["scripts"].items()]
+    assert recipe["build"]["python"]["entry_points"] == scripts
 
 
 # The wheel without extras, in an environment that holds what it declares and nothing else: it opens, draws,
@@ -213,10 +235,10 @@ def light(tmp_path_factory: pytest.TempPathFactory) -> Path:
     left_out = shutil.ignore_patterns("__pycache__", "*.egg-info")
     for part in PARTS:
         (source / part).parent.mkdir(parents=True, exist_ok=True)
-        if (PACKAGING.parent / part).is_dir():
-            shutil.copytree(PACKAGING.parent / part, source / part, symlinks=True, ignore=left_out)
+        if (ROOT / part).is_dir():
+            shutil.copytree(ROOT / part, source / part, symlinks=True, ignore=left_out)
         else:
-            shutil.copy(PACKAGING.parent / part, source / part)
+            shutil.copy(ROOT / part, source / part)
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     build = ["wheel", "--no-deps", "--no-index", "--no-build-isolation", "--wheel-dir", work, source]
     subprocess.run([*pip, *build], check=True, env=CLEAN)

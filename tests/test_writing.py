@@ -44,11 +44,11 @@ from tests.support.file_samples import random_field
 from tests.support.processes import (
     Captured,
     Write,
-    bound_by_permissions,
     check_full_disk,
     contents,
     files_of_at_most,
     killed_everywhere,
+    python,
     surroundings,
 )
 from tests.support.scenes import random_camera, random_gaussians
@@ -120,13 +120,7 @@ def test_folders_without_permission_are_refused(tmp_path: Path) -> None:
         "        try: check(Path(path))\n"
         "        except InputError as error: print(error)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(closed / "new" / "x.ply"), str(tmp_path / "link")],
-        capture_output=True,
-        text=True,
-        check=True,
-        preexec_fn=bound_by_permissions(),
-    )
+    done = python("-c", code, closed / "new" / "x.ply", tmp_path / "link", bound=True)
     assert done.stdout.count("nothing can be written into") == 4
     assert done.stdout.count("Permission denied") == 4
 

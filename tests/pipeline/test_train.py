@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +30,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import assert_same_tree
-from tests.support.processes import bound_by_permissions, run, stop_at
+from tests.support.processes import python, run, stop_at
 from tests.support.tiny_models import tiny_room, tiny_settings
 
 pytestmark = pytest.mark.long
@@ -353,15 +351,9 @@ def test_query_needs_no_home_locale_or_writable_folder(tmp_path: Path) -> None:
         path.chmod(0o555)
     names = ("PATH", "PYTHONPATH", "NUMBA_CACHE_DIR")
     kept = {name: os.environ[name] for name in names if name in os.environ}
-    done = subprocess.run(
-        [sys.executable, "-m", "langsplat_core", "query", str(folder / "tür.ply"), "book", "--json"],
-        env=kept | {"HOME": "/nonexistent", "LANG": "xx_YY.nothing", "LC_ALL": "C"},
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=bound_by_permissions(),
-    )
+    words = ("-m", "langsplat_core", "query", folder / "tür.ply", "book", "--json")
+    env = kept | {"HOME": "/nonexistent", "LANG": "xx_YY.nothing", "LC_ALL": "C"}
+    done = python(*words, env=env, cwd=folder, bound=True)
     folder.chmod(0o755)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)[0]["phrase"] == "book"

@@ -53,6 +53,12 @@ def bound_by_permissions() -> Callable[[], None] | None:
     return give_up
 
 
+def python(*words: object, bound: bool = False, **where: Any) -> subprocess.CompletedProcess[str]:
+    """Run Python; bound: by permissions, whoever runs it. where: folder, environment, time limit."""
+    command, before = [sys.executable, *map(str, words)], bound_by_permissions() if bound else None
+    return subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=before, **where)
+
+
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """What runs in a process of its own runs in this one, where what is patched is so for it too."""
     monkeypatch.setattr(apart, "run", lambda function, *given, progress, **_: function(*given, progress))
@@ -111,14 +117,7 @@ def surroundings(display: str) -> dict[str, str]:
 
 def play(display: str, arguments: list[str], folder: Path, timeout: float, **environment: str) -> str:
     """Return what Python says with `arguments`, in `folder`, within `timeout` seconds; it has to end well."""
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        env=surroundings(display) | environment,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-    )
+    done = python(*arguments, env=surroundings(display) | environment, cwd=folder, timeout=timeout)
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
     return done.stdout
 

@@ -23,7 +23,7 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import options
 from langsplat_viewer.options import load_text_encoder, parse_size
 from tests.support.fakes import CENTRES, blob_scene
-from tests.support.processes import Cast, play, surroundings
+from tests.support.processes import Cast, play, python, surroundings
 from tests.support.scenes import with_tree
 
 MUG, BOOK, PLANT = CENTRES
@@ -356,14 +356,8 @@ def test_signal_ends_an_idle_window(display, tmp_path, blobs, number):
 @pytest.mark.long
 @pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="needs a machine without CUDA")
 def test_absent_backend_is_refused_before_a_window(display, tmp_path, blobs):
-    done = subprocess.run(
-        [sys.executable, "-m", "langsplat_viewer", blobs, "--fresh", "--backend", "cuda"],
-        env=surroundings(display),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    words, env = ("-m", "langsplat_viewer", blobs, "--fresh", "--backend", "cuda"), surroundings(display)
+    done = python(*words, env=env, cwd=tmp_path, timeout=300)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "cuda" in done.stderr.lower()
