@@ -335,8 +335,7 @@ def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:
         theirs = carrier.gaussians
         if found.sh.shape[1] != theirs.sh.shape[1]:
             raise FormatError(f"{carrier.path}: SH degree {theirs.sh_degree}, others have {found.sh_degree}")
-        row = _row_of(theirs.means, found.means)
-        _require_shared(row, min(len(found), len(theirs)), carrier)
+        row = _row_of(theirs.means, found.means, min(len(found), len(theirs)), carrier)
         found = join_gaussians([found, theirs.take(row < 0)])
     return found
 
@@ -357,26 +356,23 @@ def partners(means: Array, carrier: Carrier, may_lack: bool) -> Array | None:
             f"{carrier.path}: its {len(theirs)} Gaussians are not the {len(means)} of the other files; "
             "give checkpoints that were trained from one scene"
         )
-    row = _row_of(means, theirs)
-    _require_shared(row, len(theirs), carrier)
-    return row
+    return _row_of(means, theirs, len(theirs), carrier)
 
 
-def _require_shared(row: Array, count: int, carrier: Carrier) -> None:
-    shared = int((row >= 0).sum())
-    if shared < LEAST_SHARED * count or shared == 0:
-        raise FormatError(
-            f"{carrier.path}: {shared} of {count} Gaussians are at positions of the other files'; "
-            "give checkpoints that were trained from one scene"
-        )
+def _row_of(means: Array, theirs: Array, count: int, carrier: Carrier) -> Array:
+    """(N,) row of `theirs` at the same position, -1 for none; of several the k-th goes with the k-th.
 
-
-def _row_of(means: Array, theirs: Array) -> Array:
-    """(N,) row of `theirs` at the same position, -1 for none; of several the k-th goes with the k-th."""
+    FormatError where too few of `count` have one.
+    """
     bits = np.concatenate([means, theirs]).astype(np.float32).view(np.uint32)
     places = np.unique(bits, axis=0, return_inverse=True)[1].reshape(-1)
     ours, others = _ranked(places[: len(means)]), _ranked(places[len(means) :])
     _, mine, other = np.intersect1d(ours, others, assume_unique=True, return_indices=True)
+    if len(mine) < max(LEAST_SHARED * count, 1):
+        raise FormatError(
+            f"{carrier.path}: {len(mine)} of {count} Gaussians are at positions of the other files'; "
+            "give checkpoints that were trained from one scene"
+        )
     row = np.full(len(means), -1, np.int64)
     row[mine] = other
     return row

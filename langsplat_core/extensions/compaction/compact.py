@@ -40,11 +40,10 @@ from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import tyro
-from rich.table import Table
 
 from langsplat_core.arrays import Array, mean_squared_error, psnr
 from langsplat_core.cli.arguments import AnyScene, JsonOption, OutFile
-from langsplat_core.cli.run import OutputConsole, print_json
+from langsplat_core.cli.run import print_json
 from langsplat_core.config import DatasetConfig, Decibels, Range, SeveralCount, Side, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
@@ -412,21 +411,16 @@ class Compact:
         if self.json:
             print_json({"out": str(out), **asdict(report)})
             return
-        OutputConsole().print(_table(report))
-        print(*report.lines, f"written: {out}", sep="\n")
+        print(*_lines(report), *report.lines, f"written: {out}", sep="\n")
 
 
-def _table(report: CompactReport) -> Table:
-    table = Table("", "before", "after", "after / before")
-    before, after = report.before, report.after
-    rows: list[tuple[str, float, float, str]] = [
-        ("Gaussians", before.gaussians, after.gaussians, ",d"),
-        ("SH degree", before.sh_degree, after.sh_degree, "d"),
-        ("on disk, MB", before.disk_bytes / 1e6, after.disk_bytes / 1e6, ".2f"),
-        ("in memory, MB", before.memory_bytes / 1e6, after.memory_bytes / 1e6, ".2f"),
+def _lines(report: CompactReport) -> list[str]:
+    both = report.before, report.after
+    rows: list[list[object]] = [
+        ["Gaussians", *(f"{one.gaussians:,}" for one in both)],
+        ["SH degree", *(one.sh_degree for one in both)],
+        ["MB on disk", *(f"{one.disk_bytes / 1e6:.2f}" for one in both)],
+        ["MB in memory", *(f"{one.memory_bytes / 1e6:.2f}" for one in both)],
+        ["PSNR, dB", *(f"{one.psnr:.2f}" for one in both if one.psnr is not None)],
     ]
-    if before.psnr is not None and after.psnr is not None:
-        rows.append(("PSNR, dB", before.psnr, after.psnr, ".2f"))
-    for name, old, new, form in rows:
-        table.add_row(name, format(old, form), format(new, form), f"{100 * new / old:.1f} %" if old else "-")
-    return table
+    return [f"{name}: {old[0]} before, {old[1]} after" for name, *old in rows if old]
