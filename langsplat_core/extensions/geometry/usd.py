@@ -80,11 +80,13 @@ def write_usd(path: Path, scene: Scene) -> int:
         "orientations": Vt.QuatfArray.FromNumpy(columns[f"{KHR}:ROTATION"]),
         "opacities": Vt.FloatArray.FromNumpy(columns[f"{KHR}:OPACITY"]),
         "radiance:sphericalHarmonicsDegree": scene.gaussians.sh_degree,
-        "radiance:sphericalHarmonicsCoefficients": vectors(harmonics.reshape(-1, 3)),
         "extent": vectors(np.stack([means.min(0, initial=0), means.max(0, initial=0)])),
     }
     for name, value in values.items():
         prim.GetAttribute(name).Set(value)
+    colours = prim.GetAttribute("radiance:sphericalHarmonicsCoefficients")
+    colours.Set(vectors(harmonics.reshape(-1, 3)))
+    colours.SetMetadata("elementSize", harmonics.shape[1])
     matrix = np.reshape(node_of(scene).get("matrix", np.eye(4)), (4, 4))  # of rows
     UsdGeom.Xformable(prim).AddTransformOp().Set(Gf.Matrix4d(matrix.tolist()))
     if scene.language is not None and (tree := scene.language.tree) is not None:
@@ -116,8 +118,7 @@ def _add(stage: Any, above: str, middle: Array, thing: Outline, points_of: Calla
     box = axis_aligned_box(points_of(thing.node))
     prim = UsdGeom.Xform.Define(stage, f"{above}/{name}").GetPrim()
     UsdGeom.Xformable(prim).AddTranslateOp().Set(Gf.Vec3d((box.mean(0) - middle).tolist()))
-    corners = Vt.Vec3fArray.FromNumpy((box - box.mean(0)).astype(np.float32))
-    UsdGeom.ModelAPI.Apply(prim).SetExtentsHint(corners)
+    UsdGeom.ModelAPI.Apply(prim).SetExtentsHint(Vt.Vec3fArray.FromNumpy((box - box.mean(0)).astype("f4")))
     Usd.ModelAPI(prim).SetKind(Kind.Tokens.subcomponent if middle.any() else Kind.Tokens.component)
     prim.SetCustomDataByKey("node", thing.node)  # as in the primvars
     if thing.word is not None:

@@ -657,7 +657,11 @@ def test_stage_is_valid_and_stands_upright_in_metres(tmp_path, capsys, suffix):
         np.abs(np.swapaxes(rotation_matrices(given.gaussians.quats_wxyz), 1, 2) @ given.up()),
     )
     np.testing.assert_allclose(*upright, atol=1e-5)
-    assert get("radiance:sphericalHarmonicsCoefficients").shape == (2000 * given.gaussians.sh.shape[1], 3)
+    harmonics, each = (
+        prim.GetAttribute("radiance:sphericalHarmonicsCoefficients"),
+        given.gaussians.sh.shape[1],
+    )
+    assert (len(harmonics.Get()), harmonics.GetMetadata("elementSize")) == (2000 * each, each)
     np.testing.assert_array_equal(wholes := get("primvars:whole"), given.language.tree.at(2))
     bounds, named = geom.BBoxCache(0.0, ["default"], useExtentsHint=True), set()
     for thing in stage.GetPrimAtPath("/Scene/Things").GetChildren():
