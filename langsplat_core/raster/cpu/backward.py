@@ -121,7 +121,7 @@ def backward(
                     slope = slope + ln.load(planes, (row * lines + line) * TILE) * x[line]
                 hidden = ln.load(behind, row * TILE)
                 ln.store(behind, row * TILE, hidden + weight * slope)
-                q = weight * slope - hidden * alpha * ln.reciprocal(1.0 - alpha)
+                q = weight * slope - hidden * alpha / (1.0 - alpha)
                 q = ln.where_greater(tiles.cutoffs.alpha_max, alpha, q, 0.0)
                 moved, lifted = q * w, q * v
                 q0, qw, qv = q0 + q, qw + moved, qv + lifted

@@ -2,8 +2,8 @@
 
 A tile is 16 pixels wide, so one row of it is one `<16 x float>` of LLVM: a single AVX-512 register, two
 AVX or four SSE/NEON ones. Writing rows as values of that type, instead of as loops that an optimiser may
-or may not vectorise, makes the kernels' speed a property of their source. Lanes are added, subtracted and
-multiplied with `+ - *`, scalars broadcast; the rest are the functions below, for use under `numba.njit`.
+or may not vectorise, makes the kernels' speed a property of their source. Lanes are added, subtracted,
+multiplied and divided with `+ - * /`, scalars broadcast; the rest are the functions below, used in kernels.
 """
 
 import operator
@@ -83,6 +83,7 @@ def lanewise(build: Callable[..., Any], symbol: Any = None) -> Any:
 lanewise(lambda builder, a, b: builder.fadd(a, b, flags=_FUSE), operator.add)
 lanewise(lambda builder, a, b: builder.fsub(a, b, flags=_FUSE), operator.sub)
 lanewise(lambda builder, a, b: builder.fmul(a, b, flags=_FUSE), operator.mul)
+lanewise(lambda builder, a, b: builder.fdiv(a, b), operator.truediv)
 
 
 @intrinsic
@@ -117,12 +118,6 @@ def smaller(builder: Any, a: Any, b: Any) -> Any:
 
 
 @lanewise
-def reciprocal(builder: Any, value: Any) -> Any:
-    """Return 1 / value."""
-    return builder.fdiv(_constant(1), value)
-
-
-@lanewise
 def exp2(builder: Any, power: Any) -> Any:
     """2^power for power <= 0.5, relative error 2e-7; powers below -100 give 2^-100."""
     low = _constant(-100)
@@ -145,22 +140,18 @@ def shuffle(builder: Any, a: Any, b: Any, picks: list[int]) -> Any:
 
 
 def _fold(builder: Any, value: Any, combine: Callable[[Any, Any], Any], width: int = 1) -> Any:
-    """Halve the lanes until `width` are left."""
+    """Halve the lanes until `width` are left; one alone is a number."""
     while value.type.count > width:
         half = value.type.count // 2
         low, high = list(range(half)), list(range(half, 2 * half))
         value = combine(shuffle(builder, value, value, low), shuffle(builder, value, value, high))
-    return value
+    return value if width > 1 else builder.extract_element(value, INT(0))
 
 
 @intrinsic
 def total(typing: Any, value: Any) -> Any:
     """Sum of the lanes as a float32, added pairwise in a fixed order."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return builder.extract_element(_fold(builder, arguments[0], builder.fadd), INT(0))
-
-    return types.float32(value), lower
+    return types.float32(value), lambda context, builder, sig, args: _fold(builder, args[0], builder.fadd)
 
 
 @intrinsic
@@ -171,9 +162,29 @@ def largest(typing: Any, value: Any) -> Any:
         def larger(a: Any, b: Any) -> Any:
             return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
-        return builder.extract_element(_fold(builder, arguments[0], larger), INT(0))
+        return _fold(builder, arguments[0], larger)
 
     return types.float32(value), lower
+
+
+@intrinsic
+def borrowed(typing: Any, arrays: Any) -> Any:
+    """Return a kernel's own arguments, a tuple of arrays and tuples of them, without counts of their users.
+
+    Their owner waits for the kernel; numba counts, atomically, at every row of an array that a loop takes.
+    """
+
+    def bare(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+        if isinstance(kind, types.Array):
+            array = context.make_array(kind)(context, builder, value)
+            array.meminfo = array.meminfo.type(None)
+            return array._getvalue()  # noqa: SLF001  numba has no other way to it
+        if not isinstance(kind, types.BaseTuple):
+            return value
+        parts = [bare(context, builder, k, builder.extract_value(value, i)) for i, k in enumerate(kind.types)]
+        return context.make_tuple(builder, kind, parts)
+
+    return arrays(arrays), lambda context, builder, sig, args: bare(context, builder, arrays, args[0])
 
 
 # Lanes and memory. Indices count elements of a contiguous array as if it were flat; nothing is checked.

@@ -20,14 +20,13 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
 from langsplat_core.config import RasterSettings
-from langsplat_core.raster.cpu.lanes import prefetch
+from langsplat_core.raster.cpu.lanes import borrowed, prefetch
 from langsplat_core.raster.protocol import dilation, farthest, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
 from langsplat_core.scene.transform import C0, C1, C2, C3
 
 COLUMNS = 8  # of the geometry: one cache line a row
-INVALID, UNDRAWN, DRAWN = 0, 1, 2  # what `project` says of a row
 UNUSABLE = -1.0  # size of a row that is not valid
 MEAN_X, MEAN_Y, FACTOR_A, FACTOR_K, FACTOR_C, LOG2_OPACITY, HALF_WIDTH, HALF_HEIGHT = range(8)  # columns
 HALF_LOG2_E = 0.5 / np.log(2.0)
@@ -55,9 +54,9 @@ class Rows(NamedTuple):
 class Projection(NamedTuple):
     """Gaussians projected onto the image plane, as `project` returns them."""
 
-    geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; only where DRAWN
-    depths: Array  # (N,) float64 camera z; only where DRAWN
-    status: Array  # (N,) uint8
+    geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; only where drawn
+    depths: Array  # (N,) float64 camera z; only where drawn
+    drawn: Array  # (N,) bool
 
 
 class KernelCamera(NamedTuple):
@@ -259,15 +258,15 @@ def rows_of(gaussians: Gaussians) -> Rows:
 def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projection) -> None:
     """Fill `out` for rows [first, last).
 
-    A Gaussian whose alpha = alpha_min contour meets no pixel centre is UNDRAWN.
+    A Gaussian whose alpha = alpha_min contour meets no pixel centre is not drawn.
     """
+    rows, camera, out = borrowed((rows, camera, out))
     work = np.empty((3, 3, 3))
     log2_least = np.log2(camera.alpha_min)
     for i in range(first, last):
+        out.drawn[i] = False
         if rows.sizes[i] == UNUSABLE:
-            out.status[i] = INVALID
             continue
-        out.status[i] = UNDRAWN
         x, y, z = camera_point(rows.means[i], camera)
         if not (camera.near < z <= camera.far):
             continue
@@ -290,7 +289,7 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
         right, bottom = camera.width - 0.5, camera.height - 0.5  # the last pixel's centre
         if u + wide < 0.5 or u - wide > right or v + high < 0.5 or v - high > bottom:
             continue
-        out.status[i] = DRAWN
+        out.drawn[i] = True
         out.depths[i] = z
         g = out.geometry[i]
         g[MEAN_X], g[MEAN_Y] = u, v
@@ -369,12 +368,14 @@ def _forward(
     first: int, last: int, rows: Array, sh: Array, means: Array, position: Array, out: Array
 ) -> None:
     """out[place] <- colour of the Gaussian rows[place]; columns of `out` beyond the third are left."""
-    b = np.empty(sh.shape[1])
+    rows, sh, means, position, out = borrowed((rows, sh, means, position, out))
+    b, numbers = np.empty(sh.shape[1]), 3 * sh.shape[1]
     for place in range(first, last):
         later = np.int64(rows[min(place + _AHEAD, last - 1)])
         prefetch(means, 3 * later)
-        for start in range(0, 3 * sh.shape[1], 16):  # cache lines
-            prefetch(sh, 3 * sh.shape[1] * later + start)
+        for start in range(0, numbers, 16):  # cache lines
+            prefetch(sh, numbers * later + start)
+        prefetch(sh, numbers * later + numbers - 1)  # in half of them it begins another
         n = rows[place]
         x, y, z, _ = _direction(means[n], position)
         _basis(x, y, z, b)
@@ -394,6 +395,8 @@ def _backward(
     sh_grad: Array,
     means_grad: Array,
 ) -> None:
+    sh, means, position, colour_grad = borrowed((sh, means, position, colour_grad))
+    sh_grad, means_grad = borrowed((sh_grad, means_grad))
     b, h = np.empty(sh.shape[1]), np.empty(sh.shape[1])
     for n in range(first, last):
         if colour_grad[n, 0] == 0 and colour_grad[n, 1] == 0 and colour_grad[n, 2] == 0:

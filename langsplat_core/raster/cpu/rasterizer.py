@@ -257,6 +257,7 @@ def _paint_sets(first: int, last: int, tiles: Tiles, places: Array, planes: Arra
 
 # Views.
 
+_LINE = 64  # bytes of a cache line; arrays begin with one
 _SPARE_BLOCKS = 16  # a view takes five, its gradients seven
 _IDLE = 60  # requests after which a block that nobody asked for is given back
 
@@ -288,7 +289,8 @@ class Memory:
             del self._spare[: len(spare)]  # loans that end meanwhile come behind them
             recent = [one for one in spare[-_SPARE_BLOCKS:] if now - one[0] < _IDLE]
             place = next((i for i, (_, one) in enumerate(recent) if size <= len(one) <= 2 * size), None)
-            block = np.empty(size + size // 4, np.uint8) if place is None else recent.pop(place)[1]
+            found = np.empty(size + size // 4 + _LINE, np.uint8) if place is None else recent.pop(place)[1]
+            block = found[-found.ctypes.data % _LINE :]
             self._spare[:0] = recent
         loan = _Loan(block)
         finalize(loan, self._spare.append, (now, block))
@@ -306,22 +308,13 @@ class CpuView(LiftingView):
         self._kernel_camera = projection.kernel_camera(camera, settings)
         self._rows = projection.rows_of(gaussians)
         found = projection.Projection(
-            self._empty((n, projection.COLUMNS), np.float64), np.empty(n), np.empty(n, np.uint8)
+            self._empty((n, projection.COLUMNS), np.float64), np.empty(n), np.empty(n, bool)
         )
         workers.run(projection.project, n, self._rows, self._kernel_camera, found)
-        drawn = np.flatnonzero(found.status == projection.DRAWN).astype(np.int32)
-        depths = found.depths[drawn]
-        order = tiling.depth_order(depths)
-        self.order, self._depths = drawn[order], depths[order]  # (M,) int32 rows, (M,) float64
+        drawn = np.flatnonzero(found.drawn).astype(np.int32)
+        self.order, self._depths = tiling.depth_order(found.depths, drawn), found.depths  # (M,), (N,)
         size = camera.width, camera.height
         self.tiles = tiling.bin_tiles(found.geometry, self.order, size, settings, workers, self._empty)
-
-    @property
-    def radii(self) -> Array:
-        """(N,) float32 px: the greater half extent of each footprint; 0 where nothing is drawn."""
-        radii = np.zeros(self.count, np.float32)
-        radii[self.order] = self.tiles.geometry[:, projection.HALF_WIDTH :].max(1)
-        return np.where(self.drawn, radii, 0)
 
     @property
     def drawn(self) -> Array:
@@ -419,7 +412,7 @@ class CpuView(LiftingView):
         self.workers.run(kernel, len(self.tiles.starts) - 1, self.tiles, *arguments)
 
     def median_depth(self) -> Array:
-        return self._at_half(self._depths)
+        return self._at_half(self._depths[self.order])
 
     def median_rows(self) -> Array:
         """(H, W) int64 the Gaussian at which the transmittance falls to 0.5 or below, -1 where it never does.
@@ -437,7 +430,7 @@ class CpuView(LiftingView):
 
     def depth(self) -> Array:
         # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
-        both = plain(np.stack([self._depths, np.ones_like(self._depths)], -1))
+        both = plain(np.stack([self._depths, np.ones_like(self._depths)], -1)[self.order])
         image = np.empty((self.camera.height, self.camera.width, 2), np.float32)
         self._over_tiles(splat_tiles, both, image, np.empty_like(image[..., :1]))
         return mean_depth(image[..., 0], image[..., 1])

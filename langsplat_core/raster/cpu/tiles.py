@@ -18,6 +18,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.raster.cpu import projection as cp
 from langsplat_core.raster.cpu.lanes import (
     Lanes,
+    borrowed,
     exp2,
     lanes,
     largest,
@@ -36,6 +37,7 @@ TILE = 16
 PIXELS = TILE * TILE
 _SLACK = 1e-3  # px by which footprints are widened here; the blending kernels test alpha itself
 _MOST = 2**31 - 1  # intersections of Gaussians and tiles in one view
+_SPAN, _PLACE = 10, 24  # bits of a span of rows and of a tile's number, beside those of a rank
 _DIGIT, _PASSES = 11, 3  # bits per pass of the radix sort, of 32
 _MOVES = 4  # for each depth, after which sorting by neighbours is given up
 _PIECES = 16  # of the depth order that are binned side by side; the result does not depend on it
@@ -43,7 +45,6 @@ _PIECES = 16  # of the depth order that are binned side by side; the result does
 # Of a footprint: centre, half width, abscissa of its lowest point, slope and bulge of `_rows_in_column`; px.
 Ellipse = tuple[float, float, float, float, float, float]
 Size = tuple[int, int]  # width and height of an image, px
-Touched = tuple[Array, Array, Array]  # rank, tile and span of rows of intersections
 
 
 class Cutoffs(NamedTuple):
@@ -60,7 +61,7 @@ class Tiles(NamedTuple):
     geometry: Array  # (M, 8) float64 footprints, see `projection`
     starts: Array  # (T + 1,) int64: tile t owns intersections starts[t] to starts[t + 1]
     ranks: Array  # (I,) int32 Gaussian of each intersection, ascending within a tile
-    rows: Array  # (I,) uint16 spans of rows that the footprint touches in the tile, see `pack_span`
+    rows: Array  # (I,) uint16 spans of rows that the footprint touches in the tile, see `_pack`
     firsts: Array  # (M + 1,) int64: Gaussian r has intersections slots[firsts[r] : firsts[r + 1]]
     slots: Array  # (I,) int32
     columns: int  # tiles per row of tiles
@@ -72,15 +73,9 @@ class Tiles(NamedTuple):
 
 
 @helper
-def pack_span(low: int, high: int) -> int:
-    """Rows [low, high) of a tile as one number of sixteen bits."""
-    return low + 256 * high
-
-
-@helper
-def unpack_span(packed: int) -> tuple[int, int]:
-    """Return the inverse of `pack_span`."""
-    return packed & 255, packed >> 8
+def _pack(rank: int, tile: int, low: int, high: int) -> int:
+    """One intersection, rows [low, high) of a tile, as one number: it is written once instead of thrice."""
+    return (rank << _PLACE | tile) << _SPAN | high << 5 | low
 
 
 @helper
@@ -90,15 +85,15 @@ def _digit_of(key: Any, digit: int) -> Any:
 
 @kernel
 def _sort_depths(keys: Array, depths: Array, order: Array) -> bool:
-    """(2, M) uint32 keys, those of the depths first -> order[1]: by depth, ties by index.
+    """(2, M) uint32 keys and int32 rows, first those of rising rows -> order[1]: by depth, ties by row.
 
     False where it gave up, as very many depths are nearly equal. Sorted by key (radix, least significant
-    digit first, each pass stable); then neighbours that are still in the wrong order change places.
+    digit first, each pass stable); then neighbours of one key that are in the wrong order change places.
     """
-    number = depths.shape[0]
+    keys, depths, order = borrowed((keys, depths, order))
+    number = order.shape[1]
     ends = np.zeros((_PASSES, 1 << _DIGIT), np.int64)
     for i in range(number):
-        order[0, i] = i
         for digit in range(_PASSES):
             ends[digit, _digit_of(keys[0, i], digit)] += 1
     for digit in range(_PASSES):
@@ -111,8 +106,10 @@ def _sort_depths(keys: Array, depths: Array, order: Array) -> bool:
             place = ends[digit, value]
             ends[digit, value] = place + 1
             keys[1 - here, place], order[1 - here, place] = key, order[here, i]
-    by_depth, moves = order[_PASSES % 2], 0
-    for i in range(number):
+    by_key, by_depth, moves = keys[_PASSES % 2], order[_PASSES % 2], 0
+    for i in range(1, number):
+        if by_key[i] != by_key[i - 1]:
+            continue
         row, place = by_depth[i], i
         while place > 0 and depths[by_depth[place - 1]] > depths[row] and moves <= _MOVES * number:
             by_depth[place] = by_depth[place - 1]
@@ -122,14 +119,15 @@ def _sort_depths(keys: Array, depths: Array, order: Array) -> bool:
     return moves <= _MOVES * number
 
 
-def depth_order(depths: Array) -> Array:
-    """(M,) positive float64 depths -> (M,) int32 rows by depth, ties by index."""
-    keys, order = np.empty((2, len(depths)), np.uint32), np.empty((2, len(depths)), np.int32)
+def depth_order(depths: Array, rows: Array) -> Array:
+    """(N,) positive float64 depths, (M,) int32 rising rows -> the rows by depth, ties by row."""
+    keys, order = np.empty((2, len(rows)), np.uint32), np.empty((2, len(rows)), np.int32)
     with np.errstate(over="ignore"):  # infinity is the largest key
-        keys[0] = depths.astype(np.float32).view(np.uint32)  # positive floats order as their bits do
+        keys[0] = depths[rows].astype(np.float32).view(np.uint32)  # positive floats order as their bits do
+    order[0] = rows
     if _sort_depths(keys, depths, order):
         return order[_PASSES % 2]
-    return np.argsort(depths, kind="stable").astype(np.int32)
+    return rows[np.argsort(depths[rows], kind="stable")]
 
 
 @helper
@@ -175,61 +173,62 @@ def grown(array: Array, used: int) -> Array:
 @kernel
 def _touch(
     first: int, last: int, order: Array, footprints: Array, size: Size, geometry: Array, firsts: Array
-) -> tuple[Touched, int, Array]:
+) -> tuple[Array, int, Array]:
     """Find the tiles that ranks [first, last) touch, in an image of `size` (width, height).
 
     geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles it touches. Returns these
     intersections, their number, and how often each tile was touched.
     """
+    order, footprints, geometry, firsts = borrowed((order, footprints, geometry, firsts))
     width, height = size
     columns, lines_of_tiles = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    room = 4 * (last - first) + 2 * lines_of_tiles + 2
-    ranks, where, spans = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.uint16)
+    found = np.empty(4 * (last - first) + 2 * lines_of_tiles + 2, np.int64)
     counts = np.zeros((lines_of_tiles + 2) * columns, np.int64)  # two lines more than there are, see below
     used = 0
-    for rank in range(first, last):
-        prefetch(footprints, np.int64(order[min(rank + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
-        for n in range(cp.COLUMNS):
-            geometry[rank, n] = footprints[order[rank], n]
-        g, before = geometry[rank], used
-        left, right = _span(g[cp.MEAN_X], -g[cp.HALF_WIDTH], g[cp.HALF_WIDTH], width)
-        ellipse = _ellipse(g)
-        for column in range(left // TILE, (right + TILE - 1) // TILE if left < right else 0):
-            low, high = _rows_in_column(ellipse, column, height)
-            line = low // TILE
-            lines = (high + TILE - 1) // TILE - line if low < high else 0
-            if used + lines_of_tiles + 2 > ranks.shape[0]:
-                ranks, where, spans = grown(ranks, used), grown(where, used), grown(spans, used)
-            tile, top = line * columns + column, line * TILE
-            # Most columns have one tile or two: writing two always, without a branch to foretell, is faster.
-            ranks[used], ranks[used + 1] = rank, rank
-            where[used], where[used + 1] = tile, tile + columns
-            spans[used] = pack_span(low - top, min(high - top, TILE))
-            spans[used + 1] = pack_span(0, min(high - top - TILE, TILE))
-            counts[tile] += lines >= 1
-            counts[tile + columns] += lines >= 2
-            for n in range(2, lines):
-                ranks[used + n], where[used + n] = rank, tile + n * columns
-                spans[used + n] = pack_span(0, min(high - top - n * TILE, TILE))
-                counts[tile + n * columns] += 1
-            used += lines
-        firsts[rank + 1] = used - before
-    return (ranks, where, spans), used, counts
+    while first < last:
+        for rank in range(first, last):
+            prefetch(footprints, np.int64(order[min(rank + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
+            for n in range(cp.COLUMNS):
+                geometry[rank, n] = footprints[order[rank], n]
+            g, before = geometry[rank], used
+            left, right = _span(g[cp.MEAN_X], -g[cp.HALF_WIDTH], g[cp.HALF_WIDTH], width)
+            begin, end = left // TILE, (right + TILE - 1) // TILE if left < right else 0
+            if used + (end - begin) * lines_of_tiles + 2 > found.shape[0]:
+                break
+            ellipse = _ellipse(g)
+            for column in range(begin, end):
+                low, high = _rows_in_column(ellipse, column, height)
+                line = low // TILE
+                lines = (high + TILE - 1) // TILE - line if low < high else 0
+                tile, top = line * columns + column, line * TILE
+                # Most have one tile or two: writing two always, without a branch to foretell, is faster.
+                found[used] = _pack(rank, tile, low - top, min(high - top, TILE))
+                found[used + 1] = _pack(rank, tile + columns, 0, min(high - top - TILE, TILE))
+                counts[tile] += lines >= 1
+                counts[tile + columns] += lines >= 2
+                for n in range(2, lines):
+                    found[used + n] = _pack(rank, tile + n * columns, 0, min(high - top - n * TILE, TILE))
+                    counts[tile + n * columns] += 1
+                used += lines
+            firsts[rank + 1], first = used - before, rank + 1
+        if first < last:  # outside of the loop, which takes twice as long with an array that may change
+            found = grown(found, used)
+    return found, used, counts
 
 
 @kernel
-def _place(first: int, last: int, touched: Touched, places: Array, start: int, tiles: Tiles) -> None:
+def _place(first: int, last: int, touched: Array, places: Array, start: int, tiles: Tiles) -> None:
     """Write intersections [first, last) that `_touch` found into their tiles.
 
     Those of a tile go to places[tile] and on: within a tile ranks ascend, whoever runs which piece. They are
     the view's from `start` on.
     """
-    ranks, where, spans = touched
+    touched, places, tiles = borrowed((touched, places, tiles))
     for n in range(first, last):
-        tile = where[n]
+        tile = touched[n] >> _SPAN & (1 << _PLACE) - 1
         place = places[tile]
         places[tile] = place + 1
-        tiles.ranks[place], tiles.rows[place] = ranks[n], spans[n]
+        tiles.ranks[place], tiles.rows[place] = touched[n] >> _SPAN + _PLACE, touched[n] & (1 << _SPAN) - 1
         tiles.slots[start + n] = place
 
 
@@ -251,7 +250,7 @@ def bin_tiles(
     found = workers.each(_touch, [(*piece, *shared) for piece in pieces])
     np.cumsum(firsts, out=firsts)
     total = int(firsts[-1])
-    if total > _MOST:
+    if max(total, 4 * len(order)) > _MOST:  # ranks have two bits less, see `_pack`
         raise BackendError(
             f"{total} overlaps of Gaussians and tiles are too many for the CPU rasterizer: "
             "render a smaller image"
@@ -311,44 +310,42 @@ def add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -
 
 
 @helper
-def _write_row(planes: Array, at: int, image: Array, x0: int, y: int, columns: int, channels: int) -> None:
+def _copy_row(
+    planes: Array, at: int, image: Array, x0: int, y: int, columns: int, channels: int, out: bool
+) -> None:
     for channel in range(channels):
         for column in range(columns):
-            image[y, x0 + column, channel] = planes[at + channel * TILE + column]
+            if out:
+                image[y, x0 + column, channel] = planes[at + channel * TILE + column]
+            else:
+                planes[at + channel * TILE + column] = image[y, x0 + column, channel]
 
 
 @helper
-def _load_row(planes: Array, at: int, image: Array, x0: int, y: int, columns: int, channels: int) -> None:
-    for channel in range(channels):
-        for column in range(columns):
-            planes[at + channel * TILE + column] = image[y, x0 + column, channel]
-
-
-@helper
-def _copy_rows(copy: Callable[..., None], planes: Array, image: Array, tile: int, columns: int) -> None:
+def _copy_rows(planes: Array, image: Array, tile: int, columns: int, out: bool) -> None:
     x0, y0 = tile % columns * TILE, tile // columns * TILE
     height, width, channels = image.shape
     for row in range(min(TILE, height - y0)):
         at = row * padded_inside(channels) * TILE
         if x0 + TILE > width:
-            copy(planes, at, image, x0, y0 + row, width - x0, channels)
+            _copy_row(planes, at, image, x0, y0 + row, width - x0, channels, out)
         elif channels == 3:  # with constants, whole rows are shuffled instead of copied one by one
-            copy(planes, at, image, x0, y0 + row, TILE, 3)
+            _copy_row(planes, at, image, x0, y0 + row, TILE, 3, out)
         else:
-            copy(planes, at, image, x0, y0 + row, TILE, channels)
+            _copy_row(planes, at, image, x0, y0 + row, TILE, channels, out)
 
 
 @helper
 def write_tile(planes: Array, image: Array, tile: int, tiles: Tiles) -> None:
     """Copy planes[(row, channel, column)] to a tile of the (H, W, C) image."""
-    _copy_rows(_write_row, planes, image, tile, tiles.columns)
+    _copy_rows(planes, image, tile, tiles.columns, True)
 
 
 @helper
 def load_tile(planes: Array, image: Array, tile: int, tiles: Tiles) -> None:
     """planes[(row, channel, column)] <- a tile of the (H, W, C) image, 0 beyond its border."""
     planes[:] = 0
-    _copy_rows(_load_row, planes, image, tile, tiles.columns)
+    _copy_rows(planes, image, tile, tiles.columns, False)
 
 
 @helper
@@ -422,8 +419,7 @@ def running_rows(transmittance: Array, low: int, high: int) -> tuple[int, int]:
 @helper
 def rows_to_blend(packed: int, top: int, bottom: int) -> tuple[int, int]:
     """Return the rows of a packed span that are within the running rows [top, bottom)."""
-    low, high = unpack_span(packed)
-    return max(low, top), min(high, bottom)
+    return max(packed & 31, top), min(packed >> 5, bottom)
 
 
 @helper

@@ -150,7 +150,7 @@ class SceneTextures:
         depths = x * a + y * b + z * c + d
         ahead = np.flatnonzero((depths > settings.near) & (depths <= farthest(settings))).astype(np.int32)
         self._drawn = len(ahead)
-        self.order.write(ahead[depth_order(depths[ahead])[::-1]])
+        self.order.write(depth_order(depths, ahead)[::-1].tobytes())
 
     def texels(self) -> Array:
         """(m,) int32 texels that are drawn, back to front, read from `order`."""
