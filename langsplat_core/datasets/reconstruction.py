@@ -35,7 +35,6 @@ if threading.current_thread() is threading.main_thread():  # Python sets handler
         signal.signal(_number, signal.getsignal(_number) or signal.SIG_DFL)
 
 FEATURES = 8192  # per photograph
-SMALL_SIDE = 1000  # px; smaller photographs are doubled before features are sought, as SIFT proposes
 EXTRACT_BATCH = 8  # photographs per step: a step is the unit of progress and of resuming
 MATCH_BATCH = 64  # pairs per step
 
@@ -74,7 +73,7 @@ def extract_features(folder: Path, groups: Sequence[workspace.CameraGroup], prog
         reader.existing_camera_id = rows[group.names[0]].camera_id
         options = pycolmap.FeatureExtractionOptions()
         options.sift.max_num_features = FEATURES
-        options.sift.first_octave = -1 if group.side <= SMALL_SIDE else 0
+        options.sift.first_octave = -1 if group.doubled else 0
         for start in range(0, len(group.names), EXTRACT_BATCH):
             progress("finding features", done / total)
             names = group.names[start : start + EXTRACT_BATCH]
@@ -179,6 +178,7 @@ ENOUGH = 0.9  # share of the photographs; with fewer located the next method is 
 ASTRAY, ASTRAY_GUESS = 2.0, 4.0  # times the focal length of EXIF data, and a normal lens's without them
 TIE = 0.05  # of the reprojection error: methods that end at the same cameras differ by 1 to 2 %
 FEWEST_POINTS = 30  # that hold a camera; the incremental mapper demands as many, the global one none
+FIRM_POINTS = 100  # that hold a camera which needs no further look
 # For first pairs of a walk straight ahead: degrees between rays, share of motion that is forward, matches.
 _CLOSE_PAIRS = {"init_min_tri_angle": 4.0, "init_max_forward_motion": 1.0, "init_min_num_inliers": 50}
 # For long walks: each photograph shares little with those before it, and what it shares lies far ahead.
@@ -190,15 +190,16 @@ _FEW_SHARED = _CLOSE_PAIRS | {
 }
 
 
-def map_cameras(folder: Path, count: int, progress: Progress) -> None:
-    """Locate the `count` photographs of a workspace that was matched.
+def map_cameras(folder: Path, count: int, progress: Progress, firmly: bool = False) -> bool:
+    """Locate the `count` photographs of a workspace that was matched; return whether there is a model.
 
     `MAPPERS` are tried until one locates `ENOUGH`; the best model (see `best_model`) becomes ``sparse``.
-    Where no two could be located there is none.
+    Where no two could be located there is none. firmly: the first mapper alone is tried, and there is no
+    model unless `FIRM_POINTS` hold each of the photographs.
     """
     best: Model | None = None
     astray: Model | None = None
-    for number, mapper in enumerate(MAPPERS):
+    for number, mapper in enumerate(MAPPERS[:1] if firmly else MAPPERS):
         attempts = folder / "attempts" / str(number)
         attempts.mkdir(parents=True, exist_ok=True)
         progress("locating cameras", 0.0)
@@ -208,12 +209,17 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> None:
         astray = best_model(astray, lost)
         if best is not None and len(located_names(best)) >= ENOUGH * count:
             break
+    if firmly:
+        images = [] if best is None else best.images.values()
+        if sum(image.has_pose and image.num_points3D >= FIRM_POINTS for image in images) < count:
+            return False
     if astray and (best is None or 2 * len(located_names(best)) < len(located_names(astray))):
         best = astray
     keep_matches(folder)
     if best is not None:
         store_model(best, folder)
     progress("locating cameras", 1.0)
+    return best is not None
 
 
 def _placed(places: Iterator[int], count: int, progress: Progress) -> None:

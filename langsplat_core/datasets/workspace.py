@@ -42,7 +42,7 @@ class CameraGroup:
     names: tuple[str, ...]  # file names in the workspace's images folder
     model: str  # COLMAP's camera model
     params: str = ""  # its parameters, comma-separated; empty: guessed from EXIF data or the size
-    side: int = 0  # longer side, pixels
+    doubled: bool = False  # in size before features are sought, as SIFT proposes
 
 
 def open_workspace(work: Path, inputs: object) -> Path:

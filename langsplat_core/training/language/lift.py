@@ -396,9 +396,9 @@ def lift_by_gradient(
     x = np.zeros_like(start) if published else start.copy()
     features = torch.from_numpy(x)  # the same memory
     adam = torch.optim.Adam([features], config.lr, (0.9, 0.999), 1e-15, fused=True)  # as in the INRIA code
+    none = np.zeros((1, codec.latent_dim), np.float32)
     targets = [
-        (camera, np.asarray(seen.labels, np.int32), plain(codec.encode(seen.vectors)))
-        for camera, seen in views
+        (camera, seen.labels, np.concatenate([codec.encode(seen.vectors), none])) for camera, seen in views
     ]
     kept: dict[int, LiftingView] = {}
     generator = np.random.default_rng(config.seed)
@@ -436,42 +436,14 @@ def by_features(x: Array, by_y: Array) -> Array:
 def _loss_and_gradient(view: LiftingView, labels: Array, latents: Array, y: Array) -> tuple[float, Array]:
     """Masked L1 of one view, the mean over levels, pixels and numbers, and its (3, N, d) gradient by y.
 
-    What each pixel ought to show: the row of the (M, d) `latents` by its (3, H, W) `labels`, -1 for none.
+    What each pixel ought to show: the row of the (M + 1, d) `latents` by its (3, H, W) `labels`; -1, the
+    last row, for none.
     """
     levels, count, d = y.shape
     image = view.splat(np.ascontiguousarray(np.moveaxis(y, 0, 1).reshape(count, levels * d)))[0]
-    signs, losses = np.empty_like(image), np.empty(len(image))
-    share = np.float32(1 / image.size)
-    shared_workers().run(_compare, len(image), image, labels, latents, share, signs, losses)
-    gradient = view.gather(signs)
-    return float(losses.sum() / image.size), np.moveaxis(gradient.reshape(count, levels, d), 1, 0)
-
-
-@kernel
-def _compare(
-    first: int,
-    last: int,
-    image: Array,
-    labels: Array,
-    latents: Array,
-    share: float,
-    signs: Array,
-    losses: Array,
-) -> None:
-    """Compare rows [first, last) of an image with the latents of its labels.
-
-    `signs`: `share` with the sign of (image - latents), zero where there is no label; `losses`: the sum of
-    the absolute differences of each row.
-    """
-    levels, d = labels.shape[0], latents.shape[1]
-    for row in range(first, last):
-        total = 0.0
-        for column in range(image.shape[1]):
-            for channel in range(levels * d):
-                label = labels[channel // d, row, column]
-                difference = 0.0
-                if label >= 0:
-                    difference = image[row, column, channel] - latents[label, channel % d]
-                total += abs(difference)
-                signs[row, column, channel] = share * np.sign(difference)
-        losses[row] = total
+    rows = np.moveaxis(labels, 0, -1)
+    difference = image.reshape(*rows.shape, d) - latents[rows]
+    difference[rows < 0] = 0
+    signs = np.sign(difference, dtype=np.float32) / np.float32(image.size)
+    gradient = view.gather(signs.reshape(image.shape))
+    return float(np.abs(difference).mean()), np.moveaxis(gradient.reshape(count, levels, d), 1, 0)
