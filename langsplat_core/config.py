@@ -184,10 +184,6 @@ class RadianceBudget(NamedTuple):
     max_gaussians: int
     sh_degree: int
 
-    def at_most(self, limit: "RadianceBudget") -> "RadianceBudget":
-        """Return the smaller of both budgets in each respect."""
-        return RadianceBudget(*map(min, self, limit))
-
 
 QUICK = RadianceBudget(320, 500, 30_000, 1)  # with fewer steps no capture is learnt
 GOOD = RadianceBudget(480, 1_500, 60_000, 1)
@@ -228,9 +224,9 @@ class RadianceConfig:
     # up to so many training views: Gaussians begin at depths by stereo and leave the space before surfaces,
     # opacities decay and are not reset; 0 (as published): never
     few_views: CountOrZero = 50
-    # up to so many training views, no more `steps` are trained than they support; where many are asked for,
-    # trainings on some of the views decide, see `training.radiance.trainer`; 0: never
-    rehearsed_views: CountOrZero = 24
+    # up to so many training views, 64 `steps` of each, 60 000 Gaussians and degree 1 are trained at most:
+    # more lose on views held out; 0: never
+    capped_views: CountOrZero = 24
     # each photograph has an exposure and white balance of its own; auto: where that explains enough
     exposure: Literal["auto", "on", "off"] = "auto"
     # what moves in a photograph, such as people, does not count; auto: where it explains enough of the error
@@ -349,7 +345,7 @@ class TrainConfig:
 PAPER = TrainConfig(
     dataset=DatasetConfig(hold_out="every"),
     radiance=RadianceConfig(
-        coarse_fraction=0.0, few_views=0, rehearsed_views=0, exposure="off", transients="off", near=INRIA.near
+        coarse_fraction=0.0, few_views=0, capped_views=0, exposure="off", transients="off", near=INRIA.near
     ),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
     codec=CodecConfig("autoencoder", steps=10_000, batch=64, lr=7e-4),

@@ -115,7 +115,7 @@ EXTRAS: Mapping[str, str] = MappingProxyType({  # name as imported -> extra, as 
     "torch": "train", "pycolmap": "train", "skimage": "train", "transformers": "encoders",
     "tokenizers": "encoders", "huggingface_hub": "encoders", "ftfy": "encoders", "matplotlib": "plots",
     "gsplat": "cuda", "mcp": "agents", "open3d": "geometry", "av": "phones", "pillow_heif": "phones",
-    "pxr": "usd",
+    "pxr": "usd", "distributed": "dask",
 })  # fmt: skip
 
 

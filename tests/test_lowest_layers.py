@@ -21,7 +21,7 @@ from langsplat_core.arrays import psnr
 from langsplat_core.cli.app import command_names, parse
 from langsplat_core.cli.train import Train
 from langsplat_core.compiled import Workers, is_compiled
-from langsplat_core.config import CodecConfig, TrainConfig, check_settings, numeric_settings
+from langsplat_core.config import PAPER, CodecConfig, TrainConfig, check_settings, numeric_settings
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.train import train_scene
@@ -463,7 +463,7 @@ def trained(*words: str, file: Path | None = None, text: str = "") -> Train:
         words = (*words, "--config", str(file))
     found = parse([*WORDS, *words])
     assert isinstance(found, Train)
-    assert str(found.dataset) == "photographs"
+    assert found.dataset == (Path("photographs"),)
     return found
 
 
@@ -479,6 +479,8 @@ def test_options_beside_a_preset_win() -> None:
     assert (found.preset, found.config.radiance.steps) == ("good", 8)
     assert (found.config.dataset.max_side, found.config.radiance.max_gaussians) == (480, 60_000)
     assert found.config.phrases == ("red mug", "keyboard")
+    paper = trained("--profile=paper", "--codec.latent-dim", "8").config
+    assert paper == dataclasses.replace(PAPER, codec=dataclasses.replace(PAPER.codec, latent_dim=8))
 
 
 def test_the_example_of_the_docs_is_read(tmp_path: Path) -> None:

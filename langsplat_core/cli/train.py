@@ -4,17 +4,17 @@ import contextlib
 import io
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from langsplat_core.cli.arguments import OutFile, OutFolder, check_codec, named
+from langsplat_core.cli.arguments import OutFolder, check_codec, named
 from langsplat_core.cli.run import one_line
 from langsplat_core.config import PAPER, TrainConfig, TrainPreset, TrainProfile, check_settings, with_preset
-from langsplat_core.errors import InputError, printable_line
+from langsplat_core.errors import InputError, printable_line, shortened
 from langsplat_core.io.hostile import read_text
 from langsplat_core.progress import TerminalProgress, silent
 
@@ -23,14 +23,17 @@ from langsplat_core.progress import TerminalProgress, silent
 class Train:
     """Train a searchable scene from photographs.
 
-    DATASET is a COLMAP folder, a nerfstudio transforms.json, a video or a plain folder of photographs. An
-    interrupted run continues where it stopped.
+    DATASET is a COLMAP folder, a nerfstudio transforms.json, a video or a plain folder of photographs; of
+    several each makes a scene of its own. An interrupted run continues where it stopped.
     """
 
-    dataset: tyro.conf.Positional[Path]
-    """Folder of photographs, video, COLMAP project folder, or transforms.json."""
-    out: OutFile
-    """The scene to write, *.ply; its language field and cameras are written beside it."""
+    dataset: tyro.conf.Positional[tuple[Path, ...]]
+    """Folder of photographs, video, COLMAP project folder, or transforms.json; several make a scene each."""
+    out: Path
+    """The scene to write, *.ply; its language field and cameras are written beside it. Of several datasets
+    the folder of the scenes."""
+    on: str = ""
+    """What trains several datasets: local:N, N at a time on this machine, or the workers of dask://HOST:PORT."""
     work: OutFolder | None = None
     """Folder for intermediate results (default: <out>.work)."""
     profile: TrainProfile = "default"
@@ -50,9 +53,11 @@ class Train:
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:
-        """Train, and print the figures of the scene."""
+        """Train, and print the figures of the scene, or a table of several."""
+        if self.on or len(self.dataset) != 1:
+            self._train_several()
+            return
         # They import torch: seconds that --help need not pay.
-        from langsplat_core.errors import shortened
         from langsplat_core.pipeline.report import PAGE, work_folder
         from langsplat_core.pipeline.stages import join_processes
         from langsplat_core.pipeline.train import train_scene
@@ -61,7 +66,7 @@ class Train:
         shown = TerminalProgress(self.progress == "lines") if processes.is_main else nullcontext(silent)
         with shown as progress:
             report = train_scene(
-                self.dataset,
+                self.dataset[0],
                 self.out,
                 self.config,
                 self.work,
@@ -90,8 +95,29 @@ class Train:
         )
         for warning in report.warnings:
             print(f"warning: {warning}")
-        page = (self.work or work_folder(self.out)) / PAGE
-        print(f"photographs beside what the scene shows: {page}")
+        print(f"photographs beside what the scene shows: {(self.work or work_folder(self.out)) / PAGE}")
+
+    def _train_several(self) -> None:
+        from langsplat_core.pipeline.train import Trained, tasks_for, train_captures
+
+        if not self.dataset or self.work or self.gaussians:
+            raise InputError("give a DATASET; --work and --gaussians are of one alone")
+        tasks, rows = tasks_for(self.dataset, self.out, self.config, self.until), list[Trained]()
+        try:
+            with (
+                TerminalProgress(self.progress == "lines") as progress,
+                closing(train_captures(tasks, self.on or "local:1", progress)) as ended,
+            ):
+                rows.extend(ended)
+        finally:  # also of Ctrl-C, as far as it came
+            if rows:
+                print("capture               located   held out  seconds  exit")
+            for row in rows:
+                print(f"{row.name:<18} {row.located:>10} {row.psnr:>10} {row.seconds:>8.0f} {row.code:>5}")
+                for line in row.said:
+                    print(f"  {printable_line(line)}")
+        if failed := [row.name for row in rows if row.code]:
+            raise InputError(f"{len(failed)} of {len(tasks)} captures have no scene: {shortened(failed)}")
 
 
 def train_command(args: Sequence[str]) -> type[Train]:
@@ -99,9 +125,8 @@ def train_command(args: Sequence[str]) -> type[Train]:
     profile, preset = named(args, "--profile"), named(args, "--preset")
     config = PAPER if profile == "paper" else TrainConfig()
     check_codec(args, config.codec.kind)
-    for known in get_args(TrainPreset):
-        if known == preset:
-            config = with_preset(config, known)
+    if preset in get_args(TrainPreset):
+        config = with_preset(config, preset)  # type: ignore[arg-type]  # it is one of them
 
     @dataclass(frozen=True)
     class ProfiledTrain(Train):

@@ -168,6 +168,7 @@ class _Stages:
         mask_weights = self.weights_in(folder)
 
         def make() -> Arrays:
+            self.progress("grouping masks", 0.0)
             groups = lift.group_masks(vectors)
             return {"of_mask": np.concatenate(groups.of_mask), "vectors": groups.vectors}
 

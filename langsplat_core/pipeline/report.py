@@ -9,8 +9,8 @@ import html
 import io
 import json
 from base64 import b64encode
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Container, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -55,19 +55,9 @@ class TrainReport:
     dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
     held_out_views: tuple[ViewScore, ...] = ()  # one by one
     psnr_small: float | None = None  # as `psnr`, of images shrunk to 320 px, by which presets compare
-    # budget -> PSNRs (dB) of views held out of the training views, where rehearsals decided on it
-    rehearsed: dict[str, list[float]] = field(default_factory=dict)
     psnr_trained: float | None = None  # mean over the views that were trained on, 48 of them at most
     held_out_rule: str = ""  # which views are held out, in words
     taken: str = ""  # the span of the photographs' dates and places, in words
-
-
-def rehearsals_in_words(rehearsed: Mapping[str, Sequence[float]]) -> str:
-    """Return ``after 500 steps at 320 px 24.6, 21.1 dB; after 500 steps at 480 px 24.0 dB``."""
-    return "; ".join(
-        f"after {budget} {', '.join(f'{decibels:.1f}' for decibels in found)} dB"
-        for budget, found in rehearsed.items()
-    )
 
 
 def work_folder(out: Path) -> Path:
@@ -239,10 +229,7 @@ def _figures(report: TrainReport, matches: Matches | None) -> str:
         found = f"{len(matches.located)} of {len(matches.names)} photographs are located"
         found += f"; {matches.advice()}" if matches.gap else ""
     figures = {name: f"{seconds:.1f} s" for name, seconds in report.seconds.items()}
-    figures |= {
-        "matches": found,
-        "rehearsed": rehearsals_in_words(report.rehearsed) or "no",
-    }
+    figures["matches"] = found
     described = {
         "masks by": report.masks,
         "encoder": report.encoder,

@@ -4,24 +4,29 @@ Every stage keeps its result in the work folder under a key of its settings, so 
 continues where it stopped and a changed setting recomputes only what depends on it.
 """
 
-import json
 import logging
 import os
-import shutil
+import signal
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
+from uuid import uuid4
 
 import numpy as np
 
 from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
-from langsplat_core.errors import STRICTNESS, FormatError, InputError
+from langsplat_core.datasets.photos import count_photographs
+from langsplat_core.errors import STRICTNESS, FormatError, InputError, LangSplatError, optional_imports
+from langsplat_core.interrupts import raised
+from langsplat_core.io import apart
 from langsplat_core.io.cameras import SUFFIX as CAMERAS
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.files import atomic_path, check_output_folder, patiently, shown, write_json
@@ -41,7 +46,7 @@ from langsplat_core.training.radiance import trainer
 from langsplat_core.training.radiance.differentiable import evaluate_views
 
 FEWEST_VIEWS = 3
-VERSION = 9  # of what training and rehearsals make
+VERSION = 9  # of what training makes
 
 Until = Literal["gaussians", "language field"]  # what a training ends with
 
@@ -143,9 +148,17 @@ def _train(
 
     with run.timed("radiance"):
         if given is None:
-            gaussians, rehearsed = _gaussians(run, capture, train)
+            budget = trainer.budget_for(capture, config.radiance, len(train))
+            if budget.steps < config.radiance.steps:
+                log.info(
+                    "training takes %d steps, not %d: with %d photographs more does not pay; "
+                    "--radiance.capped-views 0 spends all",
+                    *(budget.steps, config.radiance.steps, len(train)),
+                )
+            made = capture, train, config.radiance, budget, run.work, run.progress
+            gaussians = processes.once(lambda: trained_gaussians(*made))
         else:
-            gaussians, rehearsed = place_scene(given, origin=capture.origin).gaussians, {}
+            gaussians = place_scene(given, origin=capture.origin).gaussians
 
     language, figures = None, dict[str, Any]()
     if encoder is not None:
@@ -175,7 +188,6 @@ def _train(
             dataset=str(run.dataset.resolve()),
             taken=capture.taken,
             held_out_views=tuple(scores),
-            rehearsed=rehearsed,
             psnr_trained=_mean(score.psnr for score in trained),
             held_out_rule="as the dataset says" if any(photo.held_out for photo in capture.photos) else rule,
             **figures,
@@ -258,45 +270,6 @@ def _described(
     return store.of([capture.cameras[i].name for i in train])
 
 
-def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[str, list[float]]]:
-    """Return Gaussians of the supported budget, and PSNRs of held-out views by budget; one process trains."""
-    config = run.config.radiance
-    budgets = trainer.budgets_for(capture, config, len(train))
-    found = run.processes.once(lambda: _rehearsals(run, capture, train, budgets))
-    budget = budgets[trainer.supported(found)]
-    scores = [[round(decibels, 2) for decibels in each] for each in found]
-    rehearsed = dict(zip(map(trainer.budget_text, budgets), scores, strict=False))
-    if budget.steps < config.steps:
-        log.info(
-            "training takes %s, not %d: with %d photographs more does not pay%s; "
-            "--radiance.rehearsed-views 0 spends all",
-            *(trainer.budget_text(budget), config.steps, len(train)),
-            f" (held out: {reports.rehearsals_in_words(rehearsed)})" if rehearsed else "",
-        )
-    made = run.processes.once(
-        lambda: trained_gaussians(capture, train, config, budget, run.work, run.progress)
-    )
-    return made, rehearsed
-
-
-def _rehearsals(
-    run: _Run, capture: Capture, train: list[int], budgets: list[RadianceBudget]
-) -> list[list[float]]:
-    """`rehearse` for the photographs at `train`, from the work folder where that was done before."""
-    config = run.config.radiance
-    done = run.work / f"{_radiance_key('rehearsal', capture, train, config)}.json"
-    if not done.exists():
-        checkpoints = done.with_suffix(".checkpoints")
-        checkpoints.mkdir(exist_ok=True)
-        write_json(done, trainer.rehearse(capture, config, budgets, train, checkpoints, run.progress))
-        shutil.rmtree(checkpoints)
-    try:
-        found: list[list[float]] = json.loads(done.read_bytes())
-    except ValueError as error:
-        raise FormatError(f"{done}: damaged ({error}); delete it and run again") from None
-    return found
-
-
 def trained_gaussians(
     capture: Capture,
     train: list[int],
@@ -306,7 +279,9 @@ def trained_gaussians(
     progress: Progress,
 ) -> Gaussians:
     """Return the Gaussians of the photographs at `train`, from `work` where they were trained before."""
-    done = work / f"{_radiance_key('radiance', capture, train, config, budget)}.ply"
+    # The backend changes who computes, not what, so that a run may move between machines; nor do checkpoints.
+    settings = replace(config, backend="auto", checkpoint_every=RadianceConfig.checkpoint_every)
+    done = work / f"{stage_key('radiance', VERSION, settings, capture.digest(train), budget)}.ply"
     stated = done.with_suffix(".digest")
     if done.exists():
         log.debug("%s: kept from an earlier run", done.name)
@@ -324,9 +299,141 @@ def trained_gaussians(
     return gaussians
 
 
-def _radiance_key(
-    name: str, capture: Capture, train: list[int], config: RadianceConfig, *more: RadianceBudget
-) -> str:
-    # The backend changes who computes, not what, so that a run may move between machines; nor do checkpoints.
-    settings = replace(config, backend="auto", checkpoint_every=RadianceConfig.checkpoint_every)
-    return stage_key(name, VERSION, settings, capture.digest(train), *more)
+# Many captures, each in a process of its own, by an engine that runs tasks here or elsewhere: a
+# `concurrent.futures.Executor`, that is threads of this process, or Dask's workers. Machines see the
+# photographs and the folder of the scenes under the same paths.
+
+
+@dataclass(frozen=True)
+class Task:
+    """A capture to train."""
+
+    dataset: Path
+    out: Path  # its scene, *.ply
+    config: TrainConfig
+    until: Until
+    folder: Path  # that relative paths in `config` begin at
+    wanted: Path  # a file that is gone once nobody waits for the result
+    strict: bool
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a training of a capture came to."""
+
+    name: str
+    code: int  # as an exit code: 0; 2: refused; 130: interrupted; 1: whatever else happened
+    seconds: float  # of all runs, or of this one where it failed
+    said: tuple[str, ...]  # why it failed, and warnings
+    located: str = "-"  # "14 of 16" photographs
+    psnr: str = "-"  # "26.33 dB", of held-out views
+
+
+def tasks_for(datasets: Sequence[Path], out: Path, config: TrainConfig, until: Until) -> list[Task]:
+    """Return a task for each capture, whose scene in the folder `out` has its name; InputError for twins."""
+    check_output_folder(out)
+    named: dict[str, Path] = {}
+    for path in datasets:
+        folder = path.resolve().parent if path.suffix.lower() == ".json" else path.resolve()
+        name = folder.stem if folder.is_file() else folder.name
+        if name in named:
+            raise InputError(f"{named[name]} and {path} would both be {out / name}.ply; rename one of them")
+        named[name] = path
+    rest = config, until, Path.cwd(), out.resolve() / f".wanted-{uuid4().hex}", STRICTNESS.on
+    return [Task(path.absolute(), out.absolute() / f"{name}.ply", *rest) for name, path in named.items()]
+
+
+def train_captures(
+    tasks: Sequence[Task], on: str, progress: Progress = silent
+) -> Generator[Trained, None, None]:
+    """Yield what came of each task as it ends; on: ``local:N``, N at a time here, or ``dask://HOST:PORT``.
+
+    Leaving the iteration, by Ctrl-C too, ends all that runs, on other machines as well.
+    """
+    wanted, futures, share = tasks[0].wanted, dict[Future[Trained], str](), 0.0
+
+    def shown(name: str) -> Progress:
+        return Progress(lambda at: progress("captures", share, f"{name}: {at.stage}"))
+
+    with _engine(on) as engine:
+        wanted.parent.mkdir(parents=True, exist_ok=True)
+        wanted.touch()
+        try:
+            for task in tasks:  # progress can be heard of in this process alone
+                heard = [shown(task.out.stem)] if isinstance(engine, ThreadPoolExecutor) else []
+                futures[engine.submit(_train_apart, task, *heard)] = task.out.stem
+            for future in as_completed(futures):
+                share += 1 / len(tasks)
+                progress("captures", share)
+                try:
+                    yield future.result()
+                except Exception as error:  # noqa: BLE001  an engine's own: its worker was lost, for example
+                    yield Trained(futures[future], 1, 0.0, (f"{type(error).__name__}: {error}",))
+        finally:
+            wanted.unlink(missing_ok=True)
+            for future in futures:
+                future.cancel()
+
+
+@contextmanager
+def _engine(on: str) -> Iterator[Executor]:
+    kind, _, where = on.partition(":")
+    if kind == "local" and where.isdecimal() and int(where):
+        with ThreadPoolExecutor(int(where)) as pool:
+            yield pool
+    elif kind == "dask" and where.startswith("//"):
+        with optional_imports():
+            from distributed import Client
+        try:
+            client = Client(where[2:])
+        except (OSError, ValueError) as error:
+            raise InputError(f"--on {on}: {error}; is `dask scheduler` running there?") from None
+        with client:
+            yield client.get_executor(pure=False)
+    else:
+        raise InputError(f"--on {on}: there is local:N, N captures at a time, and dask://HOST:PORT")
+
+
+def _train_apart(task: Task, progress: Progress = silent) -> Trained:
+    """Train in a process of its own, whose end, however it comes, ends no other."""
+    began = time.monotonic()
+    try:
+        report, losses = apart.run(_train_while_wanted, task, progress=progress)
+    except (LangSplatError, OSError, MemoryError) as error:
+        code, said = 2, str(error) or "too little memory"
+    except apart.AbortedError as error:
+        code, said = (1, f"its process {error}") if task.wanted.exists() else (130, "interrupted")
+    else:
+        located = report.views + report.held_out
+        count = count_photographs(task.dataset) if task.dataset.is_dir() else 0
+        of = f"{located} of {max(count, located)}"
+        psnr = "-" if report.psnr is None else f"{report.psnr:.2f} dB"
+        return Trained(task.out.stem, 0, sum(report.seconds.values()), (*losses, *report.warnings), of, psnr)
+    return Trained(task.out.stem, code, time.monotonic() - began, (said,))
+
+
+def _train_while_wanted(task: Task, progress: Progress) -> tuple[reports.TrainReport, tuple[str, ...]]:
+    """Return the report, and what was lost; interrupt this process once nobody waits for that."""
+    done = threading.Event()
+
+    def watch() -> None:
+        while task.wanted.exists():
+            if done.wait(0.5):
+                return
+        os.kill(os.getpid(), signal.SIGTERM)  # which wakes whatever the main thread waits for
+
+    def named(record: logging.LogRecord) -> bool:
+        record.msg, record.args = f"{task.out.stem}: {record.getMessage()}", ()
+        return True
+
+    threading.Thread(target=watch, daemon=True).start()
+    log.addFilter(named)
+    STRICTNESS.on = task.strict
+    try:
+        os.chdir(task.folder)
+        with raised("langsplat", ""):
+            report = train_scene(task.dataset, task.out, task.config, progress=progress, until=task.until)
+        return report, tuple(STRICTNESS.said)
+    finally:
+        done.set()
+        log.removeFilter(named)

@@ -36,13 +36,7 @@ from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Scene, look_at
 from langsplat_core.training.radiance.differentiable import evaluate_views
-from langsplat_core.training.radiance.trainer import (
-    budget_text,
-    budgets_for,
-    rehearse,
-    supported,
-    train_radiance,
-)
+from langsplat_core.training.radiance.trainer import budget_for, train_radiance
 
 Kind = Literal["few", "walk"]  # on an arc around a room's table; straight ahead along a street
 VIEWS = 12
@@ -175,13 +169,13 @@ LARGER = (480, 800)  # px, of windows beside them: with dilation as at the photo
 HEAD = (
     "capture", "training / held out", "preset", "with", "seed", "held out, dB", "exposure fitted, dB",
     f"at {QUICK.longer_side} px, dB", f"at each of {LARGER} px: dilation constant, growing",
-    "SSIM", "training, dB", "budget", "rehearsed, dB", "Gaussians", "CPU-s",
+    "SSIM", "training, dB", "budget", "Gaussians", "CPU-s",
 )  # fmt: skip
 # What a training has, beside its preset.
 VARIANTS: dict[str, dict[str, object]] = {
-    "before": {"few_views": 0, "rehearsed_views": 0, "exposure": "off", "transients": "off"},
-    "depths": {"rehearsed_views": 0, "exposure": "off", "transients": "off"},
-    "depths, exposures": {"rehearsed_views": 0, "transients": "off"},
+    "before": {"few_views": 0, "capped_views": 0, "exposure": "off", "transients": "off"},
+    "depths": {"capped_views": 0, "exposure": "off", "transients": "off"},
+    "depths, exposures": {"capped_views": 0, "transients": "off"},
     "all": {},
 }
 
@@ -281,9 +275,7 @@ def _measured(
     progress: Progress,
 ) -> tuple[str, ...]:
     began = time.process_time()
-    budgets = budgets_for(capture, config, len(train))
-    found = rehearse(capture, config, budgets, train, progress=progress)
-    budget = budgets[supported(found)]
+    budget = budget_for(capture, config, len(train))
     gaussians = train_radiance(capture, config.spending(budget), train, progress=progress)
     seconds = time.process_time() - began
     small = capture.read_at(held_out, QUICK.longer_side)
@@ -304,10 +296,7 @@ def _measured(
         *(f"{mean:.2f}" for mean in means),
         ", ".join(f"{mean:.2f}" for mean in windows),
         *(f"{ssim:.3f}", f"{np.mean([score.psnr for score in learnt]):.2f}"),
-        *(
-            budget_text(budget),
-            "; ".join(", ".join(f"{decibels:.2f}" for decibels in each) for each in found),
-        ),
+        f"{budget.steps} steps at {budget.longer_side} px",
         *(str(len(gaussians)), f"{seconds:.0f}"),
     )
 

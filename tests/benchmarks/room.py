@@ -58,7 +58,7 @@ from langsplat_core.semantics.features import FeatureStore, ImageFeatures, descr
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.training.language.codec_fit import CodecReport
-from langsplat_core.training.radiance.trainer import budgets_for
+from langsplat_core.training.radiance.trainer import budget_for
 from tests.benchmarks.oracles import (
     TruthEncoder,
     moved_to_images,
@@ -216,7 +216,7 @@ class Room:
         train, _ = self.capture.split(HOLD_OUT)
         config = self.settings.radiance
         with self._timed("radiance"):
-            budget = budgets_for(self.capture, config, len(train))[-1]
+            budget = budget_for(self.capture, config, len(train))
             return trained_gaussians(self.capture, train, config, budget, self.folder, self.progress)
 
     @cached_property

@@ -2,35 +2,38 @@
 
 import json
 import os
+import pickle
 import shutil
+import signal
+import sys
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 from safetensors.numpy import load_file
 
-from langsplat_core.cli.app import parse
-from langsplat_core.config import (
-    PAPER,
-    ClipConfig,
-    CodecConfig,
-    LiftConfig,
-    TrainConfig,
-)
+from langsplat_core.config import ClipConfig, CodecConfig, LiftConfig, TrainConfig
 from langsplat_core.errors import EncoderError, FormatError, InputError
+from langsplat_core.interrupts import raised
+from langsplat_core.io import apart
 from langsplat_core.io.files import write_json
 from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.report import read_report
-from langsplat_core.pipeline.train import train_scene
+from langsplat_core.pipeline.stages import sole_use
+from langsplat_core.pipeline.train import tasks_for, train_captures, train_scene
 from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import assert_same_tree
-from tests.support.processes import python, run, stop_at
+from tests.support.processes import in_this_process, python, refusal, run, stop_at
 from tests.support.tiny_models import tiny_room, tiny_settings
 
 pytestmark = pytest.mark.long
@@ -96,9 +99,6 @@ def test_photographs_become_a_searchable_scene(room, tmp_path):
     result = QueryEngine(scene).run("Red  Mug")  # from the phrasebook: no encoder is loaded
     assert result.relevancy.shape == (3, len(scene.gaussians))
     assert 0 < result.peak < 1
-    assert json.loads((tmp_path / "scene.work" / "report.json").read_text())["views"] == 3
-    again = train_scene(room, out, tiny_settings(room))
-    assert again.warnings == report.warnings  # as they were read from the file
 
 
 STAGES = (
@@ -151,24 +151,13 @@ def test_a_setting_repeats_only_what_depends_on_it(room, trained):
     assert (len(list(work.glob("codec-*.npz"))), len(list(work.glob("latents-*.npz")))) == (3, 4)
 
 
-def cut(data: bytes) -> bytes:
-    return data[:100]
-
-
-def with_another_bit(data: bytes) -> bytes:
-    return data[:-40] + bytes([data[-40] ^ 1]) + data[-39:]
-
-
-@pytest.mark.parametrize(
-    ("name", "damage"),
-    [(name, cut) for name in ("member*/*.npy", "member*/*.npz", "codec-*", "latents-*", "nodes-*")]
-    + [("member*/*.npy", with_another_bit)],
-)
-def test_a_damaged_stage_ends_in_one_line(room, trained, name, damage):
+@pytest.mark.parametrize("name", ["member*/*.npy", "member*/*.npz", "codec-*", "latents-*", "nodes-*", "bit"])
+def test_a_damaged_stage_ends_in_one_line(room, trained, name):
     work = trained.with_name("scene.work")
-    damaged = sorted(work.glob(name))
+    damaged = sorted(work.glob("member*/*.npy" if name == "bit" else name))
     for path in damaged:
-        path.write_bytes(damage(path.read_bytes()))
+        data = path.read_bytes()
+        path.write_bytes(data[:-40] + bytes([data[-40] ^ 1]) + data[-39:] if name == "bit" else data[:100])
     for path in {*work.glob("*.np[yz]"), *work.glob("member*/*")} - set(damaged):
         path.unlink()
     with pytest.raises(FormatError, match="delete it and run again"):
@@ -270,18 +259,6 @@ def test_given_gaussians_are_described_and_not_trained(room, tmp_path):
     assert load_scene(again).metres_per_unit == 0.25
 
 
-def test_profiles_are_defaults_that_options_override():
-    plain = parse(["train", "photos", "--out", "s.ply", "--max-relevancy-error", "0.01"])
-    assert plain.config == replace(TrainConfig(), codec=CodecConfig(max_relevancy_error=0.01))
-    words = ["train", "photos", "--out", "s.ply", "--profile", "paper"]
-    assert parse(words).config == PAPER
-    assert (PAPER.codec.kind, PAPER.codec.latent_dim, PAPER.lift.steps) == ("autoencoder", 3, 30_000)
-    assert (PAPER.lift.mode, PAPER.lift.start) == ("gradient", "zeros-as-published")
-    assert PAPER.masks.crop_layers == 1
-    other = parse([*words[:-2], "--profile=paper", "--codec.latent-dim", "8"])
-    assert other.config == replace(PAPER, codec=replace(PAPER.codec, latent_dim=8))
-
-
 def test_paper_profile_runs(room, tmp_path, capsys):
     out = tmp_path / "scene.ply"
     options = ["--dataset.max-side", 64, "--dataset.test-every", 4, "--radiance.steps", 10]
@@ -358,3 +335,85 @@ def test_query_needs_no_home_locale_or_writable_folder(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)[0]["phrase"] == "book"
     assert sorted(path.suffix for path in folder.iterdir()) == [".json", ".ply", ".safetensors"]
+
+
+# Several captures.
+
+
+class Client(Executor):
+    """A client of Dask, as far as it is used: what it is given and gives back goes through pickle."""
+
+    def __init__(self, address: str) -> None:
+        if address == "nobody:1":
+            raise OSError("Timed out trying to connect")
+
+    def get_executor(self, pure: bool) -> "Client":
+        assert not pure  # it would take a second training for the first
+        return self
+
+    def submit(self, function: Callable, *task: object) -> Future:
+        done, result = Future(), function(*pickle.loads(pickle.dumps(task)))
+        done.set_result(pickle.loads(pickle.dumps(result)))
+        return done
+
+
+def several(room: Path, on: str, out: Path) -> list[object]:
+    options = f"--on={on} --dataset.max-side=64 --radiance.steps=20 --dataset.hold-out=every"
+    return ["train", room, "absent", "--out", out, "--clip.model", room / "encoder", *options.split()]
+
+
+@pytest.mark.parametrize("on", ["local:2", "dask://somewhere:8786"])
+def test_captures_are_trained_whatever_becomes_of_others(room, on, tmp_path, capsys, monkeypatch):
+    if on != "local:2":
+        in_this_process(monkeypatch)
+        monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(Client=Client))
+    assert run(*several(room, on, tmp_path)) == 2
+    printed = capsys.readouterr()
+    rows = {line.split()[0]: line for line in printed.out.splitlines() if line[0] != " "}
+    assert rows["absent"].split()[1:3] + rows["absent"].split()[-1:] == ["-", "-", "2"]
+    measured = read_report(tmp_path / f"{room.name}.work").psnr
+    assert f" 5 of 5   {measured:.2f} dB " in rows[room.name]
+    assert rows[room.name].endswith(" 0")
+    assert printed.err.splitlines()[-1] == "langsplat: 1 of 2 captures have no scene: absent"
+    assert [path.name for path in tmp_path.glob("*.ply")] == [f"{room.name}.ply"]
+    assert not list(tmp_path.glob(".wanted*"))
+
+
+def test_ctrl_c_ends_all_captures_and_keeps_what_they_have(room: Path, tmp_path: Path) -> None:
+    made, heard = tiny_settings(room), list[str]()
+    endless = replace(made, radiance=replace(made.radiance, steps=1_000_000, capped_views=0))
+
+    def stop(at: Report) -> None:
+        heard.append(at.note)
+        if heard.count(f"{room.name}: training Gaussians") == 5:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    ended = train_captures(tasks_for([room], tmp_path, endless, "gaussians"), "local:1", Progress(stop))
+    with pytest.raises(KeyboardInterrupt), raised("langsplat", ""), closing(ended):
+        list(ended)
+    work = tmp_path / f"{room.name}.work"
+    with sole_use(work):  # nobody holds it any more
+        assert list(work.glob("*.checkpoint.safetensors"))
+
+
+def test_lost_processes_and_twins_are_told(room, tmp_path, monkeypatch):
+    def lost(*_: object, **__: object) -> None:
+        raise apart.AbortedError("ended with SIGKILL")
+
+    monkeypatch.setattr(apart, "run", lost)
+    (row,) = train_captures(tasks_for([room], tmp_path, tiny_settings(room), "gaussians"), "local:1")
+    assert (row.code, row.said) == (1, ("its process ended with SIGKILL",))
+    with pytest.raises(InputError, match="rename one of them"):
+        tasks_for([room, tmp_path / room.name], tmp_path, tiny_settings(room), "gaussians")
+
+
+def test_an_engine_that_is_not_there_is_named_with_its_remedy(room, tmp_path, capsys, monkeypatch):
+    for on, distributed, said in (
+        ("local:0", None, "there is local:N"),
+        ("slurm://x", None, "there is local:N"),
+        ("dask://x:1", None, 'pip install "langsplat-viewer[dask]"'),
+        ("dask://nobody:1", SimpleNamespace(Client=Client), "is `dask scheduler` running there?"),
+    ):
+        monkeypatch.setitem(sys.modules, "distributed", distributed)
+        assert said in refusal(capsys, *several(room, on, tmp_path / "scenes"))
+    assert not list(tmp_path.iterdir())

@@ -144,7 +144,7 @@ def test_training_command_is_parsed_by_the_program():
     words = command(TrainingForm("photos", "trained.ply", "s.ply", "demo", "quick"))
     assert words[1:3] == ["-m", "langsplat_core"]
     parsed = parse(words[3:])
-    assert (parsed.dataset, parsed.out) == (Path("photos"), Path("s.ply"))
+    assert (parsed.dataset, parsed.out) == ((Path("photos"),), Path("s.ply"))
     assert (parsed.config.radiance.steps, parsed.config.clip.model) == (500, "demo")
     assert parsed.config.radiance.checkpoint_every == PREVIEW_EVERY
     assert parsed.gaussians == Path("trained.ply")

@@ -186,13 +186,12 @@ def _add_up(rank: int, tiles: Tiles, sums: Sums, out: Array) -> bool:
 
 @helper
 def _clear(i: int, out: GaussianGradients) -> None:
-    for n in range(3):
-        out.means[i, n] = out.log_scales[i, n] = 0
-    for n in range(4):
-        out.quats_wxyz[i, n] = 0
-    for n in range(out.values.shape[1]):
-        out.values[i, n] = 0
-    out.opacity_logits[i] = out.means_px[i, 0] = out.means_px[i, 1] = 0
+    out.means[i] = 0
+    out.log_scales[i] = 0
+    out.quats_wxyz[i] = 0
+    out.opacity_logits[i] = 0
+    out.values[i] = 0
+    out.means_px[i] = 0
 
 
 @helper
@@ -234,35 +233,18 @@ def _with_compensation(by_covariance: cp.Point, a: Array, camera: cp.KernelCamer
 
 
 @helper
-def _quat_gradient(quat: Array, inverse: float, d: Array) -> tuple[float, float, float, float]:
-    """Gradient by the raw quaternion from `d`, that by its rotation matrix."""
+def _quat_gradient(quat: Array, inverse: float, d: Array, out: Array) -> None:
+    """Fill `out`, the gradient by the raw quaternion, from `d`, that by its rotation matrix."""
     w, x, y, z = quat[0] * inverse, quat[1] * inverse, quat[2] * inverse, quat[3] * inverse
-    gw = 2 * (z * (d[1, 0] - d[0, 1]) + y * (d[0, 2] - d[2, 0]) + x * (d[2, 1] - d[1, 2]))
-    gx = 2 * (
-        y * (d[0, 1] + d[1, 0])
-        + z * (d[0, 2] + d[2, 0])
-        + w * (d[2, 1] - d[1, 2])
-        - 2 * x * (d[1, 1] + d[2, 2])
-    )
-    gy = 2 * (
-        x * (d[0, 1] + d[1, 0])
-        + z * (d[1, 2] + d[2, 1])
-        + w * (d[0, 2] - d[2, 0])
-        - 2 * y * (d[0, 0] + d[2, 2])
-    )
-    gz = 2 * (
-        x * (d[0, 2] + d[2, 0])
-        + y * (d[1, 2] + d[2, 1])
-        + w * (d[1, 0] - d[0, 1])
-        - 2 * z * (d[0, 0] + d[1, 1])
-    )
+    xy, xz, yz = d[0, 1] + d[1, 0], d[0, 2] + d[2, 0], d[1, 2] + d[2, 1]
+    by_x, by_y, by_z = d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]  # by the axis of the turn
+    gw = 2 * (z * by_z + y * by_y + x * by_x)
+    gx = 2 * (y * xy + z * xz + w * by_x - 2 * x * (d[1, 1] + d[2, 2]))
+    gy = 2 * (x * xy + z * yz + w * by_y - 2 * y * (d[0, 0] + d[2, 2]))
+    gz = 2 * (x * xz + y * yz + w * by_z - 2 * z * (d[0, 0] + d[1, 1]))
     along = gw * w + gx * x + gy * y + gz * z
-    return (
-        (gw - along * w) * inverse,
-        (gx - along * x) * inverse,
-        (gy - along * y) * inverse,
-        (gz - along * z) * inverse,
-    )
+    out[0], out[1] = (gw - along * w) * inverse, (gx - along * x) * inverse
+    out[2], out[3] = (gy - along * y) * inverse, (gz - along * z) * inverse
 
 
 @helper
@@ -337,8 +319,7 @@ def to_parameters(
         if rank < 0 or not _add_up(rank, tiles, sums, added):
             _clear(i, out)
             continue
-        for channel in range(out.values.shape[1]):
-            out.values[i, channel] = added[MOMENTS + channel]
+        out.values[i] = added[MOMENTS : MOMENTS + out.values.shape[1]]
         du, dv, by_covariance = _footprint_gradient(tiles.geometry[rank], moments)
         out.means_px[i, 0], out.means_px[i, 1] = du, dv
         out.opacity_logits[i] = moments[Q] * (1 - cp.opacity_of(rows.opacity_logits[i]))
@@ -349,6 +330,4 @@ def to_parameters(
         dx, dy, dz = _point_gradient(point, camera, du, dv, by_b)
         for n in range(3):
             out.means[i, n] = dx * r[0, n] + dy * r[1, n] + dz * r[2, n]
-        gw, gx, gy, gz = _quat_gradient(rows.quats_wxyz[i], inverse, by_turn)
-        quat = out.quats_wxyz[i]
-        quat[0], quat[1], quat[2], quat[3] = gw, gx, gy, gz
+        _quat_gradient(rows.quats_wxyz[i], inverse, by_turn, out.quats_wxyz[i])

@@ -182,7 +182,8 @@ def fit_codebook(
     generator = np.random.default_rng(config.seed)
 
     def grow(size: int, start: Array | None) -> Array:
-        progress("codebook", 0.1 + 0.6 * min(size / 2_048, 1), f"{size} codewords")
+        doubled = 1 << (size - 1).bit_length()  # sizes between two powers of 2 come after the larger one
+        progress("codebook", 0.1 + 0.6 * min(doubled / 2_048, 1), f"{size} codewords")
         return rounded(spherical_kmeans(fitted, size, 8 if start is None else 4, start, generator))
 
     def error(codewords: Array) -> float:

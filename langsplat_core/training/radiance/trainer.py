@@ -8,7 +8,7 @@ checkpoint exactly where it stopped.
 import logging
 import math
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,10 +18,10 @@ from torch import Tensor
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.config import GOOD, INRIA, QUICK, RadianceBudget, RadianceConfig, check_settings
-from langsplat_core.datasets.capture import Capture, shrunk_view, surrounded_views
+from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import InputError
 from langsplat_core.interrupts import Terminated, handled
-from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
+from langsplat_core.progress import Progress, WorkCancelledError, silent
 from langsplat_core.scene import Camera, Gaussians, near_plane
 from langsplat_core.training import one_torch_thread
 from langsplat_core.training.radiance import differentiable, losses
@@ -132,11 +132,8 @@ def train_radiance(
     train_indices: Sequence[int],
     checkpoint: Path | None = None,
     progress: Progress = silent,
-    promising: Callable[[Gaussians], bool] = lambda gaussians: True,
 ) -> Gaussians:
     """Fit Gaussians to the photographs at `train_indices`; return those that can be seen.
-
-    Where those after half of the steps are not `promising`, the training ends with them.
 
     With a `checkpoint` path the run continues from that file if it exists, and writes it every
     `config.checkpoint_every` steps, at the end, and when it is interrupted (Ctrl-C, or an error
@@ -174,9 +171,7 @@ def train_radiance(
     signals: list[int] = []  # held back while a step runs: half a step is no state to resume from
     with one_torch_thread(), handled(lambda number, _: signals.append(number)):
         try:
-            while state.step < config.steps and (
-                state.step != config.steps // 2 or promising(_visible(state))
-            ):
+            while state.step < config.steps:
                 recent.append(run.step(state))
                 # Every photograph has another loss: what is told is the mean over each 200th of the run.
                 if state.step * 200 // config.steps > (state.step - 1) * 200 // config.steps:
@@ -190,12 +185,7 @@ def train_radiance(
             if checkpoint:
                 training.save_checkpoint(checkpoint, state, made_from)
             raise
-    return _visible(state)
-
-
-def _visible(state: TrainingState) -> Gaussians:
-    """Return the Gaussians without those that no image can show."""
-    gaussians = state.gaussians()
+    gaussians = state.gaussians()  # without those that no image can show
     return gaussians.take(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= INRIA.alpha_min))
 
 
@@ -363,97 +353,16 @@ def _extent(capture: Capture, gaussians: Gaussians) -> float:
     return max(capture.extent(), 0.05 * distance)
 
 
-# How large a budget a few photographs support.
-#
 # Few photographs can be overfitted, and from some number of steps on they are: views that were held out get
-# worse. That number grows with the photographs (`VISITS`). A budget far above it is rehearsed: some of the
-# training views are held out, and the others trained on with the smallest budget, then with larger ones. The
-# training itself then takes all views. Every budget has the photographs' size: at a smaller one PSNRs are
-# higher, and tell nothing of the size that is asked for.
-
-REHEARSING = "rehearsing"
-LEAST_GAIN = 0.25  # dB, for which thrice the steps are spent: less may be chance
+# worse. That number grows with the photographs (docs/benchmarks/few.md#presets).
 VISITS = 64  # steps for each of few photographs, after which held-out views gain no more
 
 
-def budgets_for(capture: Capture, config: RadianceConfig, views: int) -> list[RadianceBudget]:
-    """Return the ascending budgets that are tried with so many training views.
-
-    The last is all that is asked for, and the only one with many views or few steps; but `good` is cut to
-    `VISITS` of each photograph, with which larger ones begin. Steps grow threefold.
-    """
+def budget_for(capture: Capture, config: RadianceConfig, views: int) -> RadianceBudget:
+    """Return the budget of a training of so many views: what is asked for, or what few of them support."""
     longer_side = max(max(camera.width, camera.height) for camera in capture.cameras)
     whole = RadianceBudget(longer_side, config.steps, config.max_gaussians, config.sh_degree)
-    if views > config.rehearsed_views or config.steps < GOOD.steps:
-        return [whole]
-    budgets = [GOOD._replace(longer_side=longer_side, steps=max(VISITS * views, QUICK.steps)).at_most(whole)]
-    while config.steps > GOOD.steps and 3 * budgets[-1].steps < config.steps:
-        budgets.append(whole._replace(steps=3 * budgets[-1].steps))
-    return [*budgets, whole] if config.steps > GOOD.steps else budgets
-
-
-def budget_text(budget: RadianceBudget) -> str:
-    """Return the budget as messages and reports name it."""
-    return f"{budget.steps} steps at {budget.longer_side} px"
-
-
-def rehearse(
-    capture: Capture,
-    config: RadianceConfig,
-    budgets: Sequence[RadianceBudget],
-    train_indices: Sequence[int],
-    checkpoints: Path | None = None,
-    progress: Progress = silent,
-) -> list[list[float]]:
-    """Train with ascending budgets without three of the views at `train_indices`, and score these.
-
-    Returns for each budget, until the second in a row does not pay, the PSNRs (dB, exposures fitted) of the
-    held-out views. A training that is behind the best budget after half of its steps ends there: from then on
-    held-out views gain a third of a decibel at most. Empty where there is nothing to decide: one budget, or
-    so few views that none can be held out.
-
-    With a folder for `checkpoints` an interrupted rehearsal goes on where it stopped.
-    """
-    every = max(3, min(8, len(train_indices) // 3))
-    rows = surrounded_views([capture.cameras[index] for index in train_indices], every)[:3]
-    if len(budgets) < 2 or not rows:
-        return []
-    held_out = [train_indices[row] for row in rows]
-    train = [index for index in train_indices if index not in held_out]
-    found: list[list[float]] = []
-
-    def scores(gaussians: Gaussians) -> list[float]:
-        views = differentiable.evaluate_views(gaussians, capture, held_out, config.backend, near=config.near)
-        return [view.psnr_exposed or view.psnr for view in views]
-
-    def gains(gaussians: Gaussians) -> bool:
-        return not found or bool(np.mean(scores(gaussians)) > np.mean(found[supported(found)]))
-
-    for index, budget in enumerate(budgets):
-        part = _steps_alone(progress, f"{REHEARSING} {budget_text(budget)}")
-        at = checkpoints and checkpoints / f"{index}.safetensors"
-        spent = config.spending(budget)
-        found.append(scores(train_radiance(capture, spent, train, at, part, gains)))
-        if index - supported(found) == 2:
-            break
-    return found
-
-
-def _steps_alone(progress: Progress, stage: str) -> Progress:
-    """Progress of the steps alone, as a stage: depths, found in seconds, would count as the whole."""
-
-    def show(report: Report) -> None:
-        if report.stage == STAGE:
-            progress.show(replace(report, stage=stage))
-
-    return Progress(show)
-
-
-def supported(found: Sequence[Sequence[float]]) -> int:
-    """Return the last of the budgets with the scores of `rehearse` that pays over the best before it."""
-    best = 0
-    for index in range(1, len(found)):
-        gains = np.subtract(found[index], found[best])
-        if gains.mean() >= LEAST_GAIN and np.median(gains) > 0:
-            best = index
-    return best
+    if views > config.capped_views or config.steps < GOOD.steps:
+        return whole
+    capped = GOOD._replace(longer_side=longer_side, steps=max(VISITS * views, QUICK.steps))
+    return RadianceBudget(*map(min, capped, whole))

@@ -8,6 +8,7 @@ import torch
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig
+from langsplat_core.progress import Progress
 from langsplat_core.scene import (
     NO_NODE,
     Codec,
@@ -150,7 +151,10 @@ def test_codebook_is_the_smallest_within_its_error_budget() -> None:
     vectors, _ = clusters(100, 20, noise=0.01)
     sizes = []
     for budget in (0.15, 0.06, 0.02):
-        made = fit_codebook(vectors, CodecConfig(max_relevancy_error=budget), WORDS)
+        shares = [0.0]
+        told = Progress(lambda at, shares=shares: shares.append(at.fraction))
+        made = fit_codebook(vectors, CodecConfig(max_relevancy_error=budget), WORDS, told)
+        assert shares == sorted(shares)
         sizes.append(made.size)
         # judged on all vectors, chosen by a fifth of them
         assert codec_report(made, vectors, WORDS).error_mean < 1.05 * budget

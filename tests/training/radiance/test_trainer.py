@@ -1,4 +1,4 @@
-"""Radiance training on a tiny scene drawn by the reference rasterizer: schedule, whole runs, rehearsals."""
+"""Radiance training on a tiny scene drawn by the reference rasterizer: schedule, whole runs, budgets."""
 
 import math
 from dataclasses import replace
@@ -22,21 +22,13 @@ from langsplat_core.config import (
 )
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError, InputError
-from langsplat_core.progress import Progress, Report, WorkCancelledError
+from langsplat_core.progress import Progress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Gaussians, Scene, look_at
 from langsplat_core.training.radiance.differentiable import CpuRenderer, evaluate_views, renderer_for
 from langsplat_core.training.radiance.state import PARAMETERS, initial_gaussians, start
 from langsplat_core.training.radiance.stereo import STAGE
-from langsplat_core.training.radiance.trainer import (
-    REHEARSING,
-    VISITS,
-    budgets_for,
-    rehearse,
-    schedule_for,
-    supported,
-    train_radiance,
-)
+from langsplat_core.training.radiance.trainer import VISITS, budget_for, schedule_for, train_radiance
 from tests.support.scenes import SHORT, SIZE, capture, picture, truth
 
 
@@ -203,7 +195,7 @@ def test_few_views_alone_use_depths(few_views: int) -> None:
     assert (STAGE in stages) == (few_views == 3)
 
 
-# Rehearsals: budgets that few photographs support, decided by views held out of the training views.
+# Budgets that few photographs support, and scores.
 
 
 def noise(side: int = 24, views: int = 8) -> Capture:
@@ -216,44 +208,20 @@ def noise(side: int = 24, views: int = 8) -> Capture:
     return Capture(tuple(cameras), tuple(images), points, np.full(points.shape, 128, np.uint8))
 
 
-def test_presets_are_cut_and_rehearsed_with_few_views_only() -> None:
-    def tried(config: TrainConfig, views: int = 9) -> list[RadianceBudget]:
-        return budgets_for(noise(config.dataset.max_side, 1), config.radiance, views)
+def test_presets_are_capped_with_few_views_only() -> None:
+    def spent(config: TrainConfig, views: int = 9) -> RadianceBudget:
+        return budget_for(noise(config.dataset.max_side, 1), config.radiance, views)
 
-    assert tried(with_preset(TrainConfig(), "quick")) == [QUICK]
+    assert spent(with_preset(TrainConfig(), "quick")) == QUICK
     good = with_preset(TrainConfig(), "good")
-    assert tried(good) == [GOOD._replace(steps=9 * VISITS)]
-    assert tried(good, 2) == [GOOD._replace(steps=QUICK.steps)]
+    assert spent(good) == GOOD._replace(steps=9 * VISITS)
+    assert spent(good, 2) == GOOD._replace(steps=QUICK.steps)
+    assert spent(TrainConfig()) == RadianceBudget(800, 9 * VISITS, 60_000, 1)
     whole = RadianceBudget(800, 30_000, 1_000_000, 3)
-    larger = [whole._replace(steps=9 * VISITS * factor) for factor in (3, 9, 27)]
-    assert tried(TrainConfig()) == [RadianceBudget(800, 9 * VISITS, 60_000, 1), *larger, whole]
-    assert tried(TrainConfig(), RadianceConfig.rehearsed_views + 1) == [whole]
-    assert tried(TrainConfig(radiance=RadianceConfig(rehearsed_views=0))) == [whole]
+    assert spent(TrainConfig(), RadianceConfig.capped_views + 1) == whole
+    assert spent(TrainConfig(radiance=RadianceConfig(capped_views=0))) == whole
     small = RadianceConfig(steps=1_500, max_gaussians=5_000, sh_degree=0)
-    assert budgets_for(noise(200, 1), small, 24) == [RadianceBudget(200, 1_500, 5_000, 0)]
-    assert rehearse(noise(), RadianceConfig(), [QUICK, GOOD], [0, 4, 7]) == []
-    assert rehearse(noise(), RadianceConfig(), [QUICK], range(8)) == []
-
-
-@pytest.mark.parametrize(
-    ("scores", "best"),
-    [
-        ([[20.0, 18.0, 15.0], [20.2, 18.2, 15.2], [21.0, 18.1, 15.4], [19.5, 18.0, 15.0]], 2),
-        ([[20.0, 18.0, 15.0], [19.9, 17.9, 20.0], [20.0, 18.1, 15.0]], 0),  # one view alone gains
-        ([[20.0], [19.0], [20.3]], 2),  # past a bad one
-        ([], 0),
-    ],
-)
-def test_larger_budgets_are_supported_where_most_views_gain(scores: list[list[float]], best: int) -> None:
-    assert supported(scores) == best
-
-
-@pytest.mark.parametrize("promising", [True, False])
-def test_unpromising_training_ends_halfway(promising: bool) -> None:
-    steps: list[float] = []
-    told = Progress(lambda at: steps.append(at.fraction))
-    train_radiance(noise(), replace(SHORT, few_views=0, steps=4), range(4), None, told, lambda _: promising)
-    assert steps == [1 / 7, 3 / 7, 5 / 7, 1.0][: 4 if promising else 2]  # one of them on halved images
+    assert budget_for(noise(200, 1), small, 24) == RadianceBudget(200, 1_500, 5_000, 0)
 
 
 def some_gaussians(scale: float) -> Gaussians:
@@ -277,26 +245,3 @@ def test_small_scores_compare_shrunk_images() -> None:
         expected = psnr(*(one[:, :columns] / 255 for one in small))
         assert score.psnr_small == pytest.approx(expected, abs=0.01)
         assert expected > score.psnr + 1  # of noise
-
-
-@pytest.mark.long
-def test_an_interrupted_rehearsal_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
-    config = RadianceConfig(steps=36, reference_steps=36, backend="cpu", sh_degree=0, max_gaussians=200)
-    job = noise(), config, [RadianceBudget(24, steps, 200, 0) for steps in (12, 24, 36, 48)], range(8)
-    reports: list[Report] = []
-
-    def stop(at: Report) -> None:
-        reports.append(at)
-        if at.stage.endswith("24 steps at 24 px") and at.fraction > 0.25:
-            raise WorkCancelledError
-
-    straight = rehearse(*job)
-    assert [len(scores) for scores in straight] in ([3] * 3, [3] * 4)  # of noise: nothing pays
-    with pytest.raises(WorkCancelledError):
-        rehearse(*job, tmp_path, Progress(stop))
-    assert len(list(tmp_path.iterdir())) > 1
-    assert {report.stage for report in reports} == {f"{REHEARSING} {n} steps at 24 px" for n in (12, 24)}
-    assert reports[0].fraction < 0.1
-    again: list[Report] = []
-    assert rehearse(*job, tmp_path, Progress(again.append)) == straight
-    assert again[0].fraction >= 0.25
