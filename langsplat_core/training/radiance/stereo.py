@@ -62,12 +62,12 @@ def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = s
     ]
     maps: list[DepthMap] = []
     for index, others in enumerate(neighbouring_views(small.cameras, capture.points)):
+        progress(STAGE, index / len(small))  # before the first: else the stage before seems to go on
         if others:
             depth, score = sweep(index, others, small.cameras, greys, capture.points)
             depth = np.where(masks[index], depth, np.nan)
             free = np.zeros_like(depth)
             maps.append(DepthMap(small.cameras[index], depth, free, score, small.images[index]))
-        progress(STAGE, (index + 1) / len(small))
     found: list[DepthMap] = []
     for index, one in enumerate(maps):
         progress(f"{STAGE} that agree", index / len(maps))

@@ -189,10 +189,10 @@ def test_training_ignores_transients(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("few_views", [2, 3])
 def test_few_views_alone_use_depths(few_views: int) -> None:
-    stages: list[str] = []
-    told = Progress(lambda at: stages.append(at.stage))
+    begun: list[tuple[str, float]] = []
+    told = Progress(lambda at: begun.append((at.stage, at.fraction)))
     train_radiance(capture(), replace(SHORT, steps=2, few_views=few_views), [0, 1, 2], progress=told)
-    assert (STAGE in stages) == (few_views == 3)
+    assert ((STAGE, 0.0) in begun) == (few_views == 3)
 
 
 # Budgets that few photographs support, and scores.
