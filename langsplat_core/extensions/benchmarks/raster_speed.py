@@ -34,14 +34,13 @@ from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.rasterizer import create_egl_context
-from langsplat_core.raster.protocol import LiftingView, Rasterizer
+from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.raster.reference import Footprints, ReferenceView, project, rim
 from langsplat_core.scene import Camera, Gaussians, look_at
 
 Pixels = Annotated[int, Range(1, 65_536)]
 Size = tuple[Pixels, Pixels]  # width and height of an image
 Channels = Annotated[int, Range(1, 4_096)]  # values per Gaussian
-GRIDS = ((16, 12), (8, 6), (4, 3))  # cells of subparts, parts and wholes: 252 labels in all
 WINDOW = 64  # pixels a side
 _PLACES = ((0.5, 0.5), (0.3, 0.42), (0.64, 0.7))  # centres of the windows, as fractions of the image
 _BAND = 1e-3  # relative distance to a cut-off; float32 footprints of a GPU are within about 3e-4 of it
@@ -50,7 +49,6 @@ _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _NOTES = """- The size with most scenes and the most channels; every other measurement is in raster.json.
 - ms: median of the calls after the first.
 - frame: project + splat with a camera that has moved since the last frame.
-- labels: W^T onehot of label maps with 252 regions at three levels; `channels` plays no part.
 - MiB: rise of the process's resident set at its highest during the first call.
 - Errors: against the float64 reference on three windows of 64x64 pixels, values in [0, 1); of `backward`,
   that of the derivatives by the values.
@@ -302,32 +300,6 @@ def _operations(backend: Rasterizer, case: Case, channels: int) -> Iterator[_Ope
             lambda: backward(image),
             lambda exact: exact.gather_error(lambda y: backward(y).values, image),
         )
-    if isinstance(view, LiftingView):
-        yield _labels(view, camera)
-
-
-def _labels(view: LiftingView, camera: Camera) -> _Operation:
-    """Gathering of label maps of three levels (`GRIDS`), with as many regions as a segmenter finds."""
-    maps, count = label_maps(camera)
-
-    def error(exact: "ReferenceWindows") -> Error:
-        compared = exact.masked(np.ones((camera.height, camera.width, 1), np.float32))[..., 0] > 0
-        kept = np.where(compared, maps, -1)
-        image = np.stack([(kept == label).any(0) for label in range(count)], -1).astype(np.float32)
-        return exact.gather_error(lambda _: view.gather_labels(kept, count).toarray(), image)
-
-    return "labels", lambda: view.gather_labels(maps, count), error
-
-
-def label_maps(camera: Camera) -> tuple[Array, int]:
-    """(3, H, W) int32 labels of three grids of cells, and how many labels there are."""
-    row, column = np.mgrid[: camera.height, : camera.width]
-    maps, first = [], 0
-    for across, down in GRIDS:
-        cell = row * down // camera.height * across + column * across // camera.width
-        maps.append(first + cell)
-        first += across * down
-    return np.stack(maps).astype(np.int32), first
 
 
 def _timed(call: Callable[[], Any]) -> tuple[float, float | None]:
