@@ -20,8 +20,8 @@ GROUP = "langsplat.extensions"
 HIDDEN = "LANGSPLAT_WITHOUT"  # environment: names of extensions, separated by commas, that are not loaded
 
 Kind = Literal[
-    "commands", "groups", "formats", "importers", "exporters", "encoders", "segmenters", "layouts",
-    "mask_sources", "panels",
+    "commands", "groups", "formats", "importers", "exporters", "encoders", "segmenters", "text_segmenters",
+    "layouts", "mask_sources", "panels",
 ]  # fmt: skip
 References = Mapping[str, str]
 
@@ -37,6 +37,7 @@ class Extension:
     exporters: References = field(default_factory=dict)  # word of `convert --to` -> io.scenes.Exporter
     encoders: References = field(default_factory=dict)  # `model_type` of config.json -> encoders.Family
     segmenters: References = field(default_factory=dict)  # `model_type` -> function of Weights to a Segmenter
+    text_segmenters: References = field(default_factory=dict)  # `model_type` -> function to a TextSegmenter
     layouts: References = field(default_factory=dict)  # name -> semantics.weights.Layout
     mask_sources: References = field(default_factory=dict)  # `--masks.source` -> function to a MaskSource
     panels: References = field(default_factory=dict)  # title -> langsplat_viewer.panels.layout.Panel

@@ -318,16 +318,24 @@ class TorchText:
         self.dim = dim
         self.temperature = TEMPERATURE
         self._device, self._output = weights.device, output
-        self._length = int(config.max_position_embeddings)
+        text = getattr(config, "text_config", config)
+        self._length = int(text.max_position_embeddings)
         self._model: Any = models.load_model(kind, weights, config)
-        self.tokenizer = _tokenizer(weights, int(config.vocab_size))
+        self.tokenizer = _tokenizer(weights, int(text.vocab_size))
         special = partial(_special_token, weights, self.tokenizer)
         self._begin = [special("bos_token", (begin,))] if begin else []
         self._end = [special("eos_token", ("<|endoftext|>", "</s>", "<eos>"))] if self.ends else []
         own = self.padded or not self.ends
-        self._pad = special("pad_token", ("<pad>", "</s>")) if own else self._end[0]
+        self._pad = special("pad_token", ("<pad>", "</s>", "<|endoftext|>")) if own else self._end[0]
 
     def encode(self, texts: list[str]) -> Array:
+        ids, mask = self.tokens(texts)
+        # What follows the end token of a CLIP is not seen by it; without one, padding is masked.
+        masked = {} if self.ends else {"attention_mask": mask}
+        return inferred(lambda: getattr(self._model(input_ids=ids, **masked), self._output))
+
+    def tokens(self, texts: list[str]) -> tuple[Any, Any]:
+        """Return the (B, L) int64 tokens of B phrases, and likewise 1 where they are no padding, else 0."""
         import torch
 
         plain = [clean_text(text) for text in texts]
@@ -336,11 +344,10 @@ class TorchText:
         room = self._length - len(self._begin) - len(self._end)
         for text, row in zip(plain, found, strict=True):
             check_whole(text, row.ids, room, {*self._end, self._pad})
-        # What follows the end token of a CLIP is not seen by it; without one, padding is masked.
         length = self._length if self.padded else max(map(len, rows))
-        ids = torch.tensor([row + [self._pad] * (length - len(row)) for row in rows]).to(self._device)
-        mask = {} if self.ends else {"attention_mask": (ids != self._pad).long()}
-        return inferred(lambda: getattr(self._model(input_ids=ids, **mask), self._output))
+        ids = [row + [self._pad] * (length - len(row)) for row in rows]
+        mask = [[int(place < len(row)) for place in range(length)] for row in rows]
+        return torch.tensor(ids).to(self._device), torch.tensor(mask).to(self._device)
 
 
 def _tokenizer(weights: Weights, vocabulary: int) -> Any:

@@ -6,7 +6,7 @@ the mask generator of segment-anything, with the settings of LangSplat's public 
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from math import ceil
@@ -19,9 +19,10 @@ from PIL import Image
 from langsplat_core import registry
 from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
-from langsplat_core.errors import InputError
+from langsplat_core.errors import EncoderError, InputError, optional_imports
 from langsplat_core.progress import Progress
 from langsplat_core.semantics import weights as models
+from langsplat_core.semantics.encoders import TorchText
 from langsplat_core.semantics.masks import (
     GraphMasks,
     LevelMasks,
@@ -81,6 +82,13 @@ class Segmenter(Protocol):
 
     def encode(self, image: Array) -> EncodedImage:
         """Show the model an image (H, W, 3) uint8 once."""
+
+
+class TextSegmenter(Protocol):
+    """A model that outlines what a phrase names."""
+
+    def segment(self, image: Array, phrases: Sequence[str]) -> Array:
+        """(H, W, 3) uint8 -> (H, W, P) bool: pixels of all that each phrase names, seen in one pass."""
 
 
 def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
@@ -149,10 +157,61 @@ def load_sam2(weights: Weights) -> Sam:
     return Sam("SAM 2", model, int(model.config.prompt_encoder_config.image_size), ordered=False)
 
 
+SAM3_PIXELS = (127.5,) * 3, (127.5,) * 3
+SAM3_FOUND = 0.5  # score of an instance that is there, as in Meta's own code
+
+
+class Sam3Text(TorchText):
+    """The half of a SAM 3 that outlines all that a short noun phrase names; a `TextSegmenter`."""
+
+    padded = True
+
+    def __init__(self, weights: Weights, name: str = "Sam3") -> None:
+        """name: what the model's classes in transformers begin with."""
+        import transformers
+
+        with models.loading_errors(weights.id, "SAM 3"):
+            kind, settings = getattr(transformers, f"{name}Model"), getattr(transformers, f"{name}Config")
+        config = models.load_config(settings, weights, "SAM 3")  # of the model for films that of its detector
+        super().__init__(kind, weights, config, "", 0, "<|startoftext|>")
+        self._length = min(self._length, 32)  # as its processor pads
+        self._side = int(config.image_size)
+        self._read: dict[str, tuple[Any, Any]] = {}  # what the model makes of phrases, and their masks
+
+    @models.asking_errors("the segmenter")
+    def segment(self, image: Array, phrases: Sequence[str]) -> Array:
+        """See `TextSegmenter`."""
+        import torch
+
+        pixels, _ = normalised(image, self._side, padded=False, statistics=SAM3_PIXELS)
+        with torch.inference_mode():
+            seen = self._model.get_vision_features(torch.from_numpy(pixels).to(self._device))
+            return np.stack([self._outlined(seen, phrase, image.shape[:2]) for phrase in phrases], -1)
+
+    def _outlined(self, seen: Any, phrase: str, shape: tuple[int, int]) -> Array:
+        """Return (H, W) bool of `shape`: the union of the instances that are found, of an image `seen`."""
+        from torch.nn.functional import interpolate
+
+        if phrase not in self._read:
+            ids, mask = self.tokens([phrase])
+            self._read[phrase] = self._model.get_text_features(ids, mask, return_dict=True), mask
+        texts, mask = self._read[phrase]
+        found = self._model(vision_embeds=seen, text_embeds=texts, attention_mask=mask)
+        scores = found.pred_logits[0].sigmoid() * found.presence_logits[0].sigmoid()
+        inside = np.zeros(shape, bool)
+        for logits in found.pred_masks[0, scores > SAM3_FOUND]:  # one at a time: there may be 200
+            share = interpolate(logits.sigmoid()[None, None], shape, mode="bilinear", align_corners=False)
+            inside |= (share[0, 0] > 0.5).cpu().numpy()
+        return inside
+
+
 # Loading by hub id, folder or file: a new family is a function above and one row here.
 
 FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by `model_type` of config.json
     {"sam": load_sam, "sam2": load_sam2, "sam2_video": load_sam2}
+)
+TEXT_FAMILIES: Mapping[str, Callable[[Weights], TextSegmenter]] = MappingProxyType(
+    {"sam3": Sam3Text, "sam3_video": Sam3Text, "sam3_lite_text": partial(Sam3Text, name="Sam3LiteText")}
 )
 HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven times as large
 
@@ -161,6 +220,13 @@ def load_segmenter(model: str, device: str = "auto") -> Segmenter:
     """Load `model`: a folder in Hugging Face layout, a file of segment_anything or sam2, or a hub id."""
     weights = models.open_weights(model, models.weights_path(model, "--masks.sam"), device)
     return models.family_of(weights, FAMILIES, "segmenters")(weights)
+
+
+@optional_imports(EncoderError)
+def load_text_segmenter(model: str, device: str = "auto") -> TextSegmenter:
+    """Load `model`, which outlines what phrases name: a folder in Hugging Face layout or a hub id."""
+    weights = models.open_weights(model, models.weights_path(model, "--segmenter"), device)
+    return models.family_of(weights, TEXT_FAMILIES, "text_segmenters")(weights)
 
 
 def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:

@@ -11,7 +11,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from langsplat_core import registry
 from langsplat_core.errors import EncoderError
@@ -144,7 +144,7 @@ def weight_files(folder: Path) -> list[Path]:
 # Building a model: transformers fills with random numbers what its configuration has and its weights lack.
 
 
-def family_of(weights: Weights, families: Mapping[str, T], kind: Literal["encoders", "segmenters"]) -> T:
+def family_of(weights: Weights, families: Mapping[str, T], kind: registry.Kind) -> T:
     """Return the row of what config.json names: one of `families`, or of an extension's `kind`."""
     if weights.converted:
         named = str(weights.converted.config["model_type"])
@@ -158,8 +158,8 @@ def family_of(weights: Weights, families: Mapping[str, T], kind: Literal["encode
         return families[named]
     more = registry.references(kind)
     if named not in more:
-        known = ", ".join((*families, *more))
-        raise EncoderError(f"{weights.id}: {named!r} is none of the {kind} known here, which are {known}")
+        what, known = kind.replace("_", " "), ", ".join((*families, *more))
+        raise EncoderError(f"{weights.id}: {named!r} is none of the {what} known here, which are {known}")
     return cast("T", registry.part(kind, named))
 
 
@@ -225,7 +225,12 @@ def load_model(kind: Any, weights: Weights, config: Any) -> Any:
     wrong = sorted(report["missing_keys"]) or sorted(str(key[0]) for key in report["mismatched_keys"])
     if not wrong:
         halves = {name.partition(".")[0] for name in model.state_dict()}
-        more = (name for name in report["unexpected_keys"] if name.partition(".")[0] in halves)
+        outer = f"{model.base_model_prefix}."  # before a half's names where the whole model was saved
+        more = (
+            name
+            for name in report["unexpected_keys"]
+            if {name.partition(".")[0], name.removeprefix(outer).partition(".")[0]} & halves
+        )
         layer = re.compile(r"(?:layers|blocks)\.\d+\.")
         wrong = sorted(name for name in more if weights.converted or layer.search(name))
     if wrong:

@@ -25,6 +25,8 @@ from transformers import (
     Sam2VideoConfig,
     Sam2VideoModel,
     Sam2VisionConfig,
+    Sam3LiteTextConfig,
+    Sam3LiteTextModel,
     Sam3VideoConfig,
     Sam3VideoModel,
     SamConfig,
@@ -87,16 +89,19 @@ def change_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     path.write_text(json.dumps(content), encoding="utf-8")
 
 
-def tiny_clip(folder: Path, half: bool = False) -> CLIPModel:
-    """A CLIP of two narrow layers that spells. It reads every everyday phrase whole, and no marks."""
+def spelling_text(folder: Path, length: int) -> dict[str, Any]:
+    """Settings of a CLIP's text tower of two narrow layers that spells, and its tokenizer in the folder."""
     letters = ascii_lowercase + digits
     tokens = ["<|startoftext|>", "<|endoftext|>", *letters, *(f"{letter}</w>" for letter in letters)]
-    tokenizer = CLIPTokenizer(vocab={token: i for i, token in enumerate(tokens)}, merges=[])
-    tokenizer.save_pretrained(folder)
-    text = TOWER | {"vocab_size": len(tokens), "max_position_embeddings": 40}
-    text |= {"bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1}
+    CLIPTokenizer(vocab={token: i for i, token in enumerate(tokens)}, merges=[]).save_pretrained(folder)
+    text = TOWER | {"vocab_size": len(tokens), "max_position_embeddings": length}
+    return text | {"bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1}
+
+
+def tiny_clip(folder: Path, half: bool = False) -> CLIPModel:
+    """A CLIP of two narrow layers that spells. It reads every everyday phrase whole, and no marks."""
     vision = TOWER | {"image_size": SIDE, "patch_size": 8}
-    config = CLIPConfig(text_config=text, vision_config=vision, projection_dim=24)
+    config = CLIPConfig(text_config=spelling_text(folder, 40), vision_config=vision, projection_dim=24)
     return _saved(CLIPModel, config, folder, 0, lambda model: model.half() if half else None).float()
 
 
@@ -238,8 +243,8 @@ def tiny_sam2_video(folder: Path) -> Sam2VideoModel:
     return _saved(Sam2VideoModel, config, folder, 4, _tell_points_apart)
 
 
-def tiny_sam3(folder: Path) -> Sam3VideoModel:
-    """The whole of a SAM 3, as the hub has it: a detector, and a tracker with a neck of its own."""
+def _detector(folder: Path, length: int) -> dict[str, Any]:
+    """Settings of the half of a SAM 3 that reads phrases of so many tokens."""
     encoder = TOWER | {"image_size": SAM_SIDE, "patch_size": 16, "window_size": 2, "global_attn_indexes": [1]}
     vision = {
         "backbone_config": encoder | {"model_type": "sam3_vit_model", "pretrain_image_size": SAM_SIDE // 2},
@@ -248,15 +253,34 @@ def tiny_sam3(folder: Path) -> Sam3VideoModel:
     }
     layer = {"hidden_size": 16, "num_attention_heads": 2, "num_layers": 1, "intermediate_size": 16}
     parts = ("geometry_encoder_config", "detr_encoder_config", "detr_decoder_config", "mask_decoder_config")
-    text = TOWER | {"vocab_size": 9, "max_position_embeddings": 8}
-    detector = {"vision_config": vision, "text_config": text} | dict.fromkeys(parts, layer)
-    tracker = MEMORY | {"prompt_encoder_config": PROMPTS, "mask_decoder_config": DECODER}
-    config = Sam3VideoConfig(detector_config=detector, tracker_config=tracker | {"vision_config": vision})
+    towers = {"vision_config": vision, "text_config": spelling_text(folder, length)}
+    return towers | dict.fromkeys(parts, layer)
+
+
+def _sure(detector: Any) -> None:
+    """Let a detector find much, and all of it somewhere else."""
+    for parameter in detector.parameters():
+        parameter.add_(torch.randn_like(parameter) * 0.2)
+    detector.detr_decoder.presence_head.layer3.bias.fill_(9)
+
+
+def tiny_sam3_lite(folder: Path) -> Sam3LiteTextModel:
+    """A SAM 3 with the text encoder of a MobileCLIP; phrases of 16 tokens."""
+    return _saved(Sam3LiteTextModel, Sam3LiteTextConfig(**_detector(folder, 16)), folder, 14, _sure)
+
+
+def tiny_sam3(folder: Path) -> Sam3VideoModel:
+    """The whole of a SAM 3, as the hub has it: a detector, and a tracker with a neck of its own."""
+    detector = _detector(folder, 40)
+    tracker = {"prompt_encoder_config": PROMPTS, "mask_decoder_config": DECODER}
+    tracker |= MEMORY | {"vision_config": detector["vision_config"]}
+    config = Sam3VideoConfig(detector_config=detector, tracker_config=tracker)
     torch.manual_seed(8)
     model = Sam3VideoModel(config).eval()
     with torch.no_grad():
         _tell_points_apart(model.tracker_model)
         model.tracker_model.no_memory_embedding.normal_()
+        _sure(model.detector_model)
     config.save_pretrained(folder)  # save_pretrained of the model names what is the tracker's otherwise
     save_file(model.state_dict(), folder / "model.safetensors", {"format": "pt"})
     return model

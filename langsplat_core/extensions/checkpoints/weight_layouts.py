@@ -36,7 +36,7 @@ from langsplat_core.semantics.encoders import (
     clean_text,
     torch_clip_images,
 )
-from langsplat_core.semantics.sam import Sam
+from langsplat_core.semantics.sam import SAM3_PIXELS, Sam
 from langsplat_core.semantics.weights import (
     OPEN_CLIP_CONFIG,
     Converted,
@@ -589,4 +589,4 @@ def load_sam3(weights: Weights) -> Sam:
     neck = model.vision_encoder.neck
     neck.fpn_layers = neck.fpn_layers[: len(model.backbone_feature_sizes)]
     side = int(model.config.prompt_encoder_config.image_size)
-    return Sam("SAM 3", model, side, ordered=False, statistics=((127.5,) * 3, (127.5,) * 3))
+    return Sam("SAM 3", model, side, ordered=False, statistics=SAM3_PIXELS)

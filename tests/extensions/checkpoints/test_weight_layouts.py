@@ -32,7 +32,7 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.extensions.checkpoints.weight_layouts import Hiera, converted
 from langsplat_core.semantics.encoders import CLIP_PIXELS, load_encoder, load_text_encoder
 from langsplat_core.semantics.features import embed_regions
-from langsplat_core.semantics.sam import FAMILIES, Segmenter, load_segmenter
+from langsplat_core.semantics.sam import FAMILIES, Segmenter, load_segmenter, load_text_segmenter
 from langsplat_core.semantics.weights import Weights
 from tests.support.tiny_models import (
     LENGTH,
@@ -44,6 +44,7 @@ from tests.support.tiny_models import (
     tiny_sam,
     tiny_sam2,
     tiny_sam3,
+    tiny_sam3_lite,
     tiny_siglip,
     tiny_tipsv2,
 )
@@ -510,3 +511,21 @@ def test_sam_3_sees_images_as_its_tracker_does(tmp_path: Path) -> None:
     areas = (logits > 0).flatten(2).sum(2)
     assert (areas[:, :-1] <= areas[:, 1:]).all()
     assert (logits[0] - logits[1]).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("make", [tiny_sam3, tiny_sam3_lite])
+def test_sam_3_outlines_phrases_as_its_processor_asks(make: Callable[[Path], Any], tmp_path: Path) -> None:
+    model, image = make(tmp_path), np.ascontiguousarray(crops()[0][:20])
+    detector, reader = getattr(model, "detector_model", model), CLIPTokenizer.from_pretrained(tmp_path)
+    square = Image.fromarray(image).resize((SAM_SIDE, SAM_SIDE), Image.Resampling.BILINEAR)
+    pixels = torch.from_numpy((np.asarray(square) / 127.5 - 1).transpose(2, 0, 1)[None].astype(np.float32))
+    phrases, length = ["red mug", "apple"], min(32, detector.config.text_config.max_position_embeddings)
+    masks = load_text_segmenter(str(tmp_path), "cpu").segment(image, phrases)
+    for phrase, mask in zip(phrases, np.moveaxis(masks, 2, 0), strict=True):
+        asked = reader(phrase, padding="max_length", max_length=length, return_tensors="pt")
+        with torch.inference_mode():
+            found = detector(pixels, input_ids=asked["input_ids"], attention_mask=asked["attention_mask"])
+        there = (found.pred_logits.sigmoid() * found.presence_logits.sigmoid())[0] > 0.5
+        full = torch.nn.functional.interpolate(found.pred_masks.sigmoid(), image.shape[:2], mode="bilinear")
+        assert (mask == (full[0, there] > 0.5).any(0).numpy()).mean() > 0.99
+        assert 0 < there.sum() < len(there)
