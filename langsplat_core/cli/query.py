@@ -1,9 +1,9 @@
 """`langsplat query` and `select`: where in a scene a phrase is true, and that alone as a scene of its own."""
 
+import logging
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,15 +26,17 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.lookup import PLANES, PeakPixels, decoded_relevancy, peak_pixel, splatted_relevancy
-from langsplat_core.query.selection import of_rows
+from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.selection import of_rows, shares_in_masks
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.cpu.rasterizer import CpuView
-from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, View
+from langsplat_core.raster.protocol import CHANNELS_AT_ONCE
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_core.semantics.sam import load_text_segmenter
+
+log = logging.getLogger("langsplat")
 
 # Answers in lines and as JSON, and places in images as users give them; other commands print so too.
 
@@ -153,6 +155,7 @@ def camera_of(scene: Scene, index: int) -> Camera:
 
 PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
 NOT_DECODED = "--mode paper decodes pixels, and what was shown is compared with regions; leave it out"
+_PHOTOGRAPHS = arguments.Needs("_sees", "--why or --segmenter")
 
 
 @dataclass(frozen=True)
@@ -169,8 +172,8 @@ class QueryScene:
     mode: Literal["splat", "paper"] = "splat"
     """splat: relevancy per Gaussian, then blended. paper: latents blended, every pixel decoded, and phrases
     asked whole, without looking for structure such as "lid of the teapot"."""
-    camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
-    """Training view in which the pixel is reported."""
+    camera: Annotated[CountOrZero | None, tyro.conf.arg(metavar="INDEX")] = None
+    """Training view in which the pixel is reported: by default the first, and of up to 32 phrases."""
     encoder: arguments.EncoderOption = ""
     instances: CountOrZero = 5
     """How many of a phrase's things are listed, the best first."""
@@ -178,10 +181,13 @@ class QueryScene:
     why: arguments.OutFile | None = None
     """Draw the evidence here, *.png: the photographs and masks that the best region of each answer stands on,
     best and worst. --json then has it, too."""
-    work: Annotated[Path | None, arguments.Needs("why")] = None
-    """Folder of the training, with its masks, for --why (default: <scene>.work)."""
-    photographs: Annotated[Path | None, arguments.Needs("why")] = None
-    """The dataset of the training, for --why, if it is elsewhere now."""
+    segmenter: str = ""
+    """Ask the photographs, too: hub id or folder of a model that outlines what phrases name, such as
+    facebook/sam3. Every answer then says who found it: the field, the photographs, or both."""
+    work: Annotated[Path | None, _PHOTOGRAPHS] = None
+    """Folder of the training, with its masks (default: <scene>.work)."""
+    photographs: Annotated[Path | None, _PHOTOGRAPHS] = None
+    """The dataset of the training, if it is elsewhere now."""
     json: arguments.JsonOption = False
 
     def run(self) -> None:
@@ -190,18 +196,23 @@ class QueryScene:
         if not self.texts:
             raise InputError("no phrase given; for example: langsplat query scene.ply 'blue gift'")
         explain = _Explainer(self, scene) if self.why is not None else None
-        camera = camera_of(scene, self.camera) if scene.cameras or self.camera else None
+        camera = camera_of(scene, self.camera or 0) if scene.cameras or self.camera else None
         engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
         unit = unit_of(self.scale or scene.metres_per_unit, scene.origin)
         texts = self._askable(engine, camera)
-        pixels = None if camera is None else _Pixels(engine, view_of(scene, camera), self.mode)
+        outlined = self._outlined(scene, texts) if self.segmenter else {}
+        drawn = camera if self.camera is not None or len(texts) <= CHANNELS_AT_ONCE else None
+        if camera is not drawn:
+            log.info("pixels of more than %d phrases are found with --camera INDEX", CHANNELS_AT_ONCE)
+        pixels = _Pixels(engine, drawn, self.mode)
         asked: dict[str, tuple[dict[str, Any], list[str]]] = {}  # phrase -> answer, lines of its things
         # One after the other: an answer has a number for every Gaussian and level.
         for text in dict.fromkeys(texts):
             result, tree, of = self._ask(engine, text, camera)
+            heard = compose.with_masks(engine, result, outlined[text][0]) if outlined else None
+            result = result if heard is None else heard.answer
             answer = _answer(result, camera) | {"reading": None if tree is None else unparse(tree)}
-            if pixels is not None:
-                pixels.add(result, answer)
+            pixels.add(result, answer)
             things = engine.instances(result, self.instances) if result.found else ()
             counts = result.found or (isinstance(tree, Counted) and result.verdict == "weak match")
             number = compose.count_things(engine, result) if counts else compose.Number(0, 0, 0)
@@ -209,8 +220,11 @@ class QueryScene:
             because = {} if explain is None else {"evidence": explain(engine, result, of)}
             answer |= basis_fields(engine) | {"metres_per_unit": unit.metres, **listed(things), **because}
             asked[text] = answer, instance_lines(things, unit) + _reasons(**because)
-        if pixels is not None:
-            pixels.fill()
+            if heard is not None:
+                counted = f"outlined in {outlined[text][1]} of {len(scene.cameras)} photographs"
+                answer["photographs_with_masks"] = outlined[text][1]
+                asked[text][1].insert(0, _found_by(heard, answer, things, counted))
+        pixels.fill()
         if explain is not None:
             explain.write()
         if self.json:
@@ -219,6 +233,22 @@ class QueryScene:
         for answer, table in map(asked.__getitem__, texts):
             print(*_lines(answer, unit), *table, sep="\n")
         print(f"answers: {engine.basis.long}")
+
+    @property
+    def _sees(self) -> bool:
+        return bool(self.why or self.segmenter)
+
+    def _outlined(self, scene: Scene, texts: Sequence[str]) -> dict[str, tuple[Array, int]]:
+        """Return of each phrase what `compose.with_masks` takes, and the number of photographs with masks."""
+        phrases = list(dict.fromkeys(texts))
+        with TerminalProgress() as progress:
+            photographs = kept_photographs(self.scene, scene, self.work, self.photographs, progress)
+            progress("loading the segmenter", 0.0)
+            segment = load_text_segmenter(self.segmenter).segment
+            shares, counts = shares_in_masks(
+                scene, lambda camera: segment(photographs[camera.name], phrases), progress
+            )
+        return dict(zip(phrases, zip(shares.T, counts.tolist(), strict=True), strict=True))
 
     def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
         """Return the phrases that can be asked, others said on stderr; raise why where none is left."""
@@ -298,6 +328,16 @@ class _Explainer:
             Image.fromarray(np.concatenate(self._sheets)).save(temporary, "PNG")
 
 
+def _found_by(heard: compose.Heard, answer: dict[str, Any], things: Sequence[Instance], counted: str) -> str:
+    """Say in the answer, ready for JSON, of it and of its things who found them; return it as a line."""
+    by = [heard.who(thing.members) for thing in things]
+    for entry, who in zip(answer["instances"], by, strict=True):
+        entry["found_by"] = who
+    answer["found_by"] = heard.who()
+    listed = (f", {by.count(who)} listed by {who}" for who in dict.fromkeys(by))
+    return f"  found by {heard.who()}: {counted}{''.join(listed)}"
+
+
 def _reasons(evidence: dict[str, Any] | None = None) -> list[str]:
     if evidence is None:
         return []
@@ -355,62 +395,35 @@ def _answer(result: QueryResult, camera: Camera | None) -> dict[str, Any]:
 
 
 class _Pixels:
-    """Pixels of answers in one view, found for several together."""
+    """Pixels of answers as a camera sees them, found for several together; without one none are."""
 
-    def __init__(self, engine: QueryEngine, view: View, mode: str) -> None:
-        self._engine, self._view, self._paper = engine, view, mode == "paper"
-        size = max(view.count, view.camera.height * view.camera.width)
-        self._most = max(min(CHANNELS_AT_ONCE, 2**25 // size), 1)  # 128 MB of numbers, twice
-        self._even: list[tuple[dict[str, Any], Array]] = []  # with relevancies of `engine.alike`
-        self._others: list[tuple[dict[str, Any], Array]] = []  # with those of all Gaussians
+    def __init__(self, engine: QueryEngine, camera: Camera | None, mode: str) -> None:
+        self._engine, self._paper = engine, mode == "paper"
+        self._view = None if camera is None else view_of(engine.scene, camera)
+        # 128 MB of numbers, twice
+        self._most = max(min(CHANNELS_AT_ONCE, 2**25 // max(len(engine.scene.gaussians), 1)), 1)
+        self._waiting: list[tuple[dict[str, Any], Array]] = []
 
     def add(self, result: QueryResult, answer: dict[str, Any]) -> None:
         """Take an answer, whose pixel fields are filled sooner or later."""
-        if self._paper:
+        if self._view is not None and self._paper:
             phrase, gate = self._engine.text_vectors([result.phrase]), PictureConfig().alpha_gate
             image = decoded_relevancy(self._view, self._engine.field, result.level, phrase, gate)
             _fill(answer, peak_pixel(image[..., 0], PAPER_FILTER))
-        elif result.spread is not None:
-            self._even.append((answer, result.spread.at(self._engine.alike[1])))
-            if len(self._even) == self._most:
-                self._find(self._even, self._engine.alike[0], self._peaks)
-        else:
-            self._others.append((answer, result.even))
-            if len(self._others) == self._most:
-                self._find(self._others)
-
-    @cached_property
-    def _peaks(self) -> PeakPixels | None:
-        """Of many answers; None where the sets' shares take too much memory."""
-        assert isinstance(self._view, CpuView)
-        painted, gate = self._view.paint_sets(self._engine.alike[0], PLANES), PictureConfig().alpha_gate
-        if painted is None:
-            return None
-        return PeakPixels(self._view.camera, painted, gate, PAPER_FILTER, self._most)
+        elif self._view is not None:
+            self._waiting.append((answer, result.even))
+            if len(self._waiting) == self._most:
+                self.fill()
 
     def fill(self) -> None:
         """Fill the pixel fields of all that was added."""
-        if self._even:
-            self._find(self._even, self._engine.alike[0], vars(self).get("_peaks"))
-        if self._others:
-            self._find(self._others)
-
-    def _find(
-        self,
-        waiting: list[tuple[dict[str, Any], Array]],
-        sets: Array | slice = slice(None),
-        peaks: PeakPixels | None = None,
-    ) -> None:
-        answers, values = zip(*waiting, strict=True)
-        if peaks is None:
-            columns = np.stack(values, 1)[sets]
-            images = splatted_relevancy(self._view, columns, PictureConfig().alpha_gate)
-            found = [peak_pixel(image, PAPER_FILTER) for image in np.moveaxis(images, -1, 0)]
-        else:
-            found = peaks.of(np.stack(values))
-        for answer, peak in zip(answers, found, strict=True):
-            _fill(answer, peak)
-        waiting.clear()
+        if self._view is None or not self._waiting:
+            return
+        answers, values = zip(*self._waiting, strict=True)
+        images = splatted_relevancy(self._view, np.stack(values, 1), PictureConfig().alpha_gate)
+        for answer, image in zip(answers, np.moveaxis(images, -1, 0), strict=True):
+            _fill(answer, peak_pixel(image, PAPER_FILTER))
+        self._waiting.clear()
 
 
 def _fill(answer: dict[str, Any], peak: tuple[int, int, float]) -> None:

@@ -195,6 +195,8 @@ def kept_photographs(
     """
     from langsplat_core.datasets import load_photographs
 
+    if not scene.cameras:
+        raise InputError(f"{path}: has no cameras, which photographs belong to; keep .cameras.json beside it")
     work = work or work_folder(path)
     dataset = dataset or _stated_dataset(path, work)
     most = max(max(camera.width, camera.height) for camera in scene.cameras)

@@ -61,12 +61,6 @@ class QueryResult(Judged):
         return f"<{self.phrase!r}: {self.said}, as {LEVELS[self.level]}, near {self.place}>"
 
     @property
-    def spread(self) -> "Spread | None":
-        """The even relevancy as that of whole regions, where it is and was not yet read."""
-        even = vars(self)["even"]
-        return even if isinstance(even, Spread) else None
-
-    @property
     def cut(self) -> float:
         """The least relevancy of a member, of its region where it has one; the peak where there is none."""
         if self.own_cut is not None:
@@ -224,7 +218,7 @@ def build_regions(tree: Tree, weights: Array) -> Regions:
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Relevancy at a level, the same all over a region: of all N Gaussians when called, or of some."""
+    """Relevancy at a level, the same all over a region, made of all N Gaussians when called."""
 
     regions: Regions
     level: int
@@ -234,12 +228,6 @@ class Spread:
     def __call__(self) -> Array:
         """(N,) float32."""
         return self.regions.spread(self.level, self.values, self.own.of_level(self.level))
-
-    def at(self, rows: Array) -> Array:
-        """Return the (K,) float32 of some Gaussians."""
-        of, spread = self.regions.everywhere[self.level, rows], self.own.of_level(self.level, rows)
-        spread[of >= 0] = self.values[of[of >= 0]]
-        return spread
 
 
 def place_of(points: Array) -> tuple[Array, Array]:

@@ -7,6 +7,7 @@ parts of several; its peak is that of its weakest necessary part.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import QueryResult, locate
+from langsplat_core.query.answers import QueryResult, locate, place_of
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import (
     ADJECTIVES,
@@ -34,7 +35,7 @@ from langsplat_core.query.grammar import (
     unparse,
 )
 from langsplat_core.query.relations import Body, body, most, separate, stands, upright, viewpoint
-from langsplat_core.query.rule import RULE, combined
+from langsplat_core.query.rule import RULE, Verdict, combined
 from langsplat_core.scene import LEVELS, Camera
 from langsplat_core.scene.language import phrase_key, tidy
 from langsplat_core.semantics.relevancy import FLOOR
@@ -271,3 +272,49 @@ def count_things(engine: QueryEngine, answer: QueryResult) -> Number:
         for inside in (least & answer.members, answer.members, most | answer.members)
     )
     return Number(own, min(low, own), max(high, own))
+
+
+# Answers of a scene's field, and masks of the same phrase in its photographs.
+
+Spoke = Literal["both", "the field", "the photographs", "neither"]
+TOUCHED = 0.1  # of a region of the field, in masks: from then on these alone say what of it is the thing
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """An answer of the field and of masks in photographs, and what each of them said."""
+
+    answer: QueryResult
+    field: Array  # (N,) bool members by the field; none where it did not find the phrase
+    masks: Array  # (N,) bool members by masks
+
+    def who(self, rows: Array | slice = slice(None)) -> Spoke:
+        """Return who found the thing of these Gaussians, each having most of them, or any thing at all."""
+        least = 0.0 if isinstance(rows, slice) else HALF
+        spoke = self.field[rows].mean() > least, self.masks[rows].mean() > least
+        names: tuple[Spoke, ...] = ("neither", "the photographs", "the field", "both")
+        return names[2 * spoke[0] + spoke[1]]
+
+
+def with_masks(engine: QueryEngine, found: QueryResult, shares: Array) -> Heard:
+    """Return an answer together with masks; shares: (N,) of `selection.shares_in_masks`.
+
+    What lies by more than half in masks is the thing, more sharply than regions are, with their mean share as
+    its score. Regions of the field's answer that masks hardly touch stay, and so does what no photograph
+    sees: a segmenter misses, too.
+    """
+    field, masks = found.members & found.found, shares > HALF
+    if masks.sum() < RULE.smallest:
+        return Heard(found, field, np.zeros_like(masks))
+    regions = engine.regions
+    level = found.level if found.found else regions.level_of(masks)
+    touched = regions.means(np.tile(masks, (len(LEVELS), 1)))[level] >= TOUCHED
+    settled = regions.spread(level, touched, np.zeros_like(masks)) & ~np.isnan(shares)
+    kept = field & ~masks & ~settled
+    even = np.where(masks, shares[masks].mean(), np.where(kept, found.even, 0)).astype(np.float32)
+    peak = float(even.max())
+    judgement = found.judgement if found.found else Verdict(True, "masks", 10 * (peak - HALF))
+    merged = replace(found, level=level, members=masks | kept, even=even, peak=peak, judgement=judgement)
+    best = engine.instances(merged, 1)
+    place, box = place_of(best[0].points) if best else (None, None)
+    return Heard(replace(merged, place=place, box=box), field, masks)

@@ -269,18 +269,6 @@ class QueryEngine:
         return build_regions(self.tree, surface_weights(self.scene.gaussians))
 
     @cached_property
-    def alike(self) -> tuple[Array, Array]:
-        """(N,) int32 set of each Gaussian, of those in the same region at every level; (L,) one of each set.
-
-        What is in no region is a set of its own.
-        """
-        alone = (self.regions.everywhere < 0).any(0)
-        sets = np.where(alone, self.tree.count + np.cumsum(alone), self.tree.leaves).astype(np.int32)
-        some = np.zeros(int(sets.max(initial=0)) + 1, np.int64)
-        some[sets] = np.arange(len(sets))
-        return sets, some
-
-    @cached_property
     def chance(self) -> Array | None:
         """(R, V) fits of everyday phrases in the regions of all levels; None where there are none."""
         if self.rule == "peak":

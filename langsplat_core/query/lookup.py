@@ -8,7 +8,6 @@ decoded once. Of other codecs every latent is a feature of its own.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,9 +15,8 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.display.displays import gated_mean
 from langsplat_core.errors import InputError
-from langsplat_core.raster.cpu.tiles import PIXELS, TILE
 from langsplat_core.raster.protocol import View
-from langsplat_core.scene import Camera, CodebookCodec, LanguageField
+from langsplat_core.scene import CodebookCodec, LanguageField
 from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy_of
 
 CELLS = 32_768  # of the sphere, at most: twice as many halve the squared error, and take twice the time
@@ -41,9 +39,9 @@ class Relevancy:
         shared_workers().run(_fetch, found.size, self.values, *flat)
         return found
 
-    def of_level(self, level: int, rows: Array | slice = slice(None)) -> Array:
-        """(K,) float32 of some Gaussians at a level."""
-        return np.asarray(self.values[self.features[level, rows]])
+    def of_level(self, level: int) -> Array:
+        """(N,) float32 at a level."""
+        return np.asarray(self.values[self.features[level]])
 
 
 class Lookup:
@@ -164,117 +162,19 @@ def decoded_relevancy(
 
 
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
-    """Return the peak (column, row, value) of a (H, W) map's means over `window` px, edges repeated."""
-    means = _box_means(relevancy, max(1, min(window, *relevancy.shape)))
-    return _middle_peak(means, *np.ogrid[: means.shape[0], : means.shape[1]])
+    """Return the peak (column, row, value) of a (H, W) map's means over `window` px, edges repeated.
 
-
-def _box_means(image: Array, window: int) -> Array:
+    Of those as high the middle one: which is higher by its last digits follows from the unit of lengths.
+    """
     from scipy.ndimage import uniform_filter  # here, since the window, which needs none, imports this module
 
-    return np.asarray(uniform_filter(np.asarray(image, np.float64), size=window, mode="nearest"))
-
-
-def _middle_peak(means: Array, rows: Array, columns: Array) -> tuple[int, int, float]:
-    """Return column, row and value of the highest of some pixels, of those as high the middle one.
-
-    Which is higher by its last digits follows from the unit of lengths.
-    """
-    tied = means >= means.max() - TIED
-    rows, columns = (np.broadcast_to(at, means.shape)[tied] for at in (rows, columns))
+    size = max(1, min(window, *relevancy.shape))
+    means = uniform_filter(np.asarray(relevancy, np.float64), size=size, mode="nearest")
+    rows, columns = np.nonzero(means >= means.max() - TIED)
     away = (rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2
     middle = np.lexsort((columns, rows, away))[0]
-    return int(columns[middle]), int(rows[middle]), float(means[tied][middle])
+    row, column = int(rows[middle]), int(columns[middle])
+    return column, row, float(means[row, column])
 
 
 TIED = 1e-6  # means of pixels nearer than this are as high
-PLANES = 2**16  # of weights of sets in tiles, at most: 64 MB, and about three times as much of their means
-
-
-class _Tiles(NamedTuple):
-    """Means of P pairs of a set and a tile, in the order of the T tiles of an image."""
-
-    starts: Array  # (T + 1,) of a tile's pairs
-    sets: Array  # (P,)
-    means: Array  # (P, PIXELS) of the set's share in alpha
-    highest: Array  # (P,) of these
-
-
-class PeakPixels:
-    """Peak pixels, as of `peak_pixel`, in one view of many answers that are even over sets of Gaussians.
-
-    A mean over pixels is the sum of the answer's relevancies times means of the sets' shares in alpha. These
-    are made once, in tiles; an answer then costs the tiles where its peak may be.
-    """
-
-    def __init__(
-        self, camera: Camera, painted: tuple[Array, Array, Array], gate: float, window: int, most: int
-    ) -> None:
-        """painted: of `CpuView.paint_sets`; gate: shares are 0 where alpha is at most this; most: answers."""
-        tiles, labels, planes = painted
-        self._size = height, width = camera.height, camera.width
-        rows, columns = -(-height // TILE), -(-width // TILE)
-        window = max(1, min(window, height, width))
-        there, starts = np.unique(tiles, return_index=True)
-        alpha = np.ones((rows * columns, TILE, TILE))
-        alpha[there] = np.add.reduceat(planes, starts, dtype=np.float64) if len(there) else 1
-        shares = np.where(alpha > gate, 1 / np.maximum(alpha, gate), 0)[tiles] * planes
-        y, x, around = *np.divmod(tiles, columns), -(-(window // 2) // TILE)
-        found = []
-        for label in np.unique(labels):
-            own = np.flatnonzero(labels == label)
-            top, left = max(y[own].min() - around, 0), max(x[own].min() - around, 0)
-            bottom, right = min(y[own].max() + around + 1, rows), min(x[own].max() + around + 1, columns)
-            part = np.zeros((bottom - top, TILE, right - left, TILE))
-            part[y[own] - top, :, x[own] - left] = shares[own]
-            image = part.reshape(TILE * (bottom - top), -1)[: height - TILE * top, : width - TILE * left]
-            image[:] = _box_means(image, window)
-            down, along = np.nonzero(part.max((1, 3)) > 1e-9)
-            at = (down + top) * columns + along + left
-            found.append((at, np.full(len(at), label), part[down, :, along].reshape(-1, PIXELS)))
-        at, sets, means = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        order = np.argsort(at, kind="stable")
-        starts, means = np.searchsorted(at[order], np.arange(rows * columns + 1)), means[order]
-        self._tiles = _Tiles(starts, sets[order], means, means.max(1))
-        self._images = np.empty((most, rows * columns, PIXELS))  # again and again: new pages take longer
-
-    def of(self, values: Array) -> list[tuple[int, int, float]]:
-        """(Q, L) float32 relevancies >= 0 of the sets -> columns, rows and values; Q is `most` or less."""
-        images, peaks = self._images, np.empty((len(values), self._images.shape[1]))
-        shared_workers().run(_blend_peaks, len(values), values, self._tiles, images, peaks)
-        return [self._peak(image, peak) for image, peak in zip(images, peaks, strict=False)]
-
-    def _peak(self, image: Array, peaks: Array) -> tuple[int, int, float]:
-        """Return the peak of (T, PIXELS) means, in those of T tiles that are as high."""
-        height, width = self._size
-        tiles, within = np.flatnonzero(peaks >= peaks.max() - TIED), np.arange(PIXELS)
-        row, column = np.divmod(tiles[:, None], -(-width // TILE))
-        rows, columns = TILE * row + within // TILE, TILE * column + within % TILE
-        inside = (rows < height) & (columns < width)
-        return _middle_peak(image[tiles][inside], rows[inside], columns[inside])
-
-
-@kernel
-def _blend_peaks(first: int, last: int, values: Array, tiles: _Tiles, images: Array, peaks: Array) -> None:
-    """Fill rows [first, last) of `peaks` (Q, T), the highest means in tiles, and of `images` (Q, T, PIXELS).
-
-    Tiles come in the order of what their peaks could be, by the highest share that each set has there. Where
-    that is lower than the image's peak it stands for the tile's own, whose row of `images` stays as it was.
-    """
-    for i in range(first, last):
-        own, best = values[i], 0.0
-        for tile in range(len(tiles.starts) - 1):
-            peaks[i, tile] = 0
-            for j in range(tiles.starts[tile], tiles.starts[tile + 1]):
-                peaks[i, tile] += own[tiles.sets[j]] * tiles.highest[j]
-        for tile in np.argsort(-peaks[i]):
-            if peaks[i, tile] < best - TIED:
-                break
-            pixels = images[i, tile]
-            pixels[:] = 0
-            for j in range(tiles.starts[tile], tiles.starts[tile + 1]):
-                value, means = own[tiles.sets[j]], tiles.means[j]
-                for k in range(PIXELS):
-                    pixels[k] += value * means[k]
-            peaks[i, tile] = pixels.max()
-            best = max(best, peaks[i, tile])

@@ -206,9 +206,9 @@ def excess(fits: Fits, bars: Bars, sought: Sought, level: LevelChoice = "auto") 
 # Verdicts.
 
 Outcome = Literal["found", "weak match", "not here"]
-# By a calibrated probability, the fits of everyday phrases, likeness to examples of a taught word, or as
-# published, relevancy; "several": by different ones for the parts of a phrase with structure.
-Reached = Literal["calibration", "chance", "example", "relevancy", "several"]
+# By a calibrated probability, the fits of everyday phrases, likeness to examples of a taught word, masks in
+# photographs, or as published, relevancy; "several": by different ones for parts of a phrase with structure.
+Reached = Literal["calibration", "chance", "example", "masks", "relevancy", "several"]
 IN_SPREADS: tuple[Reached, ...] = ("chance", "example")  # those whose margins can be compared
 
 
@@ -218,7 +218,9 @@ class Verdict:
 
     found: bool
     reached: Reached
-    margin: float  # above what counts as found: logits of the probability, spreads, or tenths of relevancy
+    margin: (
+        float  # above what counts as found: logits of the probability, spreads, tenths of relevancy or share
+    )
     probability: float | None = None  # that it is there at all; None where nothing is calibrated
 
     @property

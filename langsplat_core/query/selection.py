@@ -1,9 +1,10 @@
-"""Selections: (N,) bool arrays over Gaussians, by place, along the surface, and drawn on an image.
+"""Selections: (N,) bool arrays over Gaussians, by place, along the surface, drawn on an image, and by masks.
 
 Growing and shrinking walk along the surface and never jump to a thing behind or above. Gaussians too faint to
 be on it go where the one goes that they are nearest to (`Surface.anchors`); those near none never change.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +14,10 @@ from scipy.sparse.csgraph import dijkstra
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import InputError
+from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import Regions
-from langsplat_core.scene import Camera
+from langsplat_core.raster.render import view_of
+from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.surface import Surface
 
 
@@ -158,3 +161,26 @@ def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: fl
     there = depths[rows, columns].astype(np.float64)
     inside[inside] = (there <= 0) | (seen.depths[inside] <= there * (1 + behind))
     return inside
+
+
+SEEN = 1e-3  # pixels over all photographs; what paints fewer was not seen
+
+
+def shares_in_masks(
+    scene: Scene, masks_of: Callable[[Camera], Array], progress: Progress = silent
+) -> tuple[Array, Array]:
+    """Return the (N, P) float64 shares of what is seen of each Gaussian that lie in P masks of photographs.
+
+    Over all cameras W^T mask / W^T 1, NaN for what none of them sees; and the (P,) numbers of photographs
+    with a mask. masks_of: from a camera of the scene to its (H, W, P) bool; one photograph is held at a time.
+    """
+    sums, outlined = np.zeros((len(scene.gaussians), 1)), np.zeros(0, int)
+    for index, camera in enumerate(scene.cameras):
+        progress("asking photographs", index / len(scene.cameras))
+        masks = masks_of(camera)
+        image = np.concatenate([np.ones_like(masks[..., :1]), masks], -1).astype(np.float32)
+        sums = sums + view_of(scene, camera).gather(image)
+        outlined = outlined + masks.any((0, 1)) if index else masks.any((0, 1)).astype(int)
+    progress("asking photographs", 1.0)
+    seen, inside = sums[:, :1], sums[:, 1:]
+    return np.where(seen > SEEN, inside / np.maximum(seen, SEEN), np.nan), outlined

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from langsplat_core.arrays import unit
 from langsplat_core.cli import query
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.scenes import load_scene
+from langsplat_core.pipeline.encoder_check import bundled_room
 from langsplat_core.pipeline.evidence import (
     Evidence,
     find_evidence,
@@ -18,13 +20,16 @@ from langsplat_core.pipeline.evidence import (
     kept_photographs,
 )
 from langsplat_core.pipeline.train import train_scene
-from langsplat_core.query.compose import run_phrase
+from langsplat_core.query.compose import run_phrase, with_masks
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.inventory import export_labels
+from langsplat_core.query.selection import shares_in_masks
 from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.render import view_of
 from langsplat_core.scene import NO_NODE, Scene
 from langsplat_core.scene.language import Tree
+from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.features import ImageFeatures
 from tests.support.fakes import (
     CENTRES,
@@ -40,6 +45,7 @@ from tests.support.fakes import (
     named_scene,
 )
 from tests.support.processes import run
+from tests.support.scenes import dense_weights, random_camera, random_gaussians
 from tests.support.tiny_models import tiny_room, tiny_settings
 
 VIEWS = 8
@@ -198,6 +204,52 @@ def test_query_why_draws_a_sheet(trained, capsys):
     said = capsys.readouterr().out
     assert "5 of 7 photographs" in said
     assert f"worst photo_{WRONG}" in said
+
+
+def test_photographs_answer_beside_the_field(trained, capsys, monkeypatch, shown, scene):
+    """A segmenter that outlines the mug in all photographs but one, all things as "plant", and no book."""
+    seen = iter([(mug & (view != BLANK), every & False, every) for view, (mug, every) in enumerate(shown)])
+    stub = SimpleNamespace(segment=lambda image, phrases: np.stack(next(seen), -1))
+    monkeypatch.setattr(query, "load_text_segmenter", lambda model: stub)
+    assert run("query", "a.ply", "mug", "book", "plant", "--segmenter", "stub", "--json") == 0
+    mug, book, plant = json.loads(capsys.readouterr().out)
+    counts = [answer["photographs_with_masks"] for answer in (mug, book, plant)]
+    assert counts == [sum(one.any() for one, _ in shown) - 1, 0, sum(every.any() for _, every in shown)]
+    assert [answer["found_by"] for answer in (mug, book, plant)] == ["both", "the field", "both"]
+    things = [{thing["found_by"] for thing in answer["instances"]} for answer in (mug, book, plant)]
+    assert things == [{"both"}, {"the field"}, {"the photographs"}]  # of that the field has a third
+    np.testing.assert_allclose(mug["place"], CENTRES[0], atol=0.2)
+
+
+def test_shares_in_masks_are_those_of_the_reference():
+    scene = Scene(random_gaussians(30), cameras=tuple(random_camera(n, 24, 18) for n in range(3)))
+    masks = dict(zip(scene.cameras, np.random.default_rng(0).random((3, 18, 24, 2)) < 0.5, strict=True))
+    masks[scene.cameras[1]][:] = False
+    got, counts = shares_in_masks(scene, masks.__getitem__)
+    weights = {camera: dense_weights(scene.gaussians, camera) for camera in masks}
+    inside = sum(np.einsum("hwn,hwc->nc", weights[camera], 1.0 * masks[camera]) for camera in masks)
+    seen = sum(weight.sum((0, 1))[:, None] for weight in weights.values())
+    np.testing.assert_allclose(got, np.where(seen > 1e-3, inside / seen, np.nan), atol=1e-4)
+    assert counts.tolist() == [2, 2]
+
+
+@pytest.mark.long
+def test_true_masks_lift_to_the_things_that_they_show():
+    """Of the bundled scene, whose regions have known names: of these two the field finds the lid, roughly."""
+    room = bundled_room()
+    scene = replace(room.scene, cameras=tuple(camera.within(320) for camera in room.scene.cameras[::8]))
+    engine, members = QueryEngine(scene, load_text_encoder), room.tree.gaussians()
+    truth = np.zeros((len(scene.gaussians), 2), np.float32)
+    for node, names in room.parts.items():
+        truth[members[node]] += [name in names for name in ("lid", "spout")]
+    shares, _ = shares_in_masks(scene, lambda camera: view_of(scene, camera).splat(truth)[0] > 0.5)
+    spoke = ("lid", "both"), ("spout", "the photographs")
+    for (name, who), own, share in zip(spoke, truth.T > 0, shares.T, strict=True):
+        heard = with_masks(engine, run_phrase(engine, name).answer, share)
+        found = np.stack([heard.field, heard.masks, heard.answer.members])
+        field, lifted, both = (found & own).sum(1) / (found | own).sum(1)
+        assert min(lifted, both) > max(field + 0.1, 0.95)
+        assert (heard.who(), heard.answer.found) == (who, True)
 
 
 @pytest.mark.parametrize("spoil", ["work", "mask", "truncated", "report", "photograph"])

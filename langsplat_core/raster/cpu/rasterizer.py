@@ -227,34 +227,6 @@ def label_weights(
     return weights.astype(np.float32)
 
 
-# ``W onehot(labels)``: how much of every pixel each set of Gaussians paints. A tile meets few of them.
-
-
-@helper
-def _fetch_place(work: Any, s: int, later: int) -> Any:
-    return work[0][s]
-
-
-@helper
-def _add_to_plane(work: Any, plane: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
-    at = plane * PIXELS + row * TILE
-    ln.store(work[1], at, ln.load(work[1], at) + weight)
-
-
-@kernel
-def _paint_sets(first: int, last: int, tiles: Tiles, places: Array, planes: Array) -> None:
-    """(I,) plane of each intersection -> its weights are added to (P * 256,) `planes`."""
-    for i in range(first, last):
-        tiling.walk(
-            tiling.tile_at(i, tiles),
-            tiles,
-            (places, planes),
-            _fetch_place,
-            _add_to_plane,
-            tiling.nothing_to_close,
-        )
-
-
 # Views.
 
 _LINE = 64  # bytes of a cache line; arrays begin with one
@@ -365,23 +337,6 @@ class CpuView(LiftingView):
         self.check_labels(maps, count)
         labels = np.require(maps, np.int32, ["C", "W"])
         return label_weights(self.tiles, self.order, self.workers, labels, (self.count, count), least)
-
-    def paint_sets(self, labels: Array, most: int) -> tuple[Array, Array, Array] | None:
-        """Return how much of every pixel each set of Gaussians paints; None for more than `most` planes.
-
-        labels: (N,) int32 >= 0, the set of each. Returns (P,) tile, rising, and (P,) set of each plane, and
-        its (P, 16, 16) float32 weights, of which the sum times the sets' values is what `splat` gives.
-        """
-        check_array("labels", labels, (self.count,), dtype=np.int32)
-        tile_of = np.repeat(np.arange(len(self.tiles.starts) - 1), np.diff(self.tiles.starts))
-        sets = int(labels.max(initial=0)) + 1
-        pairs = tile_of * sets + labels[self.order[self.tiles.ranks]]
-        kinds, places = np.unique(pairs, return_inverse=True)
-        if len(kinds) > most:
-            return None
-        planes = np.zeros(len(kinds) * PIXELS, np.float32)
-        self._over_tiles(_paint_sets, places, planes)
-        return *np.divmod(kinds, sets), planes.reshape(-1, TILE, TILE)
 
     def backward(
         self, values: Array, image_grad: Array, alpha_grad: Array | None = None
