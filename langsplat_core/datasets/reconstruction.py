@@ -209,10 +209,9 @@ def map_cameras(folder: Path, count: int, progress: Progress, firmly: bool = Fal
         astray = best_model(astray, lost)
         if best is not None and len(located_names(best)) >= ENOUGH * count:
             break
-    if firmly:
-        images = [] if best is None else best.images.values()
-        if sum(image.has_pose and image.num_points3D >= FIRM_POINTS for image in images) < count:
-            return False
+    firm = 0 if best is None else sum(seen.num_points3D >= FIRM_POINTS for seen in best.images.values())
+    if firmly and firm < count:
+        return False
     if astray and (best is None or 2 * len(located_names(best)) < len(located_names(astray))):
         best = astray
     keep_matches(folder)

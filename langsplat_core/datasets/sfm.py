@@ -27,7 +27,7 @@ from langsplat_core.scene import Camera
 
 SIDE = 1600  # px, longer side of the images that features are sought in
 SMALL = 1000  # px, likewise at first; what is smaller yet is doubled where that does not do
-TRIED = "small.tried"  # in a workspace: a file that says that the small images did not do
+TRIED = "small.tried"  # in a workspace: a file that says that the small images did, or did not do
 MIN_PHOTOS = 3
 FEWEST = 0.5  # share of the photographs: a scene of fewer is not of what was photographed
 
@@ -46,11 +46,9 @@ def load_photos(
     labels = {path: path.relative_to(folder).as_posix() for path in paths}
     contents = [(labels[path], _content(path)) for path in paths]
     masked = [(labels[path], _content(mask)) for path in paths if (mask := photos.mask_beside(path))]
-    workspace = workspaces.open_workspace(
-        work, ["photographs", 4, SIDE, contents, *([masked] if masked else [])]
-    )
+    workspace = workspaces.open_workspace(work, ["photographs", 5, SMALL, SIDE, contents, masked])
     files = numbered(paths)
-    told = (workspace / TRIED).exists() or has_model(workspace / "sparse")
+    told = (workspace / TRIED).exists()
     if not has_model(workspace / "sparse"):
         try:
             workspaces.run_apart(_locate, workspace, files, workspace=workspace, progress=progress)
@@ -123,13 +121,10 @@ def _locate(workspace: Path, files: dict[str, Path], progress: Progress) -> None
 
     if not (workspace / TRIED).exists():
         small = workspace / "small"
-        small.mkdir(exist_ok=True)
         if map_cameras(small, match_photos(small, files, progress, SMALL), progress, firmly=True):
             for name in (workspaces.MATCHES, "sparse"):  # the model last, with which the workspace is whole
                 (small / name).replace(workspace / name)
-            shutil.rmtree(workspace / "images", ignore_errors=True)
-        else:
-            (workspace / TRIED).touch()
+        (workspace / TRIED).touch()
         shutil.rmtree(small, ignore_errors=True)
     if not has_model(workspace / "sparse"):
         map_cameras(workspace, match_photos(workspace, files, progress), progress)

@@ -49,7 +49,7 @@ from langsplat_core.query.inventory import suggest
 from langsplat_core.query.relations import ASIDE, NEAR, WHOLE, Body, body, stands, upright
 from langsplat_core.query.rule import RULE
 from langsplat_core.raster.opengl import WEB, shader, splat_shaders
-from langsplat_core.raster.render import render
+from langsplat_core.raster.render import render, view_of
 from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
 from langsplat_core.semantics.clip_plain import PlainClipText
@@ -94,6 +94,15 @@ def write_page(
     return report
 
 
+def covered(scene: Scene, cameras: Sequence[Camera]) -> Array:
+    """Return (N,) float32: the most that each Gaussian paints of any camera's image, in pixels of 320."""
+    most = np.zeros(len(scene.gaussians), np.float32)
+    for camera in (each.within(320) for each in cameras):
+        painted = view_of(scene, camera).gather(np.ones((camera.height, camera.width, 1), np.float32))
+        np.maximum(most, painted[:, 0], out=most)
+    return most
+
+
 def make_page(
     scene: Scene,
     engine: QueryEngine | None,
@@ -108,19 +117,17 @@ def make_page(
 
     first: views ahead of the scene's cameras, the first of which the page opens with. notes: texts and the
     (3,) points that they are pinned to, in the scene's units. phrase: what is asked at first. at_most: so
-    many Gaussians are drawn, those that cover most; answers are those of all.
+    many Gaussians are drawn, those that cover most of a view; answers are those of all.
     """
     gaussians = scene.gaussians
-    opacities = sigmoid(gaussians.opacity_logits.astype(np.float64))
-    rows = np.flatnonzero(gaussians.valid() & (opacities >= 1 / 255))
+    rows = np.flatnonzero(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= 1 / 255))
+    seen_from = views(scene, first)
     if at_most is not None and len(rows) > at_most:
-        cover = np.log(opacities[rows]) + np.sort(gaussians.log_scales[rows], axis=1)[:, 1:].sum(1)
-        rows = rows[np.argsort(-cover, kind="stable")[:at_most]]
+        rows = rows[np.argsort(-covered(scene, seen_from)[rows], kind="stable")[:at_most]]
     rows = rows[np.argsort(along_curve(gaussians.means[rows]), kind="stable")]
     if len(rows) == 0:
         raise InputError(f"{scene.path}: no Gaussian of this scene can be drawn; there is nothing to export")
     centre, radius = scene.bounds()
-    seen_from = views(scene, first)
     progress("packing the Gaussians", 0.1)
     tensors = pack_gaussians(gaussians.take(rows), centre)
     meta: dict[str, Any] = {

@@ -25,11 +25,11 @@ from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats, latent_colours
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.pipeline.webpage import write_page
+from langsplat_core.pipeline.webpage import covered, write_page
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
-from langsplat_core.raster.render import splat_colours, view_of
+from langsplat_core.raster.render import render, splat_colours, view_of
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from tests.support.backends import Measure
@@ -655,6 +655,8 @@ def test_notebooks_show_a_page_that_was_asked(browser, demo, engine, tmp_path, p
         assert page.report.gaussians == 5000
         assert page.report.free_text is (phrases == ())
         assert page.report.bytes < (1.3e6 if phrases else 3.2e6)
+        small = demo.cameras[0].within(320)
+        assert covered(demo, [small]).sum() == pytest.approx(render(demo, small).alpha.sum(), rel=1e-4)
     (tmp_path / "cell.html").write_text(f"<!doctype html><p>Out [1]</p>{shown}")
     tab = browser.new_page(offline=True)
     tab.goto((tmp_path / "cell.html").as_uri())
