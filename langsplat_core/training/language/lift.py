@@ -396,9 +396,8 @@ def lift_by_gradient(
     x = np.zeros_like(start) if published else start.copy()
     features = torch.from_numpy(x)  # the same memory
     adam = torch.optim.Adam([features], config.lr, (0.9, 0.999), 1e-15, fused=True)  # as in the INRIA code
-    none = np.zeros((1, codec.latent_dim), np.float32)
     targets = [
-        (camera, seen.labels, np.concatenate([codec.encode(seen.vectors), none])) for camera, seen in views
+        (camera, seen.labels, np.pad(codec.encode(seen.vectors), ((0, 1), (0, 0)))) for camera, seen in views
     ]
     kept: dict[int, LiftingView] = {}
     generator = np.random.default_rng(config.seed)
