@@ -218,9 +218,8 @@ class Verdict:
 
     found: bool
     reached: Reached
-    margin: (
-        float  # above what counts as found: logits of the probability, spreads, tenths of relevancy or share
-    )
+    # above what counts as found: logits of the probability, spreads, tenths of relevancy or of masks' share
+    margin: float
     probability: float | None = None  # that it is there at all; None where nothing is calibrated
 
     @property
