@@ -4,7 +4,7 @@ A fit (`semantics.relevancy.Scale`) says by how many spreads a region is nearer 
 phrases are by chance, so that one rule serves all encoders. The exported page has the table as JSON and
 `decide` in JavaScript (`web/rule.js`); the index over scans calls these functions for many scenes at once.
 The numbers were chosen on rooms 201 to 203, with the bundled encoder and CLIP's geometry; `common_share` on
-401 and 402, in four real spaces and with CLIP's geometry; the bars on these, 501 and 502.
+401 and 402, in four real spaces and with CLIP's geometry; the bars of things on these, 501 and 502.
 """
 
 from collections.abc import Mapping, Sequence
@@ -62,7 +62,7 @@ class Rule:
 RULE = Rule(
     advantage={"thing": (0.0, 0.25, 0.75), "part": (0.0, 0.0, 0.5), "part of a thing": (0.0, 0.1, 0.0)},
     found={
-        "thing": (1.3, 4.0),
+        "thing": (1.1, 4.0),
         "part": (2.55, 1.3),
         "part of a thing": (2.55, 1.3),
         "inside": (np.inf, 1.8),
@@ -152,13 +152,12 @@ def best_relevancies(table: RegionTable, relevancies: Array) -> Array:
 # Chance: the more places a scene has, the better the best of them fits a phrase that names nothing there; so
 # what counts as found is measured by the best fits of everyday phrases in the scene itself.
 
-LOW, HIGH = 0.16, 0.84  # quantiles one standard deviation from the median
-SKEW = 1.2  # spreads below the median: the most that counts above it, where what is there lies too
+LOW = 0.16  # quantile one standard deviation below the median; what is there lies above, and widens nothing
 
 
 @dataclass(frozen=True)
 class Bar:
-    """The best fit of phrases by chance: its median, and its spread above that."""
+    """The best fit of phrases by chance: its median and spread."""
 
     median: float
     spread: float
@@ -190,8 +189,8 @@ def bars_of(table: RegionTable, chance: Array, chosen: Array | None = None) -> B
 def _bar(best: Array) -> Bar:
     if len(best) == 0 or not np.isfinite(best).all():
         return Bar(np.inf, 1.0)
-    low, median, high = np.quantile(best, [LOW, 0.5, HIGH])
-    return Bar(float(median), float(min(high - median, SKEW * (median - low))))
+    low, median = np.quantile(best, [LOW, 0.5])
+    return Bar(float(median), float(median - low))
 
 
 def excess(fits: Fits, bars: Bars, sought: Sought, level: LevelChoice = "auto") -> float:

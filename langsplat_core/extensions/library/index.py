@@ -63,7 +63,7 @@ from langsplat_core.semantics.relevancy import fit_of
 
 log = logging.getLogger("langsplat")
 INDEX = ".langsplat-library"  # its name in the folder
-SCENES = "scenes 3"  # key of the metadata; earlier ones have other bars
+SCENES = "scenes 2"  # key of the metadata; "scenes" has bars of fits that common fits are in
 THUMBNAIL = (96, 72)  # width and height, pixels, of the picture that the index keeps of a scene
 Whole = Annotated[int, msgspec.Meta(ge=0, lt=2**62)]
 
