@@ -30,6 +30,7 @@ from langsplat_core.scene import LEVELS, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 
 SUFFIXES = (".usd", ".usda", ".usdc")
+THINGS = "/Scene/Things"
 LOSES = ("precision", "extra properties", "antialiasing", "cameras", "taught words")
 
 
@@ -99,10 +100,10 @@ def write_usd(path: Path, scene: Scene) -> int:
             things = scene_outline(Describer(QueryEngine(scene, load_text_encoder)))
         except EncoderError as error:
             print(f"things are numbers without labels: {error}")
-        Usd.ModelAPI(UsdGeom.Scope.Define(stage, "/Scene/Things")).SetKind(Kind.Tokens.group)
+        Usd.ModelAPI(UsdGeom.Scope.Define(stage, THINGS)).SetKind(Kind.Tokens.group)
         places, members = means @ matrix[:3, :3] + matrix[3, :3], tree.gaussians()
         for thing in things:
-            _add(stage, "/Scene/Things", np.zeros(3), thing, lambda node: places[members[node]])
+            _add(stage, THINGS, np.zeros(3), thing, lambda node: places[members[node]])
     with atomic_path(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise OSError(f"{path}: could not be written")
@@ -119,7 +120,7 @@ def _add(stage: Any, above: str, middle: Array, thing: Outline, points_of: Calla
     prim = UsdGeom.Xform.Define(stage, f"{above}/{name}").GetPrim()
     UsdGeom.Xformable(prim).AddTranslateOp().Set(Gf.Vec3d((box.mean(0) - middle).tolist()))
     UsdGeom.ModelAPI.Apply(prim).SetExtentsHint(Vt.Vec3fArray.FromNumpy((box - box.mean(0)).astype("f4")))
-    Usd.ModelAPI(prim).SetKind(Kind.Tokens.subcomponent if middle.any() else Kind.Tokens.component)
+    Usd.ModelAPI(prim).SetKind(Kind.Tokens.component if above == THINGS else Kind.Tokens.subcomponent)
     prim.SetCustomDataByKey("node", thing.node)  # as in the primvars
     if thing.word is not None:
         UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr(words)
