@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
 
@@ -176,19 +176,6 @@ class DatasetConfig:
     allow_few_cameras: bool = False
 
 
-class RadianceBudget(NamedTuple):
-    """Limits of a training of Gaussians."""
-
-    longer_side: int  # px, of the photographs
-    steps: int
-    max_gaussians: int
-    sh_degree: int
-
-
-QUICK = RadianceBudget(320, 500, 30_000, 1)  # with fewer steps no capture is learnt
-GOOD = RadianceBudget(480, 1_500, 60_000, 1)
-
-
 @dataclass(frozen=True)
 class RadianceConfig:
     """3D Gaussian Splatting training (Kerbl et al. 2023); defaults are those of the INRIA code.
@@ -239,12 +226,6 @@ class RadianceConfig:
     def formation(self, near: float) -> RasterSettings:
         """Return the constants of image formation; `near`: the plane that follows from what is seen."""
         return replace(INRIA, near=self.near or near)
-
-    def spending(self, budget: RadianceBudget) -> "RadianceConfig":
-        """Return these settings with the budget's steps, Gaussians and degree."""
-        return replace(
-            self, steps=budget.steps, max_gaussians=budget.max_gaussians, sh_degree=budget.sh_degree
-        )
 
 
 @dataclass(frozen=True)
@@ -353,18 +334,21 @@ PAPER = TrainConfig(
 )
 TrainProfile = Literal["default", "paper"]
 TrainPreset = Literal["quick", "good", "full"]
-OPACITY_DECAY = 0.01  # of quick and good: few photographs gain a third of a decibel, see docs/photographs.md
+# Settings of the presets, see docs/photographs.md; by the decay few photographs gain a third of a decibel.
+QUICK_SIDE, GOOD_SIDE = 320, 480  # px, the photographs' longer side
+QUICK: dict[str, Any] = {"steps": 500, "max_gaussians": 30_000, "sh_degree": 1, "opacity_decay": 0.01}
+GOOD: dict[str, Any] = {"steps": 1_500, "max_gaussians": 60_000, "sh_degree": 1, "opacity_decay": 0.01}
 
 
 def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
     """Return `config` with a preset's budget: "quick" takes minutes on a CPU, "full" is the published one."""
     if preset == "full":
         return config
-    budget, codewords = (QUICK, 512) if preset == "quick" else (GOOD, 0)
+    budget, side, codewords = (QUICK, QUICK_SIDE, 512) if preset == "quick" else (GOOD, GOOD_SIDE, 0)
     return replace(
         config,
-        dataset=replace(config.dataset, max_side=budget.longer_side),
-        radiance=replace(config.radiance.spending(budget), opacity_decay=OPACITY_DECAY),
+        dataset=replace(config.dataset, max_side=side),
+        radiance=replace(config.radiance, **budget),
         codec=replace(config.codec, size=codewords) if config.codec.kind == "codebook" else config.codec,
     )
 

@@ -37,8 +37,9 @@ class Report:
     @property
     def text(self) -> str:
         """Stage, note and metrics in words: "training: 9 Gaussians, loss 0.0312"."""
-        details = ", ".join(filter(None, [self.note, *(_metric(*item) for item in self.metrics.items())]))
-        return ": ".join(filter(None, [self.stage, details]))
+        words = {"psnr": "held-out PSNR {:.1f} dB"}
+        metrics = (words.get(name, name + " {:.4f}").format(value) for name, value in self.metrics.items())
+        return ": ".join(filter(None, [self.stage, ", ".join(filter(None, [self.note, *metrics]))]))
 
 
 @dataclass(frozen=True)
@@ -63,10 +64,6 @@ class Progress:
 
 
 silent = Progress(lambda report: None)
-
-
-def _metric(name: str, value: float) -> str:
-    return f"PSNR {value:.1f} dB" if name == "psnr" else f"{name} {value:.4f}"
 
 
 def is_quiet() -> bool:

@@ -35,7 +35,7 @@ class ProcessProgress:
     stages: dict[str, float] = field(default_factory=dict)  # name -> fraction in [0, 1], in their order
     stage: str = ""  # the latest
     left: TimeLeft = field(default_factory=TimeLeft)  # of the latest
-    losses: list[float] = field(default_factory=list)  # of a training, as far as it is
+    curves: dict[str, list[float]] = field(default_factory=dict)  # metrics of a training, as far as it is
     said: list[str] = field(default_factory=list)  # lines that are no progress, the latest last
 
     def hear(self, line: str) -> None:
@@ -52,9 +52,9 @@ class ProcessProgress:
             self.stage, self.left = report.stage, TimeLeft()
         self.stages[report.stage] = report.fraction
         self.left.hear(report.fraction)
-        loss = report.metrics.get("loss")
-        if loss is not None and [loss] != self.losses[-1:]:
-            self.losses = [*self.losses, loss]
+        for name, value in report.metrics.items():
+            if [value] != (curve := self.curves.get(name, []))[-1:]:
+                self.curves = {**self.curves, name: [*curve, value]}
 
 
 def program() -> list[str]:

@@ -20,7 +20,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainConfig, check_settings
+from langsplat_core.config import QUICK_SIDE, RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
 from langsplat_core.datasets.photos import count_photographs
@@ -148,14 +148,14 @@ def _train(
 
     with run.timed("radiance"):
         if given is None:
-            budget = trainer.budget_for(capture, config.radiance, len(train))
-            if budget.steps < config.radiance.steps:
+            settings = trainer.supported(config.radiance, len(train))
+            if settings.steps < config.radiance.steps:
                 log.info(
                     "training takes %d steps, not %d: with %d photographs more does not pay; "
                     "--radiance.capped-views 0 spends all",
-                    *(budget.steps, config.radiance.steps, len(train)),
+                    *(settings.steps, config.radiance.steps, len(train)),
                 )
-            made = capture, train, config.radiance, budget, run.work, run.progress
+            made = capture, train, settings, run.work, run.progress, held_out
             gaussians = processes.once(lambda: trained_gaussians(*made))
         else:
             gaussians = place_scene(given, origin=capture.origin).gaussians
@@ -170,7 +170,7 @@ def _train(
             metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
             scene = Scene(gaussians, language, cameras, metres_per_unit=metres, origin=capture.origin)
             save_scene(run.out, scene)
-            small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
+            small = capture.read_at(held_out, QUICK_SIDE) if held_out else None
             near = config.radiance.near or scene.near  # as whoever opens the scene has it
             told: dict[str, Any] = {"near": near, "progress": run.progress}
             scores = evaluate_views(gaussians, capture, held_out, small=small, **told) if held_out else []
@@ -274,14 +274,14 @@ def trained_gaussians(
     capture: Capture,
     train: list[int],
     config: RadianceConfig,
-    budget: RadianceBudget,
     work: Path,
     progress: Progress,
+    held_out: Sequence[int] = (),
 ) -> Gaussians:
     """Return the Gaussians of the photographs at `train`, from `work` where they were trained before."""
     # The backend changes who computes, not what, so that a run may move between machines; nor do checkpoints.
     settings = replace(config, backend="auto", checkpoint_every=RadianceConfig.checkpoint_every)
-    done = work / f"{stage_key('radiance', VERSION, settings, capture.digest(train), budget)}.ply"
+    done = work / f"{stage_key('radiance', VERSION, settings, capture.digest(train))}.ply"
     stated = done.with_suffix(".digest")
     if done.exists():
         log.debug("%s: kept from an earlier run", done.name)
@@ -291,7 +291,7 @@ def trained_gaussians(
         return found
     checkpoint = done.with_suffix(".checkpoint.safetensors")
     stated.unlink(missing_ok=True)
-    gaussians = trainer.train_radiance(capture, config.spending(budget), train, checkpoint, progress)
+    gaussians = trainer.train_radiance(capture, config, train, checkpoint, progress, held_out)
     write_ply(done, gaussians)
     with atomic_path(stated) as temporary:
         temporary.write_text(digest_of(read_ply(done)), encoding="utf-8")

@@ -21,7 +21,7 @@ from assets.making.render import Light, RenderedView, Renderer
 from assets.making.world import ENLARGED, Placed, assemble, bounds, furnished
 from langsplat_core.arrays import Array, psnr
 from langsplat_core.config import (
-    QUICK,
+    QUICK_SIDE,
     DatasetConfig,
     RadianceConfig,
     Seed,
@@ -36,7 +36,7 @@ from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Scene, look_at
 from langsplat_core.training.radiance.differentiable import evaluate_views
-from langsplat_core.training.radiance.trainer import budget_for, train_radiance
+from langsplat_core.training.radiance.trainer import supported, train_radiance
 
 Kind = Literal["few", "walk"]  # on an arc around a room's table; straight ahead along a street
 VIEWS = 12
@@ -168,7 +168,7 @@ def person(kit: Kit) -> Thing:
 LARGER = (480, 800)  # px, of windows beside them: with dilation as at the photographs' size, and growing
 HEAD = (
     "capture", "training / held out", "preset", "with", "seed", "held out, dB", "exposure fitted, dB",
-    f"at {QUICK.longer_side} px, dB", f"at each of {LARGER} px: dilation constant, growing",
+    f"at {QUICK_SIDE} px, dB", f"at each of {LARGER} px: dilation constant, growing",
     "SSIM", "training, dB", "budget", "Gaussians", "CPU-s",
 )  # fmt: skip
 # What a training has, beside its preset.
@@ -275,10 +275,10 @@ def _measured(
     progress: Progress,
 ) -> tuple[str, ...]:
     began = time.process_time()
-    budget = budget_for(capture, config, len(train))
-    gaussians = train_radiance(capture, config.spending(budget), train, progress=progress)
+    settings = supported(config, len(train))
+    gaussians = train_radiance(capture, settings, train, progress=progress)
     seconds = time.process_time() - began
-    small = capture.read_at(held_out, QUICK.longer_side)
+    small = capture.read_at(held_out, QUICK_SIDE)
     scores = evaluate_views(gaussians, capture, held_out, small=small)
     learnt = evaluate_views(gaussians, capture, train)
     scene = Scene(gaussians, cameras=tuple(capture.cameras[i] for i in train))
@@ -296,7 +296,7 @@ def _measured(
         *(f"{mean:.2f}" for mean in means),
         ", ".join(f"{mean:.2f}" for mean in windows),
         *(f"{ssim:.3f}", f"{np.mean([score.psnr for score in learnt]):.2f}"),
-        f"{budget.steps} steps at {budget.longer_side} px",
+        f"{settings.steps} steps at {max(capture.images[0].shape)} px",
         *(str(len(gaussians)), f"{seconds:.0f}"),
     )
 

@@ -58,7 +58,7 @@ from langsplat_core.semantics.features import FeatureStore, ImageFeatures, descr
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.training.language.codec_fit import CodecReport
-from langsplat_core.training.radiance.trainer import budget_for
+from langsplat_core.training.radiance.trainer import supported
 from tests.benchmarks.oracles import (
     TruthEncoder,
     moved_to_images,
@@ -214,10 +214,9 @@ class Room:
     def gaussians(self) -> Gaussians:
         """Gaussians that were trained without the held-out views."""
         train, _ = self.capture.split(HOLD_OUT)
-        config = self.settings.radiance
         with self._timed("radiance"):
-            budget = budget_for(self.capture, config, len(train))
-            return trained_gaussians(self.capture, train, config, budget, self.folder, self.progress)
+            settings = supported(self.settings.radiance, len(train))
+            return trained_gaussians(self.capture, train, settings, self.folder, self.progress)
 
     @cached_property
     def labels(self) -> Array:

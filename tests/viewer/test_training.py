@@ -161,11 +161,11 @@ def test_other_output_is_kept_as_words():
     assert len(progress.said) < 30
 
 
-def test_loss_is_heard_once_per_report():
-    progress = ProcessProgress()
-    for fraction, loss in ((0.0, {}), (0.1, {"loss": 0.25}), (0.11, {"loss": 0.25}), (0.2, {"loss": 0.125})):
-        progress.hear(json.dumps({"stage": "training Gaussians", "fraction": fraction, "metrics": loss}))
-    assert progress.losses == [0.25, 0.125]
+def test_metrics_are_heard_once_per_report():
+    progress, both = ProcessProgress(), {"loss": 0.125, "psnr": 21.5}
+    for fraction, metrics in ((0.0, {}), (0.1, {"loss": 0.25}), (0.11, {"loss": 0.25}), (0.2, both)):
+        progress.hear(json.dumps({"stage": "training Gaussians", "fraction": fraction, "metrics": metrics}))
+    assert progress.curves == {"loss": [0.25, 0.125], "psnr": [21.5]}
     assert progress.stages == {"training Gaussians": 0.2}
 
 

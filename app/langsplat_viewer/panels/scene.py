@@ -166,7 +166,8 @@ def _compared(viewer: Viewer) -> None:
 
 # Training.
 
-LOSS_EM = 5.0  # height of its plot
+CURVE_EM = 4.0  # height of a plot
+CURVES = {"psnr": "held-out photographs {:.1f} dB", "loss": "loss {:.4f}"}
 PRESETS: dict[TrainPreset, str] = {
     "quick": "minutes on a CPU",
     "good": "a quarter of an hour and more on a CPU",
@@ -197,17 +198,17 @@ def _running(viewer: Viewer, process: Training) -> None:
     imgui.text_unformatted(process.out.name)
     if not progress.stages:
         ui.coloured("starting")
-    for label, fraction in list(progress.stages.items()):
-        under_way = ": ".join(filter(None, [label, str(progress.left)]))
-        ui.small_wrapped(f"{label}: done" if fraction >= 1 else under_way)
-        if fraction < 1:
-            imgui.progress_bar(fraction, ImVec2(-1, 0))
-    if len(progress.losses) > 1:
-        values = np.array(progress.losses, np.float32)
-        size = ImVec2(-1, hello_imgui.em_size(LOSS_EM))
-        imgui.plot_lines("##loss", values, scale_min=0.0, graph_size=size)
-        ui.tip("How far the pictures are from the photographs, on average: lower is better")
-        ui.coloured(f"loss {values[-1]:.4f}, at first {values[0]:.4f}")
+    stages = dict(progress.stages)
+    if done := [label for label, fraction in stages.items() if fraction >= 1]:
+        ui.small_wrapped(f"done: {', '.join(done)}")
+    for label in (label for label in stages if label not in done):
+        ui.small_wrapped(": ".join(filter(None, [label, str(progress.left)])))
+        imgui.progress_bar(stages[label], ImVec2(-1, 0))
+    for name, text in CURVES.items():
+        if len(curve := progress.curves.get(name, [])) > 1:
+            size = ImVec2(-1, hello_imgui.em_size(CURVE_EM))
+            imgui.plot_lines(f"##{name}", np.array(curve, np.float32), graph_size=size)
+            ui.coloured(text.format(curve[-1]))
     imgui.separator()
     if imgui.button("Stop"):
         process.interrupt()

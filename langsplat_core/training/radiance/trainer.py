@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from langsplat_core.arrays import Array, sigmoid
-from langsplat_core.config import GOOD, INRIA, QUICK, RadianceBudget, RadianceConfig, check_settings
+from langsplat_core.arrays import Array, psnr, sigmoid
+from langsplat_core.config import GOOD, INRIA, QUICK, RadianceConfig, check_settings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import InputError
 from langsplat_core.interrupts import Terminated, handled
@@ -32,6 +32,7 @@ from langsplat_core.training.radiance.stereo import DepthMap, find_depths, in_fr
 log = logging.getLogger("langsplat")
 
 STAGE = "training Gaussians"
+JUDGED = 3  # held-out views that are drawn while a training runs
 
 
 @dataclass(frozen=True)
@@ -132,13 +133,15 @@ def train_radiance(
     train_indices: Sequence[int],
     checkpoint: Path | None = None,
     progress: Progress = silent,
+    held_out: Sequence[int] = (),
 ) -> Gaussians:
     """Fit Gaussians to the photographs at `train_indices`; return those that can be seen.
 
-    With a `checkpoint` path the run continues from that file if it exists, and writes it every
-    `config.checkpoint_every` steps, at the end, and when it is interrupted (Ctrl-C, or an error
-    of `progress`). Raises InputError when a setting is out of its range, there is nothing to train on or the
-    checkpoint belongs to another run, BackendError when the chosen backend does not work.
+    `progress` hears the mean PSNR of up to `JUDGED` of those at `held_out`. With a `checkpoint` path the run
+    continues from that file if it exists, and writes it every `config.checkpoint_every` steps, at the end,
+    and when it is interrupted (Ctrl-C, or an error of `progress`). Raises InputError when a setting is out of
+    its range, there is nothing to train on or the checkpoint belongs to another run, BackendError when the
+    chosen backend does not work.
     """
     check_settings(config, "--radiance.")
     if not train_indices:
@@ -159,7 +162,8 @@ def train_radiance(
         config.backend, config.formation(near_plane(first, capture.cameras))
     )
     views = _Views(capture, train_indices, renderer.device)
-    run = _Run(config, schedule_for(config, extent), views, renderer, extent, depths)
+    judged = _Views(capture, held_out[:: -(-len(held_out) // JUDGED) or 1], renderer.device)
+    run = _Run(config, schedule_for(config, extent), views, judged, renderer, extent, depths)
     if checkpoint and checkpoint.exists():
         state = training.load_checkpoint(checkpoint, made_from, renderer.device)
     else:
@@ -175,7 +179,8 @@ def train_radiance(
                 recent.append(run.step(state))
                 # Every photograph has another loss: what is told is the mean over each 200th of the run.
                 if state.step * 200 // config.steps > (state.step - 1) * 200 // config.steps:
-                    metrics, recent = {"loss": float(np.mean(recent))}, []
+                    metrics, recent = metrics | {"loss": float(np.mean(recent))}, []
+                metrics = metrics | run.held_out(state)
                 progress(STAGE, run.schedule.work(state.step), f"{len(state)} Gaussians", **metrics)
                 if signals:
                     raise Terminated if signal.SIGTERM in signals else KeyboardInterrupt
@@ -232,6 +237,7 @@ class _Run:
     config: RadianceConfig
     schedule: Schedule
     views: _Views
+    judged: _Views  # held out
     renderer: differentiable.DifferentiableRenderer
     extent: float  # world units
     depths: Sequence[DepthMap]  # of surfaces that Gaussians do not stay before; none for many views
@@ -281,15 +287,31 @@ class _Run:
         """Return the mean alpha where a view shows nothing: black Gaussians would look as empty as none."""
         return alpha.masked_fill(mask, 0).mean() if self.views.cut_out and mask is not None else 0.0
 
+    def drawn(self, state: TrainingState, camera: Camera, focal: float) -> Tensor:
+        """Return the (H, W, 3) image of a camera, without gradients."""
+        with torch.no_grad():
+            degree = self.schedule.active_sh_degree(state.step)
+            return self.renderer.render(state.values, camera, degree, focal).image
+
+    def held_out(self, state: TrainingState) -> dict[str, float]:
+        """Return the mean PSNR of the views that are judged, dB, a dozen times in a run; else nothing."""
+        if not len(self.judged) or state.step % max(self.config.steps // 12, 1):
+            return {}
+        scores = []
+        for index in range(len(self.judged)):
+            camera, target, mask = self.judged.at(index, coarse=False)
+            counted = (slice(None), slice(None)) if mask is None else mask
+            image = self.drawn(state, camera, self.judged.focals[index]).clamp(0, 1)
+            scores.append(psnr(*(one[counted].cpu().numpy() for one in (image, target))))
+        return {"psnr": float(np.mean(scores))}
+
     def find_exposures(self, state: TrainingState) -> Tensor:
         """(V, 4, 3) exposures of the training views; none where they explain too little."""
         pairs: list[tuple[Tensor, Tensor]] = []
         for index in range(len(self.views)):
             camera, target, mask = self.views.at(index, coarse=True)
             mask = self.counted(state, index, mask, camera)
-            with torch.no_grad():
-                degree = self.schedule.active_sh_degree(state.step)
-                image = self.renderer.render(state.values, camera, degree, self.views.focals[index]).image
+            image = self.drawn(state, camera, self.views.focals[index])
             counted = (slice(None), slice(None)) if mask is None else mask
             # One pixel in seven tells the exposure.
             pairs.append((image[counted].reshape(-1, 3)[::7], target[counted].reshape(-1, 3)[::7]))
@@ -355,14 +377,13 @@ def _extent(capture: Capture, gaussians: Gaussians) -> float:
 
 # Few photographs can be overfitted, and from some number of steps on they are: views that were held out get
 # worse. That number grows with the photographs (docs/benchmarks/few.md#presets).
+CAPPED = "steps", "max_gaussians", "sh_degree"
 VISITS = 64  # steps for each of few photographs, after which held-out views gain no more
 
 
-def budget_for(capture: Capture, config: RadianceConfig, views: int) -> RadianceBudget:
-    """Return the budget of a training of so many views: what is asked for, or what few of them support."""
-    longer_side = max(max(camera.width, camera.height) for camera in capture.cameras)
-    whole = RadianceBudget(longer_side, config.steps, config.max_gaussians, config.sh_degree)
-    if views > config.capped_views or config.steps < GOOD.steps:
-        return whole
-    capped = GOOD._replace(longer_side=longer_side, steps=max(VISITS * views, QUICK.steps))
-    return RadianceBudget(*map(min, capped, whole))
+def supported(config: RadianceConfig, views: int) -> RadianceConfig:
+    """Return the settings of a training on so many views: as asked for, or what few of them support."""
+    if views > config.capped_views or config.steps < GOOD["steps"]:
+        return config
+    most = {**GOOD, "steps": max(VISITS * views, QUICK["steps"])}
+    return replace(config, **{name: min(most[name], getattr(config, name)) for name in CAPPED})

@@ -12,10 +12,7 @@ from safetensors.torch import load_file
 
 from langsplat_core.arrays import psnr
 from langsplat_core.config import (
-    GOOD,
     INRIA,
-    QUICK,
-    RadianceBudget,
     RadianceConfig,
     TrainConfig,
     with_preset,
@@ -28,7 +25,7 @@ from langsplat_core.scene import Gaussians, Scene, look_at
 from langsplat_core.training.radiance.differentiable import CpuRenderer, evaluate_views, renderer_for
 from langsplat_core.training.radiance.state import PARAMETERS, initial_gaussians, start
 from langsplat_core.training.radiance.stereo import STAGE
-from langsplat_core.training.radiance.trainer import VISITS, budget_for, schedule_for, train_radiance
+from langsplat_core.training.radiance.trainer import VISITS, schedule_for, supported, train_radiance
 from tests.support.scenes import SHORT, SIZE, capture, picture, truth
 
 
@@ -116,8 +113,12 @@ def test_training_learns_the_scene() -> None:
     views = [0, 1, 2, 3, 4]
     first = initial_gaussians(capture(), views, 0, 2_000, 0)
     before = evaluate_views(first, capture(), [*views, 5], "cpu")
-    trained = train_radiance(capture(), config, views)
+    told: list[float] = []
+    progress = Progress(lambda at: told.append(at.metrics.get("psnr", 0.0)))
+    trained = train_radiance(capture(), config, views, progress=progress, held_out=[5])
     after = evaluate_views(trained, capture(), [*views, 5], "cpu")
+    assert told[-1] == pytest.approx(after[5].psnr, abs=0.5)
+    assert len(set(told)) > 10
     assert np.mean([s.psnr for s in after[:5]]) > np.mean([s.psnr for s in before[:5]]) + 10
     assert after[5].psnr > before[5].psnr + 5  # the view that was not trained on
     assert after[5].ssim > before[5].ssim
@@ -209,19 +210,16 @@ def noise(side: int = 24, views: int = 8) -> Capture:
 
 
 def test_presets_are_capped_with_few_views_only() -> None:
-    def spent(config: TrainConfig, views: int = 9) -> RadianceBudget:
-        return budget_for(noise(config.dataset.max_side, 1), config.radiance, views)
-
-    assert spent(with_preset(TrainConfig(), "quick")) == QUICK
-    good = with_preset(TrainConfig(), "good")
-    assert spent(good) == GOOD._replace(steps=9 * VISITS)
-    assert spent(good, 2) == GOOD._replace(steps=QUICK.steps)
-    assert spent(TrainConfig()) == RadianceBudget(800, 9 * VISITS, 60_000, 1)
-    whole = RadianceBudget(800, 30_000, 1_000_000, 3)
-    assert spent(TrainConfig(), RadianceConfig.capped_views + 1) == whole
-    assert spent(TrainConfig(radiance=RadianceConfig(capped_views=0))) == whole
+    quick, good = (with_preset(TrainConfig(), preset).radiance for preset in ("quick", "good"))
+    full, uncapped = RadianceConfig(), RadianceConfig(capped_views=0)
+    assert supported(quick, 9) == quick
+    assert supported(good, 9) == replace(good, steps=9 * VISITS)
+    assert supported(good, 2) == replace(good, steps=quick.steps)
+    assert supported(full, 9) == replace(full, steps=9 * VISITS, max_gaussians=60_000, sh_degree=1)
+    assert supported(full, full.capped_views + 1) == full
+    assert supported(uncapped, 9) == uncapped
     small = RadianceConfig(steps=1_500, max_gaussians=5_000, sh_degree=0)
-    assert budget_for(noise(200, 1), small, 24) == RadianceBudget(200, 1_500, 5_000, 0)
+    assert supported(small, 24) == small
 
 
 def some_gaussians(scale: float) -> Gaussians:
