@@ -379,8 +379,9 @@ def page_loop(path: Path) -> None:
         home = start = tab.run(VIEW)
         take(HELD)
         for phrase in ("teapot", "blue gift"):
-            for end in range(1, len(phrase) + 1):
-                tab.page.fill("#phrase", phrase[:end])
+            tab.page.fill("#phrase", "")
+            for letter in phrase:
+                tab.page.press("#phrase", letter)
                 take()
             tab.run(SEARCH, phrase)
             take(HELD)

@@ -44,9 +44,9 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query import grammar, taught
 from langsplat_core.query.answers import place_of
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
-from langsplat_core.query.instances import BOXED, OrientedBox, axis_aligned_box, oriented_box
+from langsplat_core.query.instances import BOXED, oriented_box
 from langsplat_core.query.inventory import suggest
-from langsplat_core.query.relations import ASIDE, NEAR, WHOLE, Body, body, stands, upright
+from langsplat_core.query.relations import ASIDE, FEWEST, NEAR, SPECK, WHOLE, Body, body, stands, upright
 from langsplat_core.query.rule import RULE
 from langsplat_core.raster.opengl import WEB, shader, splat_shaders
 from langsplat_core.raster.render import render, view_of
@@ -59,7 +59,8 @@ from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary
 # In an order in which each imports only those before it, so that their code can stand in one script.
 MODULES = ("words", "rule", "encoder", "camera", "space", "language", "data", "draw", "page")
 BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, without its imports and exports
-WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS", "ALSO_NOUNS")
+WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL")
+WORD_TABLES = ("SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")
 STILL = 1280  # pixels of the longer side of the picture in the page
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
 TOUCHING: tuple[grammar.Side, ...] = ("near", "on", "in")  # relations that follow from points
@@ -277,11 +278,12 @@ def language_tables(
         "grammar": {
             **{name.lower(): sorted(getattr(grammar, name)) for name in WORD_LISTS},
             "prepositions": {" ".join(words): kind for words, kind in grammar.PREPOSITIONS.items()},
-            "superlatives": grammar.SUPERLATIVES,
+            **{name.lower(): getattr(grammar, name) for name in WORD_TABLES},
         },
         "space": {
             "kinds": TOUCHING,
             "aside": ASIDE,
+            "specks": (FEWEST, SPECK),
             "frame": upright(engine.scene.up()).ravel().tolist(),
         },
         "examples": suggested.examples,
@@ -306,23 +308,12 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
     regions, scene, (centre, _) = engine.regions, engine.scene, engine.scene.bounds()
     means, count = scene.gaussians.means, sum(map(len, regions.nodes))
     places, boxes, corners = np.empty((count, 3)), np.empty((count, 2, 3)), np.empty((count, 8, 3))
-    axes, parents = np.empty((count, 3, 3)), regions.table.parents
-    for level, sizes in reversed([*enumerate(regions.sizes)]):
+    for level, sizes in enumerate(regions.sizes):
         order = regions.counts[np.argsort(regions.everywhere[level, regions.counts], kind="stable")]
         each = np.split(order, np.cumsum(sizes)[:-1]) if len(sizes) else []
         for region, own in enumerate(each, sum(map(len, regions.nodes[:level]))):
-            points, parent = means[own] - centre, parents[region]
             places[region], boxes[region] = place_of(means[own])
-            if parent < 0:
-                ways = [oriented_box(points[:: -(-len(own) // BOXED)]).axes]
-            else:  # along the whole, which was settled before, or along itself
-                spread = points - points.mean(0)
-                ways = [axes[parent], np.linalg.eigh(spread.T @ spread)[1]]
-            ends = [axis_aligned_box(points @ way) for way in ways]
-            areas = [np.inner(sides := high - low, np.roll(sides, 1)) for low, high in ends]
-            (low, high), turned = ends[np.argmin(areas)], ways[np.argmin(areas)]
-            axes[region] = turned
-            corners[region] = OrientedBox(turned @ ((low + high) / 2), turned, (high - low) / 2).corners
+            corners[region] = oriented_box(means[own[:: -(-len(own) // BOXED)]] - centre).corners
         if level == WHOLE:
             bodies = [body(means[own] - centre, upright(scene.up())) for own in each]
     share = regions.mixtures(codes, engine.field.codec.size + 1)[:, :-1].tocoo()
@@ -331,7 +322,7 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
         "share_code": share.col.astype(np.uint16),
         "share": share.data.astype(np.float32),
         "sizes": np.concatenate(regions.sizes).astype(np.uint32),
-        "parents": parents.astype(np.int32),
+        "parents": regions.table.parents.astype(np.int32),
         "places": scene.in_world(places),
         "boxes": scene.in_world(boxes).reshape(count, 6),
         "corners": corners.astype(np.float32).reshape(count, 24),

@@ -43,7 +43,6 @@ from langsplat_core.semantics.relevancy import FLOOR
 # Of the peak, where the place ends; of a thing's Gaussians, which two things share that are the same; of the
 # way below its best region, to which an unwanted name reaches.
 HALF = 0.5
-STRICT, WIDE = 0.25, 2.0  # of that way: the answers that the range of a count is taken from
 SAID_BY_VIEWER = ("left of", "right of", "behind", "in front of", "leftmost", "rightmost")
 
 
@@ -266,7 +265,7 @@ class Number:
 
 def count_things(engine: QueryEngine, answer: QueryResult) -> Number:
     """Return the number of single things in an answer, as `separate` tells them apart, and its range."""
-    least, most = within_reach(engine, answer, STRICT, WIDE)
+    least, most = within_reach(engine, answer, RULE.strict, RULE.wide)
     low, own, high = (
         len(separate(engine.surface, inside[engine.surface.rows], engine.tree))
         for inside in (least & answer.members, answer.members, most | answer.members)

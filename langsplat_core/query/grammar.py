@@ -71,23 +71,24 @@ def forms(word: str) -> tuple[str, ...]:
     return (low, low.removesuffix("s"), low.removesuffix("es"))
 
 
-_PLURALS = {
+PLURALS = {
     "men": "man", "women": "woman", "people": "person", "children": "child", "feet": "foot", "teeth": "tooth",
     "mice": "mouse", "geese": "goose", "leaves": "leaf", "loaves": "loaf", "knives": "knife",
     "wolves": "wolf", "shelves": "shelf", "halves": "half", "scarves": "scarf", "shoes": "shoe",
 }  # fmt: skip
-_ALWAYS_PLURAL = _words("scissors glasses jeans trousers headphones shorts pants pliers tongs binoculars")
+ALWAYS_PLURAL = _words("scissors glasses jeans trousers headphones shorts pants pliers tongs binoculars")
+# Of other plurals, and what stands there in the singular.
+ENDINGS = {"(?<=..)ies$": "y", "(?<=..ss|..ch|..sh)es$|(?<=..x)es$|(?<![sui])s$": ""}
 
 
 def singular(word: str) -> str:
     """Return the singular of an English noun; a word that is none already stays."""
     low = word.lower()
-    if low in _PLURALS or low in _ALWAYS_PLURAL:
-        return _PLURALS.get(low, word)
-    for ending, one in (("ies", "y"), ("sses", "ss"), ("xes", "x"), ("ches", "ch"), ("shes", "sh")):
-        if low.endswith(ending) and len(low) > len(ending) + 1:
-            return word[: -len(ending)] + one
-    return word[:-1] if low.endswith("s") and not low.endswith(("ss", "us", "is")) else word
+    if low in PLURALS or low in ALWAYS_PLURAL:
+        return PLURALS.get(low, word)
+    for ending, one in ENDINGS.items():
+        word = re.sub(ending, one, word, flags=re.IGNORECASE)
+    return word
 
 
 def is_part(word: str) -> bool:
@@ -273,7 +274,7 @@ _SIDES: dict[str, Side] = {
     "above": "above", "over": "above", "below": "below", "under": "below", "underneath": "below",
     "beneath": "below", "behind": "behind", "in back of": "behind", "in front of": "in front of",
 }  # fmt: skip
-_NUMBERS = ["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+NUMBERS = ["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 PREPOSITIONS: dict[tuple[str, ...], Side | Literal["nearest", "farthest", "of"]] = {
     ("of",): "of",
     **{(word, to): kind for word, kind in _DISTANCES.items() for to in ("to", "from")},
@@ -402,7 +403,7 @@ def _clause(tokens: list[str]) -> Phrase:
             return Superlative(kind, _related(tokens[1:at]), _related(tokens[at + 1 :]))
         return Superlative(kind, what)
     digits = low[0] if re.fullmatch("[0-9]{1,3}", low[0]) else "0"
-    count = _NUMBERS.index(low[0]) + 1 if low[0] in _NUMBERS else int(digits)
+    count = NUMBERS.index(low[0]) + 1 if low[0] in NUMBERS else int(digits)
     if count and _names(tokens[1:]):
         what = _clause(tokens[1:])
         return Counted(count, what if count == 1 else _one_of(what))

@@ -38,6 +38,8 @@ class Rule:
     nearest: float = 0.15  # by this at least,
     farthest: float = 1.0  # and by this at most
     around: float = 2.0  # times the reach: from wholes that fit a thing so nearly, its parts are taken
+    strict: float = 0.25  # times the reach: the answers that the range of a count is taken from
+    wide: float = 2.0
     nothing: float = float(logit(np.array(2 * NARROWEST)))  # fit; what fits less has no feature behind it
     smallest: int = SMALLEST  # Gaussians; smaller regions are crumbs and count where there is nothing else
     narrowest: float = NARROWEST  # distance of a relevancy from 0 and 1; least spread

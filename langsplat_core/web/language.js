@@ -7,6 +7,7 @@ import {
   decide,
   fitOf,
   heatRange,
+  leastFit,
   levelRange,
   regionRelevancies,
   sigmoid,
@@ -16,7 +17,8 @@ import { Space, wholeOf } from "./space.js";
 import { namedBy, nearest, parse, phraseKey, splitPhrases, thingAndPart, tidy } from "./words.js";
 
 // [page]
-const LISTS = ["articles", "stop_words", "adjectives", "parts", "also_nouns"];
+const LISTS = ["articles", "stop_words", "adjectives", "parts", "also_nouns", "always_plural"];
+const TABLES = ["superlatives", "plurals", "endings"];
 const GRID = { neighbours: 16, most: 64, side: 5 }; // as of query/answers.py, smoothed
 
 // Means of values (K) around points (3 K), smoothed on a grid that grows with them.
@@ -72,12 +74,12 @@ class Language {
     this.space = new Space(meta, this.tensors);
     this.keys = new Map(meta.keys.map((key, row) => [key, row]));
     this.taught = new Map(meta.taught.map((word, row) => [phraseKey(word.name), { ...word, row }]));
-    const { prepositions, superlatives, articles } = meta.grammar;
+    const { prepositions, articles } = meta.grammar;
     const longest = Object.keys(prepositions).sort((a, b) => b.length - a.length);
     this.lists = {
+      ...meta.grammar,
       ...Object.fromEntries(LISTS.map((name) => [name, new Set(meta.grammar[name])])),
-      prepositions,
-      superlatives,
+      ...Object.fromEntries(TABLES.map((name) => [name, new Map(Object.entries(meta.grammar[name]))])),
       leading: new RegExp(`^(?:(?:${articles.join("|")}) )+`, "i"),
       related: new RegExp(`^(.+?) (${longest.join("|")}) (.+)$`, "i"),
     };
@@ -106,7 +108,7 @@ class Language {
 
   // The answer to a tree of phrases (words.js, parse): of what is asked for, the regions in whose wholes the
   // relation holds.
-  follow({ text, kind, what, anchor }, levelName, camera) {
+  follow({ text, kind, what, anchor, count }, levelName, camera) {
     if (!kind) {
       return this.ask(text, levelName);
     }
@@ -117,6 +119,12 @@ class Language {
       return this.restricted(part, this.wholesOf(part), other);
     }
     const asked = this.thing(what, levelName, camera);
+    if (kind === "counted") {
+      const { found, reached, margin, probability } = asked.verdict;
+      const enough = found && this.count(asked) >= count;
+      const judged = verdict(this.meta.rule, enough, reached, margin, probability);
+      return this.answer(asked.phrase, { ...asked, verdict: judged }, asked.codes);
+    }
     const things = this.wholesOf(asked);
     if (kind === "without") {
       const left = things.filter((thing) => !others.includes(thing));
@@ -128,6 +136,20 @@ class Language {
   // The wholes that the regions of an answer are parts of, or are.
   wholesOf({ inside }) {
     return [...new Set(inside.map((region) => wholeOf(this.regions, region)))];
+  }
+
+  // The number of wholes that an answer has parts of or is, if it reached further down: a count needs as many.
+  count({ inside, level, regionFits }) {
+    const { rule, space } = this.meta;
+    const least = leastFit(rule, Math.max(...inside.map((region) => regionFits[region])), rule.wide);
+    const sizes = {};
+    for (let [region, last] = levelRange(this.regions, level); region < last; ++region) {
+      const whole = wholeOf(this.regions, region);
+      sizes[whole] = (sizes[whole] ?? 0) + (regionFits[region] >= least ? this.regions.sizes[region] : 0);
+    }
+    const [fewest, share] = space.specks;
+    const solid = Math.max(fewest, share * Math.max(...Object.values(sizes)));
+    return Object.values(sizes).filter((size) => size >= solid).length;
   }
 
   // The answer to a part of a thing, or on the wholes of a thing with structure.
@@ -355,22 +377,9 @@ class Language {
     return [0, 1, 2].map((channel) => Float32Array.from(own, (code) => colour(code, channel)));
   }
 
-  // Phrases that go on from what was typed (query/inventory.py, completions).
-  completions(text, most = 7) {
-    const typed = phraseKey(text);
-    if (!typed || /\s$/.test(text)) {
-      return [];
-    }
-    const phrases = [...this.taught.keys(), ...this.meta.phrases];
-    const whole = phrases.filter((phrase) => phrase.startsWith(typed) && phrase !== typed);
-    const space = typed.lastIndexOf(" ");
-    if (space < 0 || !this.encoder) {
-      return whole.slice(0, most);
-    }
-    const begun = typed.slice(0, space);
-    const last = typed.slice(space + 1);
-    const words = Object.keys(this.encoder.words).filter((word) => word.startsWith(last) && word !== last);
-    return [...new Set([...whole, ...words.map((word) => `${begun} ${word}`)])].slice(0, most);
+  // Eight corners of the box of a region, relative to the page's origin.
+  corners(region) {
+    return this.tensors.corners.subarray(24 * region, 24 * region + 24);
   }
 }
 // [/page]

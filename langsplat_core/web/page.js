@@ -2,7 +2,7 @@
 
 import { readPage } from "./data.js";
 import { Language, PhraseError } from "./language.js";
-import { Controls, add, cornersOf, inner, project, unit } from "./camera.js";
+import { Controls, cornersOf, project } from "./camera.js";
 import { Painter } from "./draw.js";
 import { wholeOf } from "./space.js";
 
@@ -95,6 +95,8 @@ class Page {
     if (examples.length) {
       byId("phrase").placeholder = `${examples.slice(0, 2).join(", ")} …`;
     }
+    const offered = language ? [...this.language.taught.keys(), ...language.phrases] : [];
+    byId("list").append(...offered.map((value) => element("option", "", { value })));
     byId("examples").append(
       ...examples.map((phrase) => {
         const button = element("button", phrase, { type: "button" });
@@ -116,34 +118,19 @@ class Page {
 
   listenToSearch() {
     const input = byId("phrase");
-    const list = byId("list");
     byId("search").addEventListener("submit", (event) => {
       event.preventDefault();
-      const chosen = list.querySelector("[aria-selected=true]");
-      this.search(chosen ? chosen.textContent : input.value);
+      this.search(input.value);
     });
-    input.addEventListener("input", () => {
-      this.offer(this.language.completions(input.value));
+    input.addEventListener("input", (event) => {
       byId("clear").hidden = !input.value;
-    });
-    input.addEventListener("blur", () => this.offer([]));
-    input.addEventListener("keydown", (event) => {
-      const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
-      if (event.key === "Escape" && !list.hidden) {
-        this.offer([]);
-      } else if (event.key === "Escape") {
-        this.search("");
-      } else if (step && !list.hidden) {
-        this.mark(step);
-      } else {
-        return;
+      if (!event.inputType || event.inputType === "insertReplacementText") {
+        this.search(input.value); // one of the list was chosen
       }
-      event.preventDefault();
     });
-    list.addEventListener("pointerdown", (event) => {
-      event.preventDefault(); // the box keeps the focus
-      if (event.target.role === "option") {
-        this.search(event.target.textContent);
+    input.addEventListener("keydown", (event) => {
+      if (event.key === "Escape") {
+        this.search("");
       }
     });
     byId("clear").addEventListener("click", () => {
@@ -264,31 +251,6 @@ class Page {
     this.update();
   }
 
-  // Options under the search box; the arrow keys mark one, which enter then asks.
-  offer(phrases) {
-    const list = byId("list");
-    const input = byId("phrase");
-    list.replaceChildren(
-      ...phrases.map((phrase, i) =>
-        element("li", phrase, { role: "option", id: `option${i}`, ariaSelected: "false" }),
-      ),
-    );
-    list.hidden = phrases.length === 0;
-    input.setAttribute("aria-expanded", String(!list.hidden));
-    input.removeAttribute("aria-activedescendant");
-  }
-
-  mark(step) {
-    const options = [...byId("list").children];
-    const now = options.findIndex((option) => option.ariaSelected === "true");
-    const next = options[(now + step + options.length + (now < 0 && step < 0 ? 1 : 0)) % options.length];
-    for (const option of options) {
-      option.ariaSelected = String(option === next);
-    }
-    byId("phrase").setAttribute("aria-activedescendant", next.id);
-    next.scrollIntoView({ block: "nearest" });
-  }
-
   search(phrase) {
     this.take(phrase);
     this.remember(true);
@@ -297,7 +259,6 @@ class Page {
   take(phrase) {
     byId("phrase").value = phrase;
     byId("clear").hidden = !phrase;
-    this.offer([]);
     this.phrase = phrase;
     if (!phrase.trim() && OF_ANSWERS.includes(this.display)) {
       this.display = "rgb";
@@ -449,11 +410,6 @@ class Page {
     };
   }
 
-  // Eight corners of the box of a region, relative to the page's origin.
-  corners(region) {
-    return this.language.tensors.corners.subarray(24 * region, 24 * region + 24);
-  }
-
   // Corners of the boxes of an answer, the best first: one for each whole that answers or has parts that do.
   boxes(answer) {
     if (answer.verdict.outcome === "not here") {
@@ -468,28 +424,9 @@ class Page {
       const whole = wholeOf(this.language.regions, region);
       things.set(whole, [...(things.get(whole) ?? []), region]);
     }
-    const boxOf = (own) => (own.length > 1 ? this.around(own) : this.corners(own[0]));
-    return [...things.values()].slice(0, MOST_BOXES).map(boxOf);
-  }
-
-  // Corners of the box around those of several regions, along the sides of the largest one's.
-  around(regions) {
-    const { sizes } = this.language.regions;
-    const largest = this.corners(regions.reduce((a, b) => (sizes[b] > sizes[a] ? b : a)));
-    const sides = [4, 2, 1].map((corner) => {
-      const edge = [0, 1, 2].map((axis) => largest[3 * corner + axis] - largest[axis]);
-      return unit(edge);
-    });
-    const points = regions.flatMap((region) => cornersOf(this.corners(region)));
-    const ends = sides.map((side) => {
-      const along = points.map((point) => inner(side, point));
-      return [Math.min(...along), Math.max(...along)];
-    });
-    const corners = Array.from({ length: 8 }, (_, corner) => {
-      const lengths = ends.map((pair, k) => pair[(corner >> (2 - k)) & 1]);
-      return lengths.reduce((sum, length, k) => add(sum, sides[k], length), [0, 0, 0]);
-    });
-    return Float32Array.from(corners.flat());
+    return [...things]
+      .slice(0, MOST_BOXES)
+      .map(([whole, own]) => this.language.corners(own.length > 1 ? whole : own[0]));
   }
 
   view(number) {

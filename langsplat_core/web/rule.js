@@ -189,4 +189,4 @@ function heatRange(rule, peak, found, best) {
 }
 // [/page]
 
-export { combined, decide, fitOf, heatRange, levelRange, regionRelevancies, sigmoid, verdict };
+export { combined, decide, fitOf, heatRange, leastFit, levelRange, regionRelevancies, sigmoid, verdict };

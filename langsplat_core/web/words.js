@@ -94,8 +94,21 @@ function splitPhrases(line, lists) {
   });
 }
 
-// What a phrase asks for: { text }, or { kind, what, anchor } of such. A part of query/grammar.py's rules: no
-// numbers, and things that others stand to are one level deep.
+// A tree with what is asked for in the singular.
+function oneOf(tree, lists) {
+  if (tree.kind) {
+    return { ...tree, what: oneOf(tree.what, lists) };
+  }
+  const words = tree.text.split(" ");
+  const noun = words.pop();
+  const { plurals, endings, always_plural: always } = lists;
+  const one = [...endings].reduce((word, [end, by]) => word.replace(RegExp(end, "i"), by), noun);
+  const low = noun.toLowerCase();
+  return { text: [...words, plurals.get(low) ?? (always.has(low) ? noun : one)].join(" ") };
+}
+
+// What a phrase asks for: { text }, or { kind, what, anchor } of such, of a count { count, what }. A part of
+// query/grammar.py's rules: things that others stand to are one level deep.
 function parse(text, lists) {
   const bare = text.replace(lists.leading, "");
   const [, wanted, unwanted] = bare.match(EXCLUDE) ?? [];
@@ -103,11 +116,20 @@ function parse(text, lists) {
     return { kind: "without", what: parse(wanted, lists), anchor: parse(unwanted, lists) };
   }
   const [first, ...rest] = bare.split(" ");
-  const kind = lists.superlatives[first.toLowerCase()];
+  const kind = lists.superlatives.get(first.toLowerCase());
   if (kind && names(rest.join(" "), lists)) {
     const what = parse(rest.join(" "), lists);
     const far = what.kind === "near" && ["nearest", "farthest"].includes(kind);
     return far ? { ...what, kind } : { kind, what, anchor: null };
+  }
+  const count = lists.numbers.indexOf(first.toLowerCase()) + 1 || (/^\d{1,3}$/.test(first) ? +first : 0);
+  if (count && names(rest.join(" "), lists)) {
+    const what = parse(rest.join(" "), lists);
+    return { kind: "counted", count, what: count === 1 ? what : oneOf(what, lists) };
+  }
+  const [, those, side] = bare.match(/^(.+) on the (left|right)$/i) ?? [];
+  if (those && names(those, lists)) {
+    return { kind: `${side.toLowerCase()}most`, what: parse(those, lists), anchor: null };
   }
   const [, before, preposition, after] = bare.match(lists.related) ?? [];
   const relation = lists.prepositions[preposition?.toLowerCase()];

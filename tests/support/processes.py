@@ -223,7 +223,7 @@ class Tab:
         inner = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
         letters = self.run(IMAGE, [pose | inner, display, phrase])
         image = np.frombuffer(base64.b64decode(letters), np.uint8)
-        return image.reshape(camera.height, camera.width, 4)[..., :3]
+        return image.reshape(camera.height, camera.width, 4)[::-1, :, :3]
 
 
 @contextmanager
