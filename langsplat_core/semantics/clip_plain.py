@@ -122,6 +122,8 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
 class PlainClipImages:
     """An `ImageTower` in NumPy."""
 
+    batch = 8  # images at a time: what a layer makes of more leaves the processor's cache
+
     def __init__(self, config: VisionConfig, tensors: Tensors, statistics: tuple[Array, Array]) -> None:
         self.config, self.tensors, self.statistics = config, tensors, statistics
         self.patch = len(tensors[f"{PATCHES}patch_embedding.weight"][0, 0])  # px, its side

@@ -205,7 +205,7 @@ class Encoder(PhraseEncoder):
 
     def __init__(self, weights: Weights, text: TextTower, images: ImageTower, batch: int) -> None:
         super().__init__(weights, text)
-        self._images, self._batch = images, batch
+        self._images, self._batch = images, min(batch, getattr(images, "batch", batch))
         self.image_size = images.image_size  # side of the images it takes, px
 
     def encode_images(self, crops: Array | Sequence[Array]) -> Array:
