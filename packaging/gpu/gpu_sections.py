@@ -40,7 +40,7 @@ from langsplat_core.extensions.benchmarks.raster_speed import (
     default_camera,
     describe_machine,
     random_scene,
-    reference_windows,
+    reference_window,
     warm_up,
 )
 from langsplat_core.extensions.benchmarks.raster_speed import measure as measure_backend
@@ -231,7 +231,7 @@ def _said_by(*command: str) -> str:
 
 
 NOTES = """- Through the interface, arrays in and out of NumPy: every `frame` copies the scene to the device.
-- Errors against the float64 reference on three windows of 64x64 pixels, values in [0, 1); the reference caps
+- Errors against the float64 reference in a window of 112x112 pixels, values in [0, 1); the reference caps
   one Gaussian's alpha where the backend does: the CPU at 0.99, gsplat 1.5 at 0.999.
 - MiB: of the process's memory, not the device's.
 """
@@ -248,7 +248,7 @@ def measure_raster(plan: Plan) -> Iterator[str]:
         case = Case("random", random_scene(count), default_camera(*size))
         rows = []
         for backend in backends:
-            exact = reference_windows(case.gaussians, case.camera, settings[backend.name])
+            exact = reference_window(case.gaussians, case.camera, settings[backend.name])
             for channels in plan.channels:
                 rows += measure_backend(backend, case, channels, exact)
         yield speed_table(rows)
@@ -482,7 +482,7 @@ def tables(plan: Plan, context: moderngl.Context) -> Iterator[str]:
     backends = [load_rasterizer("opengl", ctx=context, precision=p) for p in ("single", "half")]
     warm_up(backends, (3,))
     for case in cases:
-        exact = reference_windows(case.gaussians, case.camera, ENDLESS)
+        exact = reference_window(case.gaussians, case.camera, ENDLESS)
         rows = []
         for backend in backends:
             rows += measure_backend(backend, case, 3, exact)

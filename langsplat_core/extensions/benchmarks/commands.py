@@ -30,8 +30,6 @@ class _Eval:
     the benchmark, or one scene's folder of it. With --maps the latter alone."""
     maps: Path | None = None
     """Score these maps of another system, files named VIEW/PHRASE.npy or .png, instead of a scene."""
-    only: tuple[str, ...] = ()
-    """Names of the benchmark's scenes to score; all of them if empty."""
     json: OutFile | None = None
     """Also write all figures to this file."""
     encoder: Annotated[EncoderOption, Needs("is_ours", "a scene in place of --maps")] = ""
@@ -56,7 +54,7 @@ class _Eval:
         subject = Evaluated(scene, self.maps, self.encoder)
         benchmark = read(self.paths[-1])
         with TerminalProgress() as progress:
-            report = run_benchmark(benchmark, profile, subject, load_text_encoder, self.only, progress)
+            report = run_benchmark(benchmark, profile, subject, load_text_encoder, progress)
         print(table(report))
         if self.json is not None:
             save_json(self.json, report)

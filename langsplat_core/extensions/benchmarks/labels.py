@@ -184,9 +184,7 @@ def read_lerf_ovs(folder: Path) -> Benchmark:
     else:
         found = {}
     if not found:
-        other = (folder / "segmentations").is_dir() or any(folder.glob("*/segmentations"))
-        hint = "it looks like 3D-OVS: use `langsplat eval 3d-ovs`; " if other else ""
-        raise InputError(f"{folder}: not in the layout of LERF-OVS; {hint}{WANTED}")
+        raise InputError(f"{folder}: not in the layout of LERF-OVS; {WANTED}")
     return Benchmark("lerf-ovs", {name: _read_scene(name, *pair) for name, pair in found.items()})
 
 
@@ -261,9 +259,7 @@ def read_3d_ovs(folder: Path) -> Benchmark:
         raise InputError(f"{folder}: no such folder; {WANTED_PICTURES}")
     scenes = [folder] if _is_scene(folder) else [path for path in sorted(folder.iterdir()) if _is_scene(path)]
     if not scenes:
-        other = (folder / "label").is_dir() or (folder.parent / "label" / folder.name).is_dir()
-        hint = "it looks like LERF-OVS: use `langsplat eval lerf-ovs`; " if other else ""
-        raise InputError(f"{folder}: not in the layout of 3D-OVS; {hint}{WANTED_PICTURES}")
+        raise InputError(f"{folder}: not in the layout of 3D-OVS; {WANTED_PICTURES}")
     return Benchmark("3d-ovs", {scene.resolve().name: _read_ovs3d_scene(scene) for scene in scenes})
 
 

@@ -2,7 +2,7 @@
 
 * Time: median of the calls that fit into 0.3 seconds (at least three), after a first call that is not
   counted. A call of more than two seconds is measured once.
-* Error: against the float64 reference (`ReferenceWindows`), from a call of its own.
+* Error: against the float64 reference (`ReferenceWindow`), from a call of its own.
 * Memory: how far the process's resident set rises at its highest during the first call, with the heap's
   free pages given back before. It counts everything: arrays of NumPy, PyTorch's, kernels' own, and what a
   software OpenGL driver holds. Linux only; elsewhere unknown.
@@ -41,16 +41,14 @@ from langsplat_core.scene import Camera, Gaussians, look_at
 Pixels = Annotated[int, Range(1, 65_536)]
 Size = tuple[Pixels, Pixels]  # width and height of an image
 Channels = Annotated[int, Range(1, 4_096)]  # values per Gaussian
-WINDOW = 64  # pixels a side
-_PLACES = ((0.5, 0.5), (0.3, 0.42), (0.64, 0.7))  # centres of the windows, as fractions of the image
+WINDOW = 112  # pixels a side of the window in the middle that errors are measured on
 _BAND = 1e-3  # relative distance to a cut-off; float32 footprints of a GPU are within about 3e-4 of it
 _FLIP = 2e-5  # an error in the band is a flip if larger than this and than twice all others
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-_NOTES = """- The size with most scenes and the most channels; every other measurement is in raster.json.
-- ms: median of the calls after the first.
+_NOTES = """- ms: median of the calls after the first.
 - frame: project + splat with a camera that has moved since the last frame.
 - MiB: rise of the process's resident set at its highest during the first call.
-- Errors: against the float64 reference on three windows of 64x64 pixels, values in [0, 1); of `backward`,
+- Errors: against the float64 reference in a window of 112x112 pixels, values in [0, 1); of `backward`,
   that of the derivatives by the values.
 - Cut-offs are an alpha of 1/255 and a transmittance of 1e-4. A pixel within 0.1 % of one may come out on its
   other side: a flip, counted where its error exceeds all others. gather is compared without such
@@ -60,13 +58,13 @@ _NOTES = """- The size with most scenes and the most channels; every other measu
 
 @dataclass(frozen=True)
 class BenchRaster:
-    """Time, error and memory of every rasterizer that loads here, in one run; takes some minutes."""
+    """Time, error and memory of every rasterizer that loads here, in one run; takes a minute or two."""
 
     counts: tuple[Count, ...] = (10_000, 31_000, 100_000, 200_000, 1_000_000)
-    """Sizes of the random scenes, drawn at the middle one of --sizes."""
-    sizes: Annotated[tuple[Size, ...], Range(1, 65_536, some=True)] = ((320, 240), (640, 480), (960, 720))
-    """Widths and heights of the image, pixels; the last random scene but the largest is drawn at each."""
-    channels: Annotated[tuple[Channels, ...], Range(1, 4_096, some=True)] = (3, 12)
+    """Gaussians of the random scenes."""
+    size: Size = (640, 480)
+    """Width and height of the image, pixels."""
+    channels: Channels = 12
     """Values per Gaussian."""
     scenes: tuple[Path, ...] = ()
     """Real scenes to measure beside the random ones, from their first camera, else one that frames them."""
@@ -133,6 +131,15 @@ class Case:
 
 
 @dataclass(frozen=True)
+class Error:
+    """Differences from the reference."""
+
+    largest: float  # over all pixels compared
+    off_cuts: float  # over those where no cut-off is near
+    flips: int  # pixels near a cut-off that came out on its other side
+
+
+@dataclass(frozen=True)
 class Measurement:
     """One backend doing one operation."""
 
@@ -145,9 +152,7 @@ class Measurement:
     backend: str
     milliseconds: float = 0.0  # median
     peak_mib: float | None = None  # rise of the resident set; None: unknown
-    largest_error: float | None = None  # None: not compared
-    error_off_cuts: float | None = None  # away from cut-offs
-    flips: int | None = None  # pixels near a cut-off that came out on its other side
+    error: Error | None = None  # None: not compared
 
 
 def run_plan(plan: BenchRaster, progress: Progress = silent) -> tuple[dict[str, object], list[Measurement]]:
@@ -155,37 +160,26 @@ def run_plan(plan: BenchRaster, progress: Progress = silent) -> tuple[dict[str, 
     machine = describe_machine()
     backends = _backends(machine)
     progress("bench: compiling", 0.0)
-    warm_up(backends, plan.channels)
-    rows = list[Measurement]()
-    pairs = sweep(plan.counts, plan.sizes)
-    total = len(plan.scenes) + len(pairs)
-    for n, case in enumerate(_cases(plan, pairs)):
-        name = f"bench: {case.scene} {len(case.gaussians)} at {case.camera.width}x{case.camera.height}"
+    warm_up(backends, (plan.channels,))
+    rows, total = list[Measurement](), len(plan.scenes) + len(plan.counts)
+    for n, case in enumerate(_cases(plan)):
+        name = f"bench: {case.scene} {len(case.gaussians)}"
         progress(f"{name}, reference", n / total)
-        exact = reference_windows(case.gaussians, case.camera)
-        steps = [(channels, backend) for channels in plan.channels for backend in backends]
-        for step, (channels, backend) in enumerate(steps):
-            progress(f"{name}, {backend.name}", (n + step / len(steps)) / total)
-            rows += measure(backend, case, channels, exact)
+        exact = reference_window(case.gaussians, case.camera)
+        for step, backend in enumerate(backends):
+            progress(f"{name}, {backend.name}", (n + step / len(backends)) / total)
+            rows += measure(backend, case, plan.channels, exact)
     progress("bench: done", 1.0)
     return machine, rows
 
 
-def sweep(counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...]) -> list[tuple[int, tuple[int, int]]]:
-    """Return every count at the middle size and every size at the last count but one, small ones first."""
-    middle, pivot = sorted(sizes)[len(sizes) // 2], sorted(counts)[-2:][0]
-    pairs = {(count, middle) for count in counts} | {(pivot, size) for size in sizes}
-    return sorted(pairs, key=lambda pair: (pair[0], pair[1][0] * pair[1][1]))
-
-
-def _cases(plan: BenchRaster, pairs: list[tuple[int, tuple[int, int]]]) -> Iterator[Case]:
-    for count, size in pairs:
-        yield Case("random", random_scene(count), default_camera(*size))
+def _cases(plan: BenchRaster) -> Iterator[Case]:
+    for count in sorted(plan.counts):
+        yield Case("random", random_scene(count), default_camera(*plan.size))
     for path in plan.scenes:
         scene = load_scene(path)
-        size = sorted(plan.sizes)[len(plan.sizes) // 2]
-        camera = scene.cameras[0] if scene.cameras else scene.framing_camera(size)
-        yield Case(path.name, scene.gaussians, camera.resized(*size))
+        camera = scene.cameras[0] if scene.cameras else scene.framing_camera(plan.size)
+        yield Case(path.name, scene.gaussians, camera.resized(*plan.size))
 
 
 def random_scene(count: int) -> Gaussians:
@@ -255,22 +249,19 @@ def warm_up(backends: Sequence[Rasterizer], channels: Sequence[int]) -> None:
 
 
 def measure(
-    backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindows"
+    backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindow"
 ) -> Iterator[Measurement]:
     """Time every operation of `backend` on one case."""
     shape = case.scene, len(case.gaussians), case.camera.width, case.camera.height, channels
     name = f"{backend.name} {getattr(backend, 'precision', '')}".strip()
     for operation, call, error_of in _operations(backend, case, channels):
         seconds, peak = _timed(call)
-        row = Measurement(*shape, operation, name, 1e3 * seconds, peak)
-        if error_of is not None:
-            error = error_of(exact)
-            row = replace(row, largest_error=error.largest, error_off_cuts=error.off_cuts, flips=error.flips)
-        yield row
+        error = None if error_of is None else error_of(exact)
+        yield Measurement(*shape, operation, name, 1e3 * seconds, peak, error)
 
 
 # Name, what is timed, and its error where one is known.
-_Operation = tuple[str, Callable[[], Any], "Callable[[ReferenceWindows], Error] | None"]
+_Operation = tuple[str, Callable[[], Any], "Callable[[ReferenceWindow], Error] | None"]
 
 
 def _operations(backend: Rasterizer, case: Case, channels: int) -> Iterator[_Operation]:
@@ -322,151 +313,81 @@ def _timed(call: Callable[[], Any]) -> tuple[float, float | None]:
 # The reference.
 
 
-@dataclass(frozen=True)
-class Error:
-    """Differences from the reference."""
-
-    largest: float  # over all pixels compared
-    off_cuts: float  # over those where no cut-off is near
-    flips: int  # pixels near a cut-off that came out on its other side
-
-
 @dataclass(frozen=True, eq=False)
 class ReferenceWindow:
-    """Part of an image and its exact blending weights."""
+    """The float64 reference in the middle of one view of N Gaussians, which may be millions.
 
-    at: tuple[slice, slice]  # rows and columns of the image
-    weights: scipy.sparse.csr_array  # (pixels, K) alpha_i T_i, K = len(ReferenceWindows.rows)
-    band: Array  # (h, w) bool: pixels near a cut-off
-
-
-@dataclass(frozen=True, eq=False)
-class ReferenceWindows:
-    """The float64 reference on three small windows of one view of N Gaussians, which may be millions.
-
-    The reference draws Gaussians one by one, so a whole image of a million of them takes minutes. A window's
-    pixels depend only on the Gaussians that reach into it; projected by the whole image's camera (as the
-    Jacobian's clamp depends on the image's size) and shifted, they give exactly the pixels of the whole.
+    The reference draws Gaussians one by one, so a whole image of a million of them takes minutes. The
+    window's pixels depend only on the Gaussians that reach into it; projected by the whole image's camera (as
+    the Jacobian's clamp depends on the image's size) and shifted, they give exactly the pixels of the whole.
 
     Pixels where rounding may decide a cut-off (an alpha of just 1/255, a transmittance of just 1e-4) are the
     *band*: there one flip outweighs every other error, so flips are counted and the error is stated without
     them.
     """
 
-    rows: Array  # (K,) ascending: the Gaussians that reach into a window
-    windows: tuple[ReferenceWindow, ...]
+    at: tuple[slice, slice]  # rows and columns of the image
+    rows: Array  # (K,) ascending: the Gaussians that reach into it
+    weights: scipy.sparse.csr_array  # (h * w, K) their exact blending weights alpha_i T_i
+    band: Array  # (h, w) bool: pixels near a cut-off
 
-    def splat(self, values: Array) -> list[Array]:
-        """(N, C) -> each window's (h, w, C) image, float64."""
-        x = values[self.rows].astype(np.float64)
-        return [(w.weights @ x).reshape(*w.band.shape, -1) for w in self.windows]
+    def splat(self, values: Array) -> Array:
+        """(N, C) -> the window's (h, w, C) image, float64."""
+        image: Array = self.weights @ values[self.rows].astype(np.float64)
+        return image.reshape(*self.band.shape, -1)
 
     def splat_error(self, image: Array, values: Array) -> Error:
         """Error of the (H, W, C) `image` that a backend made from `values`."""
-        errors = [
-            np.abs(image[window.at] - want).max(-1, initial=0)
-            for window, want in zip(self.windows, self.splat(values), strict=True)
-        ]
-        pairs = list(zip(errors, self.windows, strict=True))
-        off = max(float(error[~window.band].max(initial=0)) for error, window in pairs)
-        flips = sum(int((error[window.band] > max(_FLIP, 2 * off)).sum()) for error, window in pairs)
-        return Error(max(float(error.max()) for error in errors), off, flips)
-
-    def masked(self, image: Array) -> Array:
-        """Return `image` with 0 outside the windows, which know nothing of the rest, and in their bands."""
-        kept = np.zeros_like(image)
-        for window in self.windows:
-            kept[window.at] = image[window.at] * ~window.band[..., None]
-        return kept
-
-    def gather(self, masked: Array) -> Array:
-        """(H, W, C) image from `masked` -> (K, C) values of the Gaussians `rows`, float64; others get 0."""
-        # Windows may overlap: every pixel counts once.
-        left = masked.astype(np.float64)
-        total = np.zeros((len(self.rows), masked.shape[2]))
-        for window in self.windows:
-            total += window.weights.T @ left[window.at].reshape(-1, masked.shape[2])
-            left[window.at] = 0
-        return total
+        errors = np.abs(image[self.at] - self.splat(values)).max(-1, initial=0)
+        off = float(errors[~self.band].max(initial=0))
+        flips = int((errors[self.band] > max(_FLIP, 2 * off)).sum())
+        return Error(float(errors.max()), off, flips)
 
     def gather_error(self, gather: Callable[[Array], Array], image: Array) -> Error:
-        """Error of a backend's (H, W, C) -> (N, C), `masked` to what is off the cut-offs."""
-        masked = self.masked(image)
+        """Error of a backend's (H, W, C) -> (N, C), of an image that is 0 in the band and off the window."""
+        masked = np.zeros_like(image)
+        masked[self.at] = image[self.at] * ~self.band[..., None]
         values = gather(masked)
         want = np.zeros(values.shape)
-        want[self.rows] = self.gather(masked)
+        want[self.rows] = self.weights.T @ masked[self.at].reshape(-1, image.shape[2]).astype(np.float64)
         off = float(np.abs(values - want).max(initial=0))
         return Error(off, off, 0)
 
 
-def reference_windows(
+def reference_window(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA
-) -> ReferenceWindows:
-    """Draw the windows with the reference; about 0.1 ms for each Gaussian that reaches into one."""
+) -> ReferenceWindow:
+    """Draw the window with the reference; about 0.1 ms for each Gaussian that reaches into it."""
     footprints = project(gaussians, camera, settings)
     reach = rim(footprints, settings, _BAND)
+    width, height = size = np.minimum(WINDOW, (camera.width, camera.height))
+    start = (np.array([camera.width, camera.height]) - size) // 2
     low, high = footprints.means_px - reach, footprints.means_px + reach
-    places = [_place(camera, fraction) for fraction in _PLACES]
-    reaching = []
-    for down, across in places:
-        inside = (high > (across.start, down.start)) & (low < (across.stop, down.stop))
-        reaching.append(np.flatnonzero(inside.all(1) & (footprints.opacities > 0)))
-    rows = np.unique(np.concatenate(reaching))
-    windows = []
-    for at, mine in zip(places, reaching, strict=True):
-        part = Footprints(
-            **{column.name: getattr(footprints, column.name)[mine] for column in fields(Footprints)}
-        )
-        windows.append(_window(part, camera, settings, at, (len(rows), np.searchsorted(rows, mine))))
-    return ReferenceWindows(rows, tuple(windows))
-
-
-def _place(camera: Camera, fraction: tuple[float, float]) -> tuple[slice, slice]:
-    slices = []
-    for size, part in ((camera.height, fraction[1]), (camera.width, fraction[0])):
-        start = min(max(round(size * part) - WINDOW // 2, 0), max(size - WINDOW, 0))
-        slices.append(slice(start, min(start + WINDOW, size)))
-    return slices[0], slices[1]
-
-
-def _window(
-    footprints: Footprints,
-    camera: Camera,
-    settings: RasterSettings,
-    at: tuple[slice, slice],
-    place: tuple[int, Array],
-) -> ReferenceWindow:
-    """`place`: how many columns the matrix has, and the column of each footprint."""
-    count, where_to = place
-    rows, columns = at
-    height, width = rows.stop - rows.start, columns.stop - columns.start
-    moved = replace(footprints, means_px=footprints.means_px - (columns.start, rows.start))
-    view = ReferenceView(moved, replace(camera, width=width, height=height), settings)
-    pixels = np.arange(height * width).reshape(height, width)
+    inside = (high > start).all(1) & (low < start + size).all(1) & (footprints.opacities > 0)
+    rows = np.flatnonzero(inside)
+    own = {column.name: getattr(footprints, column.name)[rows] for column in fields(Footprints)}
+    moved = Footprints(**own | {"means_px": own["means_px"] - start})
+    view = ReferenceView(moved, replace(camera, width=int(width), height=int(height)), settings)
+    pixels = np.arange(width * height).reshape(height, width)
     indices, where, weights = [np.empty(0, int)], [np.empty(0, int)], [np.empty(0)]
     for step in view.steps():
         hit = step.weights > 0
         where.append(pixels[step.window][hit])
         weights.append(step.weights[hit])
-        indices.append(np.full(len(where[-1]), where_to[step.index]))
+        indices.append(np.full(len(where[-1]), step.index))
     entries = (np.concatenate(weights), (np.concatenate(where), np.concatenate(indices)))
-    matrix = scipy.sparse.csr_array(entries, shape=(height * width, count))
-    return ReferenceWindow(at, matrix, view.cut_off_band(_BAND))
+    matrix = scipy.sparse.csr_array(entries, shape=(width * height, len(rows)))
+    (left, top), (right, bottom) = start, start + size
+    return ReferenceWindow((slice(top, bottom), slice(left, right)), rows, matrix, view.cut_off_band(_BAND))
 
 
 # The report.
 
 
 def report_text(machine: Mapping[str, object], rows: Sequence[Measurement]) -> str:
-    """Return the machine and the rows of the size with most scenes and the most channels, as Markdown."""
-    counts: dict[tuple[int, int], set[int]] = {}
-    for row in rows:
-        counts.setdefault((row.width, row.height), set()).add(row.gaussians)
-    size = max(counts, key=lambda size: len(counts[size]), default=None)
-    most = max((row.channels for row in rows), default=0)
-    chosen = [row for row in rows if (row.width, row.height) == size and row.channels == most]
+    """Return the machine and the measurements as Markdown."""
     told = "".join(f"- {name}: {value}\n" for name, value in machine.items())
-    return f"# Rasterizers: time against error\n\n{told}\n{table(chosen)}\n{_NOTES}"
+    return f"# Rasterizers: time against error\n\n{told}\n{table(rows)}\n{_NOTES}"
 
 
 def table(rows: Sequence[Measurement]) -> str:
@@ -476,12 +397,8 @@ def table(rows: Sequence[Measurement]) -> str:
         (*head, "error off cut-offs", "largest error", "flips"),
         (
             (r.scene, r.gaussians, f"{r.width}x{r.height}", r.channels, r.operation, r.backend)
-            + (f"{r.milliseconds:.4g}", _cell(r.peak_mib, ".1f"))
-            + (_cell(r.error_off_cuts, ".1e"), _cell(r.largest_error, ".1e"), _cell(r.flips, "d"))
+            + (f"{r.milliseconds:.4g}", "-" if r.peak_mib is None else f"{r.peak_mib:.1f}")
+            + (("-",) * 3 if (e := r.error) is None else (f"{e.off_cuts:.1e}", f"{e.largest:.1e}", e.flips))
             for r in rows
         ),
     )
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)

@@ -284,15 +284,14 @@ def run_benchmark(
     profile: Profile,
     subject: Evaluated,
     load_encoder: LoadEncoder,
-    only: Sequence[str] = (),
     progress: Progress = silent,
 ) -> BenchmarkReport:
-    """Score `subject` on the scenes of `benchmark`, or those named by `only`.
+    """Score `subject` on the scenes of `benchmark`.
 
     Raises InputError for a scene or maps that do not belong to the labels, EncoderError where the text
     encoder cannot be loaded.
     """
-    names = _chosen_scenes(list(benchmark.scenes), only, subject)
+    names = _chosen_scenes(list(benchmark.scenes), subject)
     queries, left_out = list[QueryScore](), list[str]()
     for name in names:
         labelled = benchmark.scenes[name]
@@ -308,20 +307,13 @@ def run_benchmark(
     return BenchmarkReport(benchmark.name, profile, said, tuple(queries), tuple(left_out))
 
 
-def _chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Evaluated) -> list[str]:
-    """Return the names of the `labelled` scenes to score.
-
-    These are `only`, or the one that a scene file is named after where several could be meant. Raises
-    InputError for a name that is not labelled.
-    """
-    wrong = [name for name in only if name not in labelled]
-    if wrong:
-        raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(labelled)}")
-    if only or subject.scene is None or subject.scene.is_dir() or len(labelled) == 1:
-        return list(only or labelled)
+def _chosen_scenes(labelled: Sequence[str], subject: Evaluated) -> list[str]:
+    """Return the names of scenes to score: all `labelled`, or the one that a scene file is named after."""
+    if subject.scene is None or subject.scene.is_dir() or len(labelled) == 1:
+        return list(labelled)
     if subject.scene.stem not in labelled:
         raise InputError(
-            f"{subject.scene} could be any labelled scene of {', '.join(labelled)}; say which with --only"
+            f"{subject.scene} could be any labelled scene of {', '.join(labelled)}; name the folder of one"
         )
     return [subject.scene.stem]
 
@@ -336,7 +328,7 @@ def _scene_source(
     assert subject.scene is not None
     path = subject.scene / f"{labelled.name}.ply" if subject.scene.is_dir() else subject.scene
     if not path.exists():
-        raise InputError(f"{path}: no such scene; leave {labelled.name} out (--only), or name another folder")
+        raise InputError(f"{path}: no such scene; name another folder, or that of one labelled scene")
     # Published maps are read as published.
     rule: AnswerRule = "peak" if isinstance(profile.rule, MapRule) else "regions"
     engine = QueryEngine(searchable(path), load_encoder, encoder_id=subject.encoder, rule=rule)

@@ -8,11 +8,8 @@ mapped into memory and not read, as torch then sees where they end.
 
 import io
 import pickletools
-import tempfile
 import warnings
-import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -66,11 +63,11 @@ def load_torch(path: Path) -> Any:
 
     open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
     stand_ins: Any = [(IgnoredArray if name in _ARRAYS else _Ignored, name) for name in _OF_NUMPY]
-    with _mappable(path) as file, warnings.catch_warnings(), torch.serialization.safe_globals(stand_ins):
+    with warnings.catch_warnings(), torch.serialization.safe_globals(stand_ins):
         warnings.simplefilter("ignore")
         try:
-            archived = _look_through(file)
-            return torch.load(file, map_location="cpu", weights_only=True, mmap=archived)
+            archived = _look_through(path)
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=archived)
         except FormatError as error:
             raise FormatError(f"{path}: {error}") from None
         except Exception:  # noqa: BLE001  a damaged file raises whatever it hits first
@@ -78,30 +75,18 @@ def load_torch(path: Path) -> Any:
             raise FormatError(f"{path}: {reason}") from None
 
 
-@contextmanager
-def _mappable(path: Path) -> Iterator[Path]:
-    """Yield the file, or a copy that lasts as long where members of its archive are deflated."""
-    try:
-        with opened_archive(path, "archive") as archive:
-            deflated = archive.deflated
-    except FormatError:  # torch finds more in a damaged archive than zipfile does
-        deflated = False
-    if not deflated:
-        yield path
-        return
-    # A mapped file outlives its name, where the system lets it be removed.
-    with tempfile.TemporaryDirectory(prefix="langsplat-", ignore_cleanup_errors=True) as folder:
-        copy = Path(folder) / "stored.pth"
-        with opened_archive(path, "archive") as archive, zipfile.ZipFile(copy, "w") as stored:
-            for name in archive.names:
-                stored.writestr(name, archive.read(name, 2**32))
-        yield copy
-
-
 def _look_through(path: Path) -> bool:
     """Return whether a file is an archive. Raises FormatError for what its pickles may not hold."""
     from torch._C import PyTorchFileReader
 
+    packed = False
+    with (
+        suppress(FormatError),
+        opened_archive(path, "archive") as archive,
+    ):  # torch finds more in damaged ones
+        packed = archive.deflated  # whose bytes would be taken for numbers
+    if packed:
+        raise FormatError("its archive is compressed, which torch.save does not; save it again by that")
     with open_for_reading(path)[0] as file:
         archived = file.read(len(_ARCHIVE)) == _ARCHIVE
         file.seek(0)

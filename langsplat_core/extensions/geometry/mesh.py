@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from langsplat_core.arrays import Array, linear_light, rotation_matrices, unit
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.geometry.planes import cloud
+from langsplat_core.extensions.geometry.registration import some_cameras
 from langsplat_core.io.gltf import SIGNS, GltfWriter, node_of
 from langsplat_core.io.ply import CHANNELS, POSITION, write_table
 from langsplat_core.io.quantised import to_bytes
@@ -108,11 +109,11 @@ def fuse(
     how many must show a surface, >= 1; more leave out more, and what is left is nearer to the truth; cameras:
     to be rendered, by default the scene's own, or generated ones. Raises InputError where nothing is seen.
     """
-    chosen = cameras or scene.cameras or scene.spiral_cameras(VIEWS, (SIDE, SIDE * 3 // 4), ELEVATIONS)
-    images, pixels = [], []
-    for number, index in enumerate(np.unique(np.linspace(0, len(chosen) - 1, MOST).astype(int))):
-        progress(STAGE, number / (2 * min(len(chosen), MOST)))
-        images.append(_rendered(scene, chosen[index]))
+    every = cameras or scene.cameras or scene.spiral_cameras(VIEWS, (SIDE, SIDE * 3 // 4), ELEVATIONS)
+    chosen, images, pixels = some_cameras(every, MOST, SIDE), [], []
+    for number, each in enumerate(chosen):
+        progress(STAGE, number / (2 * len(chosen)))
+        images.append(_rendered(scene, each))
         camera, depth, _ = images[-1]
         pixels.append(depth[depth > 0] / camera.fx)
     if not any(map(len, pixels)):
@@ -129,12 +130,11 @@ def fuse(
 
 
 def _rendered(scene: Scene, camera: Camera) -> Depth:
-    small = camera.within(SIDE)
-    view = view_of(scene, small, CpuRasterizer())
+    view = view_of(scene, camera, CpuRasterizer())
     image = splat_colours(view, scene.gaussians)
     colours = np.clip(image.colours / np.maximum(image.alpha, 0.5)[..., None], 0, 1)
-    depth = surface_depth(scene.gaussians, small, view.median_rows())
-    return small, depth, np.rint(255 * colours).astype(np.uint8)
+    depth = surface_depth(scene.gaussians, camera, view.median_rows())
+    return camera, depth, np.rint(255 * colours).astype(np.uint8)
 
 
 def _fused(images: list[Depth], centre: Array, resolution: float, views: int, progress: Progress) -> Mesh:

@@ -198,9 +198,7 @@ def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None =
 
 
 def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -> Goal | None:
-    """Return the pose of `where` (X, Y) bool nearest to a thing, facing its middle, with nothing between.
-
-    None for none.
+    """Return the pose of `where` (X, Y) bool nearest to a thing, facing it, with nothing between, or None.
 
     points: (P, 2) metres, of the thing seen from above, P >= 1; least: metres to be kept from it, also where
     it hangs.

@@ -3,6 +3,7 @@
 Features of surface points are matched by RANSAC and refined by ICP (Open3D); renderings check the answer.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -137,8 +138,12 @@ def _aligned(
 def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:
     """Return the share of pixels, filled in both as cameras of both see, of one depth; 0 without overlap."""
     there = similarity(transform)
-    views = [(camera, there.inverse().camera(camera)) for camera in _some(fixed)]
-    views += [(there.camera(camera), camera) for camera in _some(moving)]
+    mine, theirs = (
+        some_cameras(scene.cameras or (scene.framing_camera((SIDE, SIDE)),), VIEWS, SIDE)
+        for scene in (moving, fixed)
+    )
+    views = [(camera, there.inverse().camera(camera)) for camera in theirs]
+    views += [(there.camera(camera), camera) for camera in mine]
     same = both = 0
     for in_fixed, in_moving in views:
         near, far = (
@@ -152,11 +157,10 @@ def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:
     return same / both if both else 0.0
 
 
-def _some(scene: Scene) -> list[Camera]:
-    """Return a few cameras of a scene, small; two that frame it where it has none."""
-    cameras = scene.cameras or (scene.framing_camera((SIDE, SIDE)),)
-    chosen = np.unique(np.linspace(0, len(cameras) - 1, VIEWS).astype(int))
-    return [cameras[i].within(SIDE) for i in chosen]
+def some_cameras(cameras: Sequence[Camera], most: int, side: int) -> list[Camera]:
+    """Return at most so many of the cameras, evenly chosen, with images of at most `side` pixels a side."""
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(most, len(cameras))).astype(int))
+    return [cameras[row].within(side) for row in chosen]
 
 
 # Two scenes in the same axes as one, with language field, cameras, tree and taught words.

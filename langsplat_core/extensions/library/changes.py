@@ -8,7 +8,6 @@ so, however the two trees are divided; what one capture did not see, or what sta
 nothing.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -17,6 +16,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, linear_light, unit
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.geometry.registration import some_cameras
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.describe import Describer, likely_name
 from langsplat_core.query.engine import QueryEngine
@@ -24,7 +24,7 @@ from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.inventory import NAMES
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import splat_colours, view_of
-from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.scene import LEVELS, Scene
 from langsplat_core.scene.surface import surface_areas
 from langsplat_core.scene.transform import moving, similarity
 from langsplat_core.semantics.encoders import same_vectors
@@ -143,7 +143,8 @@ def _evidence(
     """(N, `_CHANNELS`) float64 of the Gaussians of both scenes."""
     there = similarity(into)
     back = there.inverse()
-    own, others = _some(first.cameras), [there.camera(camera) for camera in _some(second.cameras)]
+    own, others = (some_cameras(scene.cameras, VIEWS, SIDE) for scene in (first, second))
+    others = [there.camera(camera) for camera in others]
     if not own + others:
         raise InputError("neither scene has cameras to look from; keep .cameras.json beside one of them")
     sums = np.zeros((len(first.gaussians), _CHANNELS)), np.zeros((len(second.gaussians), _CHANNELS))
@@ -178,12 +179,6 @@ def _evidence(
             total[:, 3] += lifted[:, :2].sum(1) > 0
             total[:, 4:] += lifted[:, 3:]
     return sums
-
-
-def _some(cameras: Sequence[Camera]) -> list[Camera]:
-    """At most `VIEWS` of the cameras, evenly chosen, with images of at most `SIDE`."""
-    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).astype(int))
-    return [cameras[row].within(SIDE) for row in chosen]
 
 
 def to_lab(colours: Array) -> Array:

@@ -236,15 +236,12 @@ def test_feature_3dgs(tmp_path):
     refused([ply], "without gaps")
 
 
-def test_archives_with_deflated_members_are_read(tmp_path):
+def test_archives_with_deflated_members_are_refused(tmp_path):
     path, packed = save_model(tmp_path / "a.pth", G), tmp_path / "b.pth"
     with zipfile.ZipFile(path) as whole, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in whole.namelist():
             archive.writestr(name, whole.read(name))
-    assert_same(read_foreign([packed]).scene.gaussians, G)
-    content = packed.read_bytes()
-    packed.write_bytes(content.replace(content[200:220], bytes(20), 1))
-    refused([packed], r"^\S*b\.pth: not a readable archive")
+    refused([packed], r"^\S*b\.pth: its archive is compressed")
 
 
 FAR = replace(G, means=G.means + np.float32(2**20))
