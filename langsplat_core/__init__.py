@@ -4,7 +4,6 @@ The public names below load on first use, so that importing the package costs no
 """
 
 import os
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -59,17 +58,3 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'langsplat_core' has no attribute {name!r}")
     with optional_imports():
         return getattr(import_module(_HOMES[name]), name)
-
-
-def load_ipython_extension(shell: Any) -> None:
-    """Have IPython show a scene at the end of a cell as the page that can be searched."""
-    html = shell.display_formatter.formatters["text/html"]
-    html.for_type_by_name("langsplat_core.scene.scene", "Scene", _page)
-
-
-def _page(scene: Any) -> Any:
-    return __getattr__("show")(scene)._repr_html_()
-
-
-if "IPython" in sys.modules and (shell := sys.modules["IPython"].get_ipython()) is not None:
-    load_ipython_extension(shell)

@@ -18,7 +18,6 @@ from PIL import Image
 from langsplat_core.config import CodecConfig, PictureConfig
 from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.pipeline.notebook import show
 from langsplat_core.training.language.codec_fit import train_autoencoder
 from langsplat_viewer import disk
 from langsplat_viewer.actions import editing, opening, outline, settings, viewpoint
@@ -300,9 +299,9 @@ def page_picture(path: Path) -> None:
 
 def notebook_picture(path: Path) -> None:
     """Write a screenshot of what a cell of a notebook has: its line, and its output."""
-    shown = show(load_scene(scene_path(None)), PAGE_PHRASE)
+    shown = load_scene(scene_path(None)).show(PAGE_PHRASE)
     style = "font: 15px monospace; margin: 16px 24px; color: #555"
-    line = f"[1]: &nbsp;show(scene, &quot;{PAGE_PHRASE}&quot;)"
+    line = f"[1]: &nbsp;scene.show(&quot;{PAGE_PHRASE}&quot;)"
     with tempfile.TemporaryDirectory() as folder, open_browser() as browser:
         cell = Path(folder) / "cell.html"
         cell.write_text(f'<!doctype html><body style="{style}"><p>{line}</p>{shown._repr_html_()}')

@@ -16,7 +16,6 @@ import pytest
 from PIL import Image
 
 from assets.making.__main__ import parse as parse_making
-from langsplat_core import load_ipython_extension
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.arguments import Runnable
 from langsplat_core.cli.run import main
@@ -170,7 +169,6 @@ def test_notebook_says_and_shows_what_it_keeps() -> None:
     path = ROOT / "docs" / "examples" / "06_in_a_notebook.ipynb"
     assert path.stat().st_size < 1.5e6
     try:
-        load_ipython_extension(shell)
         for cell in json.loads(path.read_text())["cells"]:
             with redirect_stdout(StringIO()) as said:
                 done = shell.run_cell("".join(cell["source"]) if cell["cell_type"] == "code" else "")
@@ -180,11 +178,13 @@ def test_notebook_says_and_shows_what_it_keeps() -> None:
             kept = "".join(line for output in outputs for line in output.get("text", ()))
             assert re.sub(r"\d+", "", words) == re.sub(r"\d+", "", kept)
             assert shown == {kind for output in outputs for kind in output.get("data", ())}
-        scene = shell.display_formatter.format(shell.user_ns["toys"])[0]
+        pages = [shell.display_formatter.format(shell.user_ns[name])[0] for name in ("toys", "answer")]
     finally:
         type(shell).clear_instance()
-    assert scene["text/html"].startswith("<iframe")
-    assert len(scene["text/plain"]) < 200
+    for page in pages:
+        assert page["text/html"].startswith("<iframe")
+        assert len(page["text/html"]) < 3.5e6
+        assert len(page["text/plain"]) < 200
 
 
 # Examples: what each prints, and the files that it draws.

@@ -1,7 +1,7 @@
 """Scenes in a notebook: `show`, the exported page in a frame of the cell; `draw`, a picture.
 
 Nothing is served or fetched, and no widget is needed: the page is in the notebook's file, so that it stays
-where the notebook is read without Python. In IPython a `Scene` at the end of a cell is shown by itself.
+where the notebook is read without Python. A `Scene` or an answer at the end of a cell is shown by itself.
 """
 
 import html
@@ -18,7 +18,9 @@ from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats
 from langsplat_core.pipeline.webpage import PageReport, make_page
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import encoded_texts
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.grammar import parse
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -59,7 +61,8 @@ def show(
     engine = source if isinstance(source, QueryEngine) else QueryEngine(source, load_text_encoder)
     scene = engine.scene
     if phrases:
-        known = [name for name in (phrase, *phrases) if name]
+        trees = [parse(name, engine.taught) for name in (phrase, *phrases) if name]
+        known = [text for tree in trees for text in encoded_texts(engine, tree)]
         book = dict(zip(known, engine.text_vectors(known), strict=True))
         own = replace(engine.field, phrasebook=book, taught=tuple(engine.taught.values()))
         scene = replace(scene, language=own)

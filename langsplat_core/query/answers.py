@@ -4,11 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.sparse import csr_matrix, vstack
 
+import langsplat_core
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.instances import axis_aligned_box
@@ -18,6 +19,7 @@ from langsplat_core.scene import LEVELS, Fits, LanguageField, Tree
 from langsplat_core.scene.surface import NEIGHBOURS, Surface
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale
 
+LIGHT = 40_000  # Gaussians of a page that shows an answer
 AnswerRule = Literal["regions", "peak"]  # by `rule.decide`, or as published
 
 
@@ -56,9 +58,17 @@ class QueryResult(Judged):
     even: Deferred = Deferred()  # (N,) float32 relevancy at the level, the same all over a region
     members: Deferred = Deferred()  # (N,) bool: the Gaussians that answer, wherever they are
     own_cut: float | None = None  # relevancy from which on everything is a member, where it was set by hand
+    engine: Any = None  # the QueryEngine that was asked, whose scene a notebook shows
 
     def __repr__(self) -> str:
         return f"<{self.phrase!r}: {self.said}, as {LEVELS[self.level]}, near {self.place}>"
+
+    def _repr_html_(self) -> str | None:
+        """Return a light page of the scene with the phrase asked, for a notebook; None without an engine."""
+        if self.engine is None:
+            return None
+        page = langsplat_core.show(self.engine, self.phrase, at_most=LIGHT, phrases=[self.phrase])
+        return page._repr_html_()
 
     @property
     def cut(self) -> float:

@@ -91,6 +91,11 @@ def run_phrase(
     return ComposedResult(replace(found, phrase=tidy(text), place=place, box=box), tree)
 
 
+def encoded_texts(engine: QueryEngine, tree: Phrase) -> list[str]:
+    """Return what of a phrase is encoded: its atoms, but for taught words."""
+    return [atom.text for atom in atoms(tree) if not engine.is_taught(atom.text)]
+
+
 def check_phrase(
     engine: QueryEngine, text: str, viewpoint: Camera | None = None, progress: Progress = silent
 ) -> None:
@@ -99,7 +104,7 @@ def check_phrase(
     if not isinstance(tree, Atom):
         _check_viewpoint(tree, viewpoint)
     try:
-        engine.text_vectors([atom.text for atom in atoms(tree) if not engine.is_taught(atom.text)], progress)
+        engine.text_vectors(encoded_texts(engine, tree), progress)
     except EncoderError:
         if phrase_key(text) not in engine.field.phrasebook:
             raise
@@ -110,9 +115,7 @@ def encode_phrases(engine: QueryEngine, texts: Sequence[str]) -> None:
     wanted: list[str] = []
     for text in texts:
         with suppress(InputError):
-            wanted += [
-                atom.text for atom in atoms(parse(text, engine.taught)) if not engine.is_taught(atom.text)
-            ]
+            wanted += encoded_texts(engine, parse(text, engine.taught))
     with suppress(EncoderError, InputError):
         engine.known_vectors(wanted)
 

@@ -141,6 +141,7 @@ class QueryEngine:
                 answers.append(self._by_showing(self.taught[phrase_key(phrase)], level))
             else:
                 answers.append(self._answer(tidy(phrase), next(relevancies), level, others))
+            vars(answers[-1])["engine"] = self  # not by `replace`, which would make its arrays
         return answers
 
     def relevancy(self, vector: Array) -> Array:

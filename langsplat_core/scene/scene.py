@@ -5,10 +5,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+import langsplat_core
 from langsplat_core.arrays import Array, across, check_array, unit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene.gaussians import Gaussians
@@ -299,6 +301,14 @@ class Scene:
         return (
             f"<Scene of {len(self.gaussians):,} Gaussians {what} a language field: {self.path or 'no file'}>"
         )
+
+    # Layers above are asked by the public names, which load them.
+    def show(self, phrase: str = "", **options: Any) -> Any:
+        """Return the page of `langsplat_core.show`, with `phrase` asked, which a notebook shows."""
+        return langsplat_core.show(self, phrase, **options)
+
+    def _repr_html_(self) -> str:
+        return str(self.show()._repr_html_())
 
     def in_world(self, points: Array) -> Array:
         """(..., 3) positions in this scene -> (..., 3) float64 positions in the world."""

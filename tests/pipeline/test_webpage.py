@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from langsplat_core import show
 from langsplat_core.arrays import Array, psnr, unit
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.export import Export
@@ -640,13 +639,17 @@ def frame_of_docs() -> str:
     return "".join(json.loads(path.read_text())["cells"][-1]["outputs"][0]["data"]["text/html"])
 
 
-@pytest.mark.parametrize("phrases", [(), ("laptop",), None])
+@pytest.mark.parametrize("phrases", [(), ("laptop",), None, "an answer"])
 def test_notebooks_show_a_page_that_was_asked(browser, demo, engine, tmp_path, phrases):
     """In a frame without rights, as a cell has it: bounded, answered over all Gaussians, searchable."""
     if phrases is None:
         asked, other, shown = "duck", "penguin", frame_of_docs()
+    elif phrases == "an answer":
+        asked, other = "ball near the teddy bear", "ball"
+        shown = run_phrase(engine, asked).answer._repr_html_()
+        assert len(shown) < 3.5e6
     else:
-        page = show(demo, asked := "teddy bear", at_most=5000, phrases=phrases)
+        page = demo.show(asked := "teddy bear", at_most=5000, phrases=phrases)
         other, shown = "laptop", page._repr_html_()
         assert page.report.gaussians == 5000
         assert page.report.free_text is (phrases == ())
@@ -657,7 +660,7 @@ def test_notebooks_show_a_page_that_was_asked(browser, demo, engine, tmp_path, p
     tab = browser.new_page(offline=True)
     tab.goto((tmp_path / "cell.html").as_uri())
     frame = tab.frames[1]
-    said = engine.run(asked).said
+    said = run_phrase(engine, asked).answer.said
     frame.wait_for_function("said => document.body.innerText.includes(said)", arg=said)
     assert frame.evaluate("async () => (await langsplat).page.display") == "relevancy"
     frame.fill("#phrase", other)

@@ -529,6 +529,7 @@ def _ask_group(
             unread.append((name, str(error)))
             del hits[name]
             continue
+        vars(answer)["engine"] = None  # or all scenes that are asked would stay in memory
         exact[name] = Hit(hits[name].path, answer.judgement, answer, scene.metres_per_unit, scene.origin)
     found = [hit for hit in exact.values() if hit.verdict != "not here"]
     others = [hit for hit in (hits | exact).values() if hit not in found]
