@@ -31,9 +31,9 @@ system: $(STAMP)
 browser: $(STAMP)
 	@$(PYTHON) packaging/system_libraries.py --tests
 
-demo: system  ## install everything and open the bundled scene (without a display: pictures in demo_out/)
+demo: system  ## install everything and open the bundled scene (without a display: a page and a picture in demo_out/)
 	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] || [ "$$(uname)" != Linux ]; then $(BIN)/langsplat-viewer assets/demo/scene.ply; \
-	else echo "No display: rendering the bundled scene to pictures instead of opening a window."; \
+	else echo "No display: a page and a picture of the bundled scene instead of opening a window."; \
 	  $(BIN)/langsplat demo; fi
 
 quick: check  ## lint, types, and the tests that take no time: the loop while working

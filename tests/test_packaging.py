@@ -21,7 +21,6 @@ from packaging.requirements import Requirement
 from PIL import Image
 
 from langsplat_core import load_scene
-from langsplat_core.cli.scenes import PICTURES
 from langsplat_core.errors import EXTRAS
 from langsplat_core.io.scenes import formats
 from langsplat_core.raster.opengl.rasterizer import create_egl_context
@@ -287,7 +286,7 @@ def test_plain_install_runs_the_demo_and_selects(light: Path, tmp_path: Path) ->
     done = run(light, "langsplat", "demo", "--no-open", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     assert "'blue gift': found" in done.stdout
-    assert {path.name for path in tmp_path.iterdir()} == {*PICTURES, "room.html"}
+    assert {path.name for path in tmp_path.iterdir()} == {"blue_gift.png", "room.html"}
     assert np.asarray(Image.open(tmp_path / "blue_gift.png")).std() > 10
     scene = next(light.parent.glob("lib/python*/site-packages/langsplat_assets/demo/scene.ply"))
     done = run(light, "langsplat", "select", scene, "keyboard", "--out", tmp_path / "keyboard.ply")
