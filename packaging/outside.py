@@ -111,6 +111,7 @@ PROGRAMS: Mapping[str, str] = {
     "gltf-validator": "scene.glb thing.glb",
     "usd-core": "scene.usdc",
 }
+OURS = (".spz", ".sog", ".splat", ".glb", ".usdc")
 NPM = ROOT / ".others" / "node_modules"
 VALIDATE = """const { readFileSync } = require("fs"), validator = require("gltf-validator");
 validator.validateBytes(new Uint8Array(readFileSync(process.argv[1]))).then(({ issues }) => {
@@ -173,10 +174,9 @@ def print_programs() -> None:
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy(scene, folder)
         for words in (
-            *(["convert", scene, f"{folder}/scene{suffix}"] for suffix in (".spz", ".sog", ".splat", ".glb")),
+            *(["convert", scene, f"{folder}/scene{suffix}"] for suffix in OURS),
             ["convert", scene, f"{folder}/rdf.spz", "--axes", "rdf"],
             ["mesh", scene, f"{folder}/thing.glb", "--phrase", "teddy bear", "--watertight"],
-            ["usd", scene, f"{folder}/scene.usdc"],
         ):
             with redirect_stdout(io.StringIO()):
                 main("outside", lambda words=words: parse([*map(str, words), "--quiet"]))

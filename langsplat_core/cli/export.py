@@ -84,7 +84,7 @@ class Convert:
     """Write any readable scene in another format, with its language field and cameras beside it.
 
     A .ply (INRIA's) keeps everything. Rounded are .spz (Niantic's) and .sog (PlayCanvas's), a tenth of it,
-    and .glb and .gltf (KHR_gaussian_splatting); .splat is without view dependence; what is lost is printed.
+    and .glb, .gltf (KHR_gaussian_splatting), .usdc and .usda; .splat has no view dependence; losses are said.
     Checkpoints of LangSplat, LangSplatV2, Occam's LGS, OpenGaussian, Feature-3DGS and 3D Gaussian Splatting
     become such a scene (see docs/files.md for what to give), and a scene becomes checkpoints.
     """
@@ -93,7 +93,7 @@ class Convert:
     """Scene to read, of any format; or the first of the files that another method has of one scene."""
     rest: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[MORE...] OUT")]]
     """The other method's further files, in any order, and last the scene to write (.ply, .spz, .sog, .glb,
-    .gltf or .splat); with --to the folder."""
+    .gltf, .usdc, .usda or .splat); with --to the folder."""
     rematch: Path | None = None
     """A language sidecar (*.langsplat.safetensors) made before the Gaussians were edited: its field is
     carried over to the Gaussians of SOURCE by nearest position."""
@@ -260,19 +260,10 @@ class Crop:
         scene, corners = load_scene(self.scene), np.array(self.box).reshape(2, 3)
         keep = in_box(scene.gaussians.means, corners.min(0) - scene.origin, corners.max(0) - scene.origin)
         if not keep.any():
-            raise InputError(f"the crop holds none of the {len(keep)} Gaussians; {_extent(scene)}")
+            where = f"`langsplat inspect {self.scene}` says where they lie"
+            raise InputError(f"the crop holds none of the {len(keep)} Gaussians; {where}")
         save_scene(self.out, replace(scene.take(keep), path=self.out))
         print(f"{self.out}: {keep.sum()} of {len(keep)} Gaussians")
-
-
-def _extent(scene: Scene) -> str:
-    means = scene.gaussians.means[np.isfinite(scene.gaussians.means).all(1)]
-    if not len(means):
-        return "the scene holds none that lies anywhere"
-    ends = scene.in_world(np.stack([means.min(0), means.max(0)]))
-    digits = 10 if scene.origin.any() else 4
-    low, high = (" ".join(f"{number:.{digits}g}" for number in corner) for corner in ends)
-    return f"they lie between {low} and {high}"
 
 
 @dataclass(frozen=True)

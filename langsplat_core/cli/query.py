@@ -456,7 +456,7 @@ class Select:
     texts: tyro.conf.Positional[tuple[str, ...]]
     """Phrases, each in quotes if it has several words; what any of them names is taken."""
     out: arguments.OutFile
-    """Scene to write: .ply, .spz, .sog, .glb, .gltf or .splat."""
+    """Scene to write: .ply, .spz, .sog, .glb, .gltf, .usdc, .usda or .splat."""
     remove: bool = False
     """Write everything else instead."""
     level: LevelChoice = "auto"

@@ -20,6 +20,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
+TEMPORARY = ".writing-"  # how names of files begin that are not written whole yet
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # where a disk is full, or broken
 # Names that Windows does not take, or takes for a device.
 _NOT_OF_WINDOWS = re.compile(r"""(?i)[<>:"|?*\0-\x1f]|[. ]$|^(con|prn|aux|nul|(com|lpt)[1-9]) *(\.|$)""")
@@ -40,7 +41,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     place = Path(os.path.realpath(target)) if os.path.islink(target) else target
     place.parent.mkdir(parents=True, exist_ok=True)
     try:
-        handle, name = tempfile.mkstemp(prefix=".writing-", suffix=suffix, dir=place.parent)
+        handle, name = tempfile.mkstemp(prefix=TEMPORARY, suffix=suffix, dir=place.parent)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(target)) from None
     os.close(handle)

@@ -17,7 +17,7 @@ Source: Khronos' public specification of the extension, as ratified in 2026.
 import base64
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -119,13 +119,18 @@ class _Node(Struct):
     extras: Any = None  # anything
 
 
-class _Kept(Struct):
+class Kept(Struct):
     """What the extras of a node keep of a scene, beside the node's own matrix as it was written."""
 
     matrix: list[Number] | None = None
     origin: tuple[Number, Number, Number] = (0, 0, 0)
     metres_per_unit: Annotated[float, Meta(gt=0, le=1e12)] | None = None
     antialiased: bool = False
+
+    def given(self, scene: Scene) -> Scene:
+        """Return the scene, read without its matrix, with what is kept of it."""
+        scene = replace(scene, antialiased=self.antialiased, metres_per_unit=self.metres_per_unit)
+        return replace(scene, origin=np.array(self.origin, np.float64))
 
 
 class _Scene(Struct):
@@ -163,28 +168,37 @@ def read_gltf_scene(path: Path | str) -> Scene:
     path = Path(path)
     file = _File(path)
     try:
-        # Positions about the first node's: in the world float32 may be too coarse.
-        placed = (matrix for matrix, primitive in _placed(file) if EXTENSION in primitive.extensions)
-        middle = next(placed, np.eye(4))[:3, 3]
-        parts = list(_parts(file, middle))
+        scene = placed_scene(path, _parts(file))
     except LookupError as error:
         raise malformed(path, f"names what it lacks ({str(error)[:80]})", "export it again") from None
-    if not parts and EXTENSION not in file.content.extensions_used:
+    if not len(scene.gaussians) and EXTENSION not in file.content.extensions_used:
         raise malformed(path, f"holds no Gaussians ({EXTENSION}); meshes are not read")
     report_losses(path, file.losses())
-    gaussians, kept = mirrored(join_gaussians(parts), SIGNS), file.kept
-    scene = Scene(gaussians, antialiased=file.antialiased == {True})
-    if kept is not None:
-        scene = replace(scene, antialiased=kept.antialiased, metres_per_unit=kept.metres_per_unit)
-        return replace(scene, origin=np.array(kept.origin, np.float64))
-    if not middle.any():
-        return scene
+    scene = replace(scene, antialiased=file.antialiased == {True})
+    return scene if file.kept is None else file.kept.given(scene)
+
+
+@np.errstate(all="ignore")
+def placed_scene(path: Path, parts: Iterable[tuple[Array, Gaussians]]) -> Scene:
+    """Return the scene of Gaussians along axes as glTF's, each with the (4, 4) matrix of its place there."""
+    middle, placed = None, []
+    for matrix, gaussians in parts:
+        if middle is None:  # positions are about the first: in the world float32 may be too coarse
+            middle = matrix[:3, 3].copy()
+        try:
+            place = similarity(matrix).then(moving(-middle))
+            placed.append(gaussians if place.is_identity else transform_gaussians(gaussians, place))
+        except InputError as error:
+            raise malformed(path, str(error)) from None
+    gaussians = mirrored(join_gaussians(placed), SIGNS)
+    if middle is None or not middle.any():
+        return Scene(gaussians)
     means, origin = about_origin(gaussians.means + SIGNS * middle)
-    return replace(scene, gaussians=replace(gaussians, means=means), origin=origin)
+    return Scene(replace(gaussians, means=means), origin=origin)
 
 
-def _parts(file: "_File", middle: Array) -> Iterator[Gaussians]:
-    """Yield the Gaussians of every primitive, placed by nodes, in glTF's axes, relative to middle (3,)."""
+def _parts(file: "_File") -> Iterator[tuple[Array, Gaussians]]:
+    """Yield the Gaussians of every primitive, in glTF's axes, and the matrix of its place."""
     for matrix, primitive in _placed(file):
         if EXTENSION not in primitive.extensions:
             file.bare += 1
@@ -208,11 +222,7 @@ def _parts(file: "_File", middle: Array) -> Iterator[Gaussians]:
         else:
             file.antialiased.add(False)
             gaussians = _gaussians(file, primitive.attributes)
-        try:
-            place = similarity(matrix).then(moving(-middle))
-            yield gaussians if place.is_identity else transform_gaussians(gaussians, place)
-        except InputError as error:
-            raise malformed(file.path, str(error)) from None
+        yield matrix, gaussians
 
 
 def _placed(file: "_File") -> Iterator[tuple[Array, _Primitive]]:
@@ -229,7 +239,7 @@ def _placed(file: "_File") -> Iterator[tuple[Array, _Primitive]]:
         node = content.nodes[number]
         matrix = above @ _matrix(node)
         with suppress(LookupError, TypeError, ValidationError):  # extras may be anything
-            kept = convert(node.extras[OWN], _Kept)
+            kept = convert(node.extras[OWN], Kept)
             if len(content.nodes) == 1 and kept.matrix == node.matrix:
                 file.kept, matrix = kept, np.eye(4)
         file.others.update(map(quoted, node.extensions))
@@ -285,7 +295,7 @@ class _File:
         self.bare = 0  # placed primitives without Gaussians
         self.shown: set[int] = set()  # meshes that nodes place
         self.antialiased: set[bool] = set()  # what primitives say
-        self.kept: _Kept | None = None  # of a scene of ours, where its node is as it was
+        self.kept: Kept | None = None  # of a scene of ours, where its node is as it was
         text = memoryview(hostile.read_file(path, 2**32))
         self._binary = text[:0]
         # Numbers as they are stored, which an honest file shows once or a few times; Gaussians packed in it
@@ -401,9 +411,9 @@ def node_of(scene: Scene) -> dict[str, Any]:
     there = turn.then(moving(turned_origin(turn.rotation * SIGNS, scene.origin)))
     there = there.then(scaling(scene.metres_per_unit or 1.0))
     matrix = None if there.is_identity else there.matrix.T.reshape(-1).tolist()
-    kept = _Kept(matrix, tuple(scene.origin.tolist()), scene.metres_per_unit, scene.antialiased)
+    kept = Kept(matrix, tuple(scene.origin.tolist()), scene.metres_per_unit, scene.antialiased)
     said = {"matrix": matrix} if matrix else {}
-    return said if kept == _Kept() else {**said, "extras": {OWN: to_builtins(kept)}}
+    return said if kept == Kept() else {**said, "extras": {OWN: to_builtins(kept)}}
 
 
 class GltfWriter:

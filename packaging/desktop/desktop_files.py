@@ -19,6 +19,7 @@ NAMES = {
     "model/x-ply": "3D points, mesh or Gaussians (PLY)",
     "model/gltf-binary": "3D scene (glTF, binary)",
     "model/gltf+json": "3D scene (glTF)",
+    "model/vnd.usd": "3D scene (OpenUSD)",
 }
 FURTHER = {
     "model/x-gaussian-splat": ['<glob pattern="*.compressed.ply" weight="60"/>'],

@@ -130,13 +130,11 @@ def test_transform_moves_everything(scene, source, tmp_path, capsys):
     assert f"{N} Gaussians, 3 cameras" in capsys.readouterr().out
 
 
-def test_transform_and_its_inverse_by_matrix(scene, source, tmp_path):
-    there, back = tmp_path / "there.ply", tmp_path / "back.ply"
+def test_transform_takes_a_matrix_row_by_row(scene, source, tmp_path):
     matrix = [0, -2, 0, 5, 2, 0, 0, 6, 0, 0, 2, 7, 0, 0, 0, 1]
-    assert run("transform", source, there, "--matrix", *matrix) == 0
-    assert run("transform", there, back, "--matrix", *np.linalg.inv(np.reshape(matrix, (4, 4))).ravel()) == 0
-    np.testing.assert_allclose(load_scene(back).gaussians.means, scene.gaussians.means, atol=1e-5)
-    np.testing.assert_allclose(load_scene(back).gaussians.sh, scene.gaussians.sh, atol=1e-5)
+    assert run("transform", source, tmp_path / "there.ply", "--matrix", *matrix) == 0
+    want = scene.gaussians.means @ np.array([[0, 2, 0], [-2, 0, 0], [0, 0, 2]]) + (5, 6, 7)
+    np.testing.assert_allclose(load_scene(tmp_path / "there.ply").gaussians.means, want, atol=1e-5)
 
 
 @pytest.mark.parametrize(("axis", "up"), [("z", [0, 0, 1]), ("-y", [0, -1, 0])])
@@ -180,12 +178,9 @@ def test_bad_input_is_one_line_and_nothing_is_written(words, message, source, ca
     assert contents(source.parent) == before
 
 
-def test_empty_crop_tells_the_extent_in_any_unit(scene, tmp_path, capsys):
-    means = np.float32(1e-5) * scene.gaussians.means
-    save_scene(tmp_path / "s.ply", Scene(replace(scene.gaussians, means=means)))
-    said = refusal(capsys, "crop", tmp_path / "s.ply", tmp_path / "out.ply", "--box", 9, 9, 9, 8, 8, 8)
-    numbers = [float(word) for word in said.replace(" and ", " ").split()[-6:]]
-    np.testing.assert_allclose(np.reshape(numbers, (2, 3)), [means.min(0), means.max(0)], rtol=1e-3)
+def test_empty_crop_is_refused(source, tmp_path, capsys):
+    said = refusal(capsys, "crop", source, tmp_path / "out.ply", "--box", 99, 99, 99, 98, 98, 98)
+    assert f"langsplat inspect {source}" in said
 
 
 def test_clean_reports_what_it_removes(scene, source, tmp_path, capsys):

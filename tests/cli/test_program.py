@@ -23,7 +23,6 @@ import pytest
 from tyro.extras import get_parser
 
 from langsplat_core import __version__
-from langsplat_core.cli import scenes
 from langsplat_core.cli.app import command_names, entry, load_command, parse
 from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Doctor
@@ -149,13 +148,12 @@ def test_demo_renders_the_bundled_scene_and_opens_its_page(tmp_path, monkeypatch
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", lambda page: opened.append(page) or True)
     monkeypatch.setenv("DISPLAY", ":987")
-    monkeypatch.setattr(scenes, "PICTURES", {"gift.png": ("--query", "blue gift")})
     assert run("demo", "--out", tmp_path) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"gift.png", "room.html"}
+    assert {path.name for path in tmp_path.iterdir()} == {"blue_gift.png", "room.html"}
     assert "'blue gift': found" in capfd.readouterr().out
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(scenes, "PICTURES", {"gift.png": ("--camera", "absent")})
+    monkeypatch.setattr(sys, "executable", "/bin/false")
     assert run("demo", "--out", tmp_path) == 2
     assert opened == [(tmp_path / "room.html").as_uri()]  # once: without a screen there is no browser
 
@@ -184,7 +182,6 @@ LINES = {  # words that work: positions, and options; what would take long ends 
     "mesh": "s.ply m.ply -- --views 3",
     "register": "s.ply t.ply --",
     "merge": "s.ply t.ply -- --out o.ply --as-is",
-    "usd": "s.ply o.usda --",
     "clean": "s.ply o.ply -- --views 2",
     "compact": "s.ply -- --out o.ply --views 2",
     "eval lerf-ovs": "s.ply . --",

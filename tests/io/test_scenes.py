@@ -3,6 +3,7 @@
 import json
 import os
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import (
+    CORE_FORMATS,
     LOSSES,
     companion_path,
     formats,
@@ -27,7 +29,7 @@ from langsplat_core.io.scenes import (
 from langsplat_core.io.sidecar import SUFFIX as SIDECAR
 from langsplat_core.io.sidecar import write_language
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.scene import NO_NODE, Calibration, PlattScaling, Scene
+from langsplat_core.scene import Scene
 from langsplat_core.scene.transform import moving, place_scene
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import (
@@ -41,9 +43,11 @@ from tests.support.file_samples import (
     write_folder,
 )
 from tests.support.processes import killed_everywhere, refusal, run
-from tests.support.scenes import random_camera, random_extras, random_gaussians, tree_of_wholes
+from tests.support.scenes import random_camera, random_extras, random_gaussians
 
 N = 60
+MARKS = (pytest.mark.long, pytest.mark.skipif(find_spec("pxr") is None, reason="no usd-core"))
+WRITTEN = [pytest.param(row, marks=MARKS * (row not in CORE_FORMATS)) for row in formats() if row.write]
 
 
 def full_scene(seed: int = 0) -> Scene:
@@ -79,7 +83,7 @@ def spoilt(got: Scene, want: Scene) -> set[str]:
 
 
 @pytest.mark.parametrize("degree", range(1, 4))
-@pytest.mark.parametrize("row", [row for row in formats() if row.write], ids=lambda row: row.suffix)
+@pytest.mark.parametrize("row", WRITTEN, ids=lambda row: row.suffix)
 def test_a_scene_keeps_what_its_format_holds_and_says_the_rest(tmp_path, row, degree, caplog):
     want = replace(full_scene(), gaussians=random_gaussians(N, sh_degree=degree), antialiased=True)
     want = replace(want, extras=random_extras(N), metres_per_unit=1 / 3)
@@ -107,7 +111,7 @@ FAR = [(500_123.25, 5_412_345.5, 0.0), (4.0e6, 7.0e5, 4.9e6)]  # UTM, and from t
 
 
 @pytest.mark.parametrize("at", FAR, ids=["UTM", "ECEF"])
-@pytest.mark.parametrize("row", [row for row in formats() if row.write], ids=lambda row: row.suffix)
+@pytest.mark.parametrize("row", WRITTEN, ids=lambda row: row.suffix)
 def test_a_far_scene_is_kept_like_one_at_zero(tmp_path, row, at, caplog):
     near = full_scene()
     save_scene(tmp_path / f"near{row.suffix}", near)
@@ -335,18 +339,6 @@ def test_inspect_prints_a_table_and_json(tmp_path, capsys):
     assert (answer["gaussians"], answer["cameras"]) == (N, 3)
     assert answer["disk_bytes"] == sum(file.stat().st_size for file in tmp_path.iterdir())
     assert answer["memory_bytes"] == 4 * N * (3 + 3 + 4 + 1 + 12 + 1 + 3 * (3 + 1))
-
-
-def test_summary_counts_nodes():
-    field = random_field(40)
-    tree = tree_of_wholes(np.array([1, 1, 0, NO_NODE] * 10))
-    sure = Calibration(*[PlattScaling(0, 1, 0)] * 3)
-    fields = field, replace(field, tree=tree, calibration=sure)
-    plain, named = (summarise(Scene(random_gaussians(40), made)) for made in fields)
-    assert [one["language"]["nodes"] for one in (plain, named)] == [None, [0, 0, 2]]
-    assert [one["language"]["calibrated"] for one in (plain, named)] == [False, True]
-    assert named["language"]["bytes"] - plain["language"]["bytes"] == tree.leaves.nbytes
-    assert named["memory_bytes"] - plain["memory_bytes"] == tree.leaves.nbytes
 
 
 # ---- INRIA's cameras.json ----

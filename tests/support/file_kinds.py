@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -41,10 +41,11 @@ from langsplat_core.datasets.video import extract_frames
 from langsplat_core.display.displays import latent_colours
 from langsplat_core.errors import InputError, LangSplatError, printable_line
 from langsplat_core.extensions.benchmarks.raster_speed import peak_memory, restart_peak
+from langsplat_core.extensions.geometry.usd import write_usd
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import write_gltf
 from langsplat_core.io.hostile import picture_size
-from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.scenes import formats, load_scene
 from langsplat_core.io.sidecar import Words, read_language, read_words, write_language, write_words
 from langsplat_core.pipeline.stages import kept, open_array
 from langsplat_core.progress import silent
@@ -808,6 +809,10 @@ def as_gltf(gaussians: Gaussians, name: str) -> bytes:
     return bytes_of(write_gltf, Scene(gaussians), name=name)
 
 
+def as_stage(end: str, _: Path) -> list[bytes]:
+    return pytest.importorskip("pxr") and [bytes_of(write_usd, Scene(random_gaussians(5)), name=f"a{end}")]
+
+
 KINDS = {
     "INRIA PLY": _scenes(
         *("a.ply", plain_ply(SCENE), plain_ply(PLAIN), mixed_ply(SCENE), ascii_ply(random_gaussians(5))),
@@ -825,6 +830,10 @@ KINDS = {
     ".glb": _scenes("a.glb", *(as_gltf(one, "a.glb") for one in (SCENE, PLAIN)), damage=in_glb),
     ".gltf": _scenes("a.gltf", as_gltf(random_gaussians(3), "a.gltf"), damage=in_json),
     ".splat": _scenes("a.splat", splat_bytes(SCENE), splat_bytes(PLAIN)),
+    **{
+        end: FileKind(f"a{end}", partial(as_stage, end), scene_share, share=0.0)  # a second for each
+        for end in (row.suffix for row in formats() if row.write is write_usd)
+    },
     "sidecar": FileKind("a.langsplat.safetensors", sidecars, searched, in_safetensors),
     "taught words": FileKind("a.safetensors", word_files, asked_words, in_safetensors),
     "vocabulary": FileKind("a.txt", vocabularies, encoded),

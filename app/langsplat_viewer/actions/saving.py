@@ -229,7 +229,7 @@ OPTIONS: dict[str, tuple[str, float, tuple[float, float]]] = {  # label, default
 }
 SCENES = {
     ".ply": (0, 56, 12), ".spz": (0, 14, 2), ".sog": (0, 20, 0.5), ".glb": (0, 52, 12), ".gltf": (0, 70, 16),
-    ".splat": (0, 32, 0),
+    ".splat": (0, 32, 0), ".usdc": (0, 44, 12),
 }  # fmt: skip
 PAGE, SCENE = "web page", "scene"
 EXPORTS = {

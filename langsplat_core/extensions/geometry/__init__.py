@@ -2,13 +2,13 @@
 
 from langsplat_core.registry import Extension
 
-_COMMANDS = "langsplat_core.extensions.geometry.commands"
+_COMMANDS, _USD = (f"langsplat_core.extensions.geometry.{module}" for module in ("commands", "usd"))
 EXTENSION = Extension(
     commands={
         "map": f"{_COMMANDS}:Map",
         "mesh": f"{_COMMANDS}:WriteMesh",
         "register": f"{_COMMANDS}:Register",
         "merge": f"{_COMMANDS}:Merge",
-        "usd": "langsplat_core.extensions.geometry.usd:Usd",
-    }
+    },
+    formats={f".{name}": f"{_USD}:{name.upper()}" for name in ("usda", "usdc", "usd", "usdz")},
 )

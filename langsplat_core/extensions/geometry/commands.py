@@ -145,7 +145,7 @@ class Merge:
     second: tyro.conf.Positional[Path]
     """The scene that is added, and moved for that."""
     out: OutFile
-    """Scene to write: .ply, .spz, .sog, .glb, .gltf or .splat."""
+    """Scene to write: .ply, .spz, .sog, .glb, .gltf, .usdc, .usda or .splat."""
     transform: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """How the second lies in the axes of the first: .json of `langsplat register`, instead of a search."""
     as_is: bool = False

@@ -3,6 +3,7 @@ along rays, the map of the floor, poses in front of things."""
 
 import json
 import os
+import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array, rotation_matrices, unit
 from langsplat_core.cli.app import parse
-from langsplat_core.errors import InputError
+from langsplat_core.errors import BackendError, FormatError, InputError
 from langsplat_core.extensions.geometry.commands import read_transform
 from langsplat_core.extensions.geometry.mesh import (
     Mesh,
@@ -42,7 +43,8 @@ from langsplat_core.extensions.geometry.occupancy import (
     trace,
 )
 from langsplat_core.extensions.geometry.planes import FEWEST, Room, find_room
-from langsplat_core.extensions.geometry.registration import agreement, merge, once, quarter_turns, register
+from langsplat_core.extensions.geometry.registration import agreement, merge, once, register
+from langsplat_core.io import apart
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -226,18 +228,6 @@ def test_a_capture_is_laid_onto_another(scale, scaled):
     assert found.agreement > 0.9
     assert np.linalg.norm(found.transform @ there.matrix - np.eye(4)) < 0.03
     assert found.scale == pytest.approx(1 / scale, rel=0.01)
-
-
-def test_quarter_turns_are_rotations_about_the_middle():
-    scene = box_room()
-    centre, up = scene.bounds()[0], scene.up()
-    turns = quarter_turns(scene)
-    for quarter, turn in enumerate(turns):
-        np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
-        np.testing.assert_allclose(turn[:3, :3] @ centre + turn[:3, 3], centre, atol=1e-12)
-        np.testing.assert_allclose(turn[:3, :3] @ up, up, atol=1e-12)
-        np.testing.assert_allclose(np.linalg.matrix_power(turns[1], quarter), turn, atol=1e-12)
-    assert np.trace(turns[1][:3, :3]) == pytest.approx(1)
 
 
 def test_metres_decide_the_scale():
@@ -623,20 +613,18 @@ def test_splats_and_surface_of_a_glb_overlap(tmp_path, cameras, metres):
 
 
 @pytest.mark.parametrize("suffix", [".usda", ".usdc"])
-def test_stage_is_valid_and_stands_upright_in_metres(tmp_path, capsys, suffix):
-    usd, geom, validation = (
-        pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdValidation")
-    )
+def test_stage_is_valid_and_stands_upright_in_metres(tmp_path, caplog, suffix):
+    usd, geom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
+    from pxr import UsdUtils, UsdValidation
 
     scene = load_scene(DEMO).take(np.arange(0, 80_000, 40))
     at = np.array([500_123.25, 5_412_345.5, 30.0])  # UTM
     save_scene(tmp_path / "far.ply", place_scene(scene, moving(at)))
     out = tmp_path / f"far{suffix}"
-    parse(["usd", str(tmp_path / "far.ply"), str(out)]).run()
-    assert "2,000 Gaussians, " in capsys.readouterr().out
+    parse(["convert", str(tmp_path / "far.ply"), str(out)]).run()
     stage = usd.Stage.Open(str(out))
-    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
-    assert validation.ValidationContext(validators).Validate(stage) == []
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert UsdValidation.ValidationContext(validators).Validate(stage) == []
     assert stage.GetDefaultPrim().GetPath() == "/Scene"
     prim = stage.GetPrimAtPath("/Scene/Gaussians")
     assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
@@ -650,17 +638,8 @@ def test_stage_is_valid_and_stands_upright_in_metres(tmp_path, capsys, suffix):
     heights = given.in_world(given.gaussians.means) @ given.up()
     np.testing.assert_allclose(np.diff(world[:, 1]), np.diff(heights), atol=1e-6)
     np.testing.assert_allclose(np.exp(given.gaussians.log_scales), get("scales"), rtol=1e-6)
-    quats = get("orientations")[:, [3, 0, 1, 2]]  # i, j, k, r in memory
-    axes = np.swapaxes(rotation_matrices(quats), 1, 2) @ matrix[:3, :3]
-    upright = (
-        np.abs(axes[..., 1]),
-        np.abs(np.swapaxes(rotation_matrices(given.gaussians.quats_wxyz), 1, 2) @ given.up()),
-    )
-    np.testing.assert_allclose(*upright, atol=1e-5)
-    harmonics, each = (
-        prim.GetAttribute("radiance:sphericalHarmonicsCoefficients"),
-        given.gaussians.sh.shape[1],
-    )
+    each = given.gaussians.sh.shape[1]
+    harmonics = prim.GetAttribute("radiance:sphericalHarmonicsCoefficients")
     assert (len(harmonics.Get()), harmonics.GetMetadata("elementSize")) == (2000 * each, each)
     np.testing.assert_array_equal(wholes := get("primvars:whole"), given.language.tree.at(2))
     bounds, named = geom.BBoxCache(0.0, ["default"], useExtentsHint=True), set()
@@ -671,3 +650,75 @@ def test_stage_is_valid_and_stands_upright_in_metres(tmp_path, capsys, suffix):
         assert within.all(1).mean() > 0.9
         named |= {*(thing.GetAttribute("semantics:labels:class").Get() or ())}
     assert {"teddy bear", "hamburger"} < named
+    assert not caplog.messages
+    out.with_name(f"far{suffix}.langsplat.safetensors").unlink()
+    assert load_scene(out).language is None
+    assert "language features and labels are in" in caplog.text
+    assert UsdUtils.CreateNewUsdzPackage(str(out), str(tmp_path / "far.usdz"))
+    np.testing.assert_array_equal(load_scene(tmp_path / "far.usdz").origin, load_scene(out).origin)
+
+
+OTHERS = """#usda 1.0
+( metersPerUnit = 0.01; upAxis = "Z" )
+def Xform "World"
+{
+    double3 xformOp:translate = (100, 0, 50); float3 xformOp:rotateXYZ = (10, 20, 90)
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]
+    def Xform "Group"
+    {
+        float3 xformOp:scale.timeSamples = { 1: (2, 2, 2), 5: (3, 3, 3) }
+        uniform token[] xformOpOrder = ["xformOp:scale"]
+        def ParticleField3DGaussianSplat "Splats"
+        {
+            point3f[] positions = [(0, 0, 0), (1, 0, 0), (0, 0, 1)]
+            quath[] orientationsh = [(1, 0, 0, 0), (0.6, 0, 0, 0.8), (1, 0, 0, 0)]
+            float3[] scales = [(0.1, 0.1, 0.1), (0.3, 0.1, 0.1), (0.1, 0.1, 0.2)]
+            float[] opacities.timeSamples = { 1: [0.9, 0.5, 0.25], 2: [0, 0, 0] }
+            int radiance:sphericalHarmonicsDegree = 0
+            float3[] radiance:sphericalHarmonicsCoefficients = [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
+        }
+    }
+    def Mesh "Table" ( references = @table.usd@ ) {}
+    over "Splats" {}
+}
+"""
+
+
+def test_a_stage_of_another_program_is_placed_by_its_transforms(tmp_path, caplog):
+    usd, geom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
+    (tmp_path / "a.usd").write_text(OTHERS)
+    stage = usd.Stage.Open(str(tmp_path / "a.usd"))
+    prim = stage.GetPrimAtPath("/World/Group/Splats")
+    matrix = np.array(geom.Xformable(prim).ComputeLocalToWorldTransform(1.0))  # of rows
+    got = load_scene(tmp_path / "a.usd")
+    assert got.metres_per_unit == 0.01
+    to_ours = np.array([[-1, 0, 0], [0, 0, -1], [0, -1, 0.0]])  # of rows: z is up there, -y here
+    there = np.array(prim.GetAttribute("positions").Get()) @ matrix[:3, :3] + matrix[3, :3]
+    np.testing.assert_allclose(got.in_world(got.gaussians.means), there @ to_ours, atol=1e-5)
+    axes = rotation_matrices(got.gaussians.quats_wxyz)[1] * np.exp(got.gaussians.log_scales[1])
+    long = np.array([1 - 2 * 0.8**2, 2 * 0.6 * 0.8, 0]) * 0.3  # x, turned about z
+    np.testing.assert_allclose(np.abs(axes[:, 0]), np.abs(long @ matrix[:3, :3] @ to_ours), atol=1e-3)
+    np.testing.assert_allclose(1 / (1 + np.exp(-got.gaussians.opacity_logits)), [0.9, 0.5, 0.25], atol=1e-6)
+    for said in ("2 moments of opacities", "'Mesh'", "/World/Splats", "refers to, 'table.usd'"):
+        assert said in caplog.text
+    broken = {"scales its axes unlike": ("(2, 2, 2)", "(2, 1, 1)"), "do not fit degree": ("= 0\n", "= 1\n")}
+    broken |= {
+        "holds no Particle": ("3DGaussianSplat", ""),
+        "has no scales": ("float3[] scales", "float3[] s"),
+    }
+    for message, change in broken.items():
+        (tmp_path / "b.usd").write_text(OTHERS.replace(*change))
+        with pytest.raises(FormatError, match=message):
+            load_scene(tmp_path / "b.usd")
+
+
+def test_without_usd_core_the_remedy_is_said(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    monkeypatch.setattr(apart, "run", lambda read, *given, progress, **_: read(*given, progress))
+    (tmp_path / "a.usda").write_text(OTHERS)
+    for ask in (
+        lambda: load_scene(tmp_path / "a.usda"),
+        lambda: save_scene(tmp_path / "b.usdc", blob_scene()),
+    ):
+        with pytest.raises(BackendError, match=r"langsplat-viewer\[usd\]"):
+            ask()
