@@ -16,7 +16,7 @@ from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import Side, adopt_up, level
-from langsplat_viewer.marks import TOOLS, Tool
+from langsplat_viewer.marks import TOOLS
 from langsplat_viewer.session import Overlay
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
@@ -95,14 +95,6 @@ def _display(button: Button, number: int) -> Command:
     )
 
 
-def _recent(path: Path) -> Command:
-    return Command(f"open {path.parent.name}/{path.name}", lambda viewer: opening.open_file(viewer, path))
-
-
-def _panel(title: str) -> Command:
-    return Command(f"panel: {title}", lambda v: settings.open_panel(v, title))
-
-
 def _overlay(name: Overlay, title: str) -> Command:
     return Command(
         f"show or hide the {title}",
@@ -110,10 +102,6 @@ def _overlay(name: Overlay, title: str) -> Command:
         ("B",) if name == "things" else (),
         is_on=lambda v: name in v.state.session.overlays,
     )
-
-
-def _tool(tool: Tool) -> Command:
-    return Command(f"select: {tool}", lambda v: editing.use_tool(v, tool), is_on=_is("tools.tool", tool))
 
 
 def _step(step: editing.Step, act: editing.Action, *keys: str) -> Command:
@@ -224,7 +212,10 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             is_on=_is("tools.tool", None),
             apart=True,
         ),
-        *(_tool(tool) for tool in TOOLS),
+        *(
+            Command(f"select: {one}", partial(editing.use_tool, tool=one), is_on=_is("tools.tool", one))
+            for one in TOOLS
+        ),
         Command("hide the selection", editing.hide_selected, ("H",), "Hide", apart=True),
         Command("isolate the selection", editing.isolate_selected, ("Shift+H",), "Isolate"),
         Command("show all that is hidden", editing.show_hidden, ("U", "Alt+H"), "Show all"),
@@ -297,7 +288,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("smaller text", lambda v: settings.scale_text(v, -0.25)),
     ),
     "Export": tuple(map(_export_as, saving.exports())),  # in the menu File
-    "": tuple(_panel(title) for title in PANEL_TITLES),
+    "": tuple(Command(f"panel: {one}", partial(settings.open_panel, title=one)) for one in PANEL_TITLES),
     "Help": (
         Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),
         Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "First steps"),
@@ -384,7 +375,11 @@ def matching(text: str, recent: Sequence[str] = ()) -> list[Command]:
 
     `recent` scenes are some.
     """
-    words, commands = text.lower().split(), (*COMMANDS, *map(_recent, map(Path, recent)))
+    opened = (
+        Command(f"open {path.parent.name}/{path.name}", partial(opening.open_file, path=path))
+        for path in map(Path, recent)
+    )
+    words, commands = text.lower().split(), (*COMMANDS, *opened)
 
     def missed(command: Command) -> int:
         """Return how many words are none of its own; one more than there are where one is unknown."""

@@ -20,7 +20,6 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
-import platformdirs
 from msgspec import Meta
 
 from langsplat_core.config import check_settings
@@ -34,7 +33,6 @@ from langsplat_viewer.camera.flight import FOV_LIMITS, LONGEST, SAME_TIME, SPAN_
 from langsplat_viewer.session import (
     LONGEST_NOTE,
     MOST_RECENT,
-    SCALES,
     SLOTS,
     Bits,
     Bookmark,
@@ -344,12 +342,6 @@ def _from_version_1(top: dict[str, Any]) -> dict[str, Any]:
 
 BUNDLED = Path(str(files("langsplat_assets") / "demo" / "scene.ply"))
 FILE_NAME, LAYOUT_NAME = "preferences.json", "layout.ini"
-DESIGNED = 1080  # window units: the height of the screen that a scale of 1 is made for
-
-
-def preferences_folder() -> Path:
-    """Return the folder of the preferences; it need not exist."""
-    return Path(platformdirs.user_config_path("langsplat-viewer", appauthor=False))
 
 
 def thumbnail_of(folder: Path | None, path: Path) -> Path | None:
@@ -358,11 +350,6 @@ def thumbnail_of(folder: Path | None, path: Path) -> Path | None:
         return path.with_suffix(".jpg")
     name = hashlib.sha256(os.fsencode(path.absolute())).hexdigest()[:24]
     return None if folder is None else folder / "thumbnails" / f"{name}.jpg"
-
-
-def fitting_scale(height: float) -> float:
-    """Return the size of letters for a screen `height` units high: at 1080 that of the design."""
-    return float(np.clip(round(4 * height / DESIGNED) / 4, 1.0, SCALES[1]))
 
 
 def load_preferences(folder: Path, at_first: Preferences | None = None) -> Preferences:

@@ -342,6 +342,7 @@ class Preferences:
     coarse_while_moving: Annotated[
         bool, widget("Camera", "Coarse while moving", "Where drawing is slow: fewer pixels, merged Gaussians")
     ] = True
+    undocked: tuple[str, ...] = ()  # titles of sections of the inspector that are windows of their own
 
     def with_recent(self, path: Path) -> "Preferences":
         """Return the preferences with `path` as what was opened last."""

@@ -14,6 +14,7 @@ from imgui_bundle import hello_imgui, imgui, immapp  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip  (before glfw, else there are two)
 import glfw  # isort: skip
 import moderngl
+import platformdirs
 
 from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
@@ -26,7 +27,7 @@ from langsplat_viewer.options import ViewerOptions, chosen_camera, latent_level
 from langsplat_viewer.panels import dialogs, layout, menus, navigation, outline, overlays, theme, ui
 from langsplat_viewer.panels.navigation import Keyboard
 from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
-from langsplat_viewer.session import Preferences
+from langsplat_viewer.session import SCALES, Preferences
 from langsplat_viewer.viewer import Services, Viewer
 
 # 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's images.
@@ -57,11 +58,12 @@ def probe_gl() -> tuple[int, int]:
     raise BackendError(f"the display offers no OpenGL 3.3; update the graphics driver, or {hint}")
 
 
-def _screen_height() -> float:
-    """Height of the first screen, window units in the size that the system gives them; 0 if unknown."""
+def _fitting_scale() -> float:
+    """Size of letters for the first screen: at a height of 1080 window units that of the design."""
     monitor = glfw.get_primary_monitor()
     mode = glfw.get_video_mode(monitor) if monitor else None
-    return mode.size.height / max(glfw.get_monitor_content_scale(monitor)[1], 1.0) if mode else 0.0
+    height = mode.size.height / max(glfw.get_monitor_content_scale(monitor)[1], 1.0) if mode else 0.0
+    return min(max(round(4 * height / 1080) / 4, 1.0), SCALES[1])
 
 
 def _gl_hints(major: int, minor: int) -> None:
@@ -88,9 +90,7 @@ class Workspace:
         """Take the preferences that are there; where the folder makes no sense say so, and keep nothing."""
         params.ini_disable = True
         params.app_window_params.restore_previous_geometry = False
-        self._state.preferences = replace(
-            self._state.preferences, ui_scale=projects.fitting_scale(_screen_height())
-        )
+        self._state.preferences = replace(self._state.preferences, ui_scale=_fitting_scale())
         if self._folder is None:
             return
         try:
@@ -139,7 +139,8 @@ RECORDER_PATIENCE = 5.0  # seconds for a film that is being drawn to leave nothi
 def open_window(path: Path | None, options: ViewerOptions, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
     share_one_heap()
-    window = Window(path, options, services, folder=None if options.fresh else projects.preferences_folder())
+    kept = platformdirs.user_config_path("langsplat-viewer", appauthor=False)
+    window = Window(path, options, services, folder=None if options.fresh else kept)
     with on_signals(glfw.post_empty_event) as window.signals:
         immapp.run(window.params())
     if window.failure is not None:

@@ -16,7 +16,7 @@ from langsplat_viewer.actions import editing, opening, saving, settings, viewpoi
 from langsplat_viewer.camera.controls import from_side, pan
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.panels import select
-from langsplat_viewer.panels.layout import INSPECTOR, all_panels
+from langsplat_viewer.panels.layout import INSPECTOR, TAKE_OUT, all_panels
 from langsplat_viewer.panels.menus import button_label
 from langsplat_viewer.panels.ui import scene_area
 from langsplat_viewer.projects import thumbnail_of
@@ -50,7 +50,9 @@ def split_the_view(s: Any) -> None:
 
     s.drag((middle, y), (middle + 40, y))  # beside the line the camera turns as ever
     assert s.state.view is not before
+    s.open_panel("Search")
     s.menu("View", "Three levels side by side")
+    assert not s.ctx.item_exists("//**/##phrase")  # the search would cover two of them
     levels = s.shot("levels")
     assert s.drawn > drawn
     thirds = [levels[250:400, int(area.left + (i + 0.5) * area.width / 3)] for i in range(3)]
@@ -756,7 +758,11 @@ def arrange_panels(s: Any) -> None:
     s.key("escape", frames=1)
     s.menu("Window", "Reset the layout")
     assert s.state.size == whole
-    assert s.ctx.item_exists("//**/Colours")
+    s.click(f"//Inspector/{TAKE_OUT}##Display")
+    assert s.ctx.item_exists("//Display/Colours")
+    s.ctx.dock_into("Display", "Inspector", imgui.Dir.down)
+    s.menu("Window", "Reset the layout")
+    assert s.ctx.item_exists("//Inspector/**/Colours")
 
 
 def leave_settings(s: Any) -> None:

@@ -78,6 +78,8 @@ def compare(
     needs_field = mode == "levels" or (mode == "wipe" and DISPLAYS[second].needs_field)
     if _can_show(viewer, needs_field):
         viewer.change(split=replace(split, mode=mode, second=second, second_level=level))
+        if mode == "levels":  # whose first columns it would cover
+            turn_panel(viewer, "Search", is_open=False)
 
 
 def _toggle_compare(viewer: Viewer, mode: SplitMode) -> None:

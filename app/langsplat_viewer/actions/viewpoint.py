@@ -176,7 +176,9 @@ def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
     if box is None:
         box = np.stack([place, place + 0.1 * extent.radius])
     most = max(float(np.linalg.norm(place - view.eye)), home.distance)
-    distance = min(max(controls.holding_distance(view, box), NEAREST * extent.radius), most)
+    angle = np.radians(min(view.intrinsics.fov_degrees, 170.0))  # of which the box takes about half
+    holding = controls.SURROUNDINGS * 0.5 * float(np.linalg.norm(box[1] - box[0]) / np.sin(angle / 2))
+    distance = min(max(holding, NEAREST * extent.radius), most)
     glide_to(viewer, controls.focus(view, place, distance))
 
 

@@ -363,12 +363,6 @@ def frame_all(view: OrbitCamera, extent: Extent, size: tuple[int, int]) -> Orbit
     return replace(view, target=target, distance=distance)
 
 
-def holding_distance(view: OrbitCamera, box: Array) -> float:
-    """Distance from which a thing in `box` (2, 3) fills about half of the image, world units."""
-    radius = 0.5 * float(np.linalg.norm(box[1] - box[0]))
-    return SURROUNDINGS * radius / math.sin(math.radians(min(view.intrinsics.fov_degrees, 170.0)) / 2)
-
-
 def default_view(scene: Scene, extent: Extent, size: tuple[int, int]) -> OrbitCamera:
     """Return the first training camera, else a view of the whole scene in a window of `size` pixels."""
     if scene.cameras:

@@ -24,6 +24,7 @@ from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 
 INSPECTOR, FOOT = "Inspector", "Foot"  # the docks: right of the scene, and below it
+TAKE_OUT = icons_fontawesome_6.ICON_FA_UP_RIGHT_FROM_SQUARE
 COLUMN = 320.0  # the inspector's width at first, window units
 MOST_SHARE, FOOT_SHARE = 0.36, 0.3
 
@@ -67,13 +68,18 @@ def opened(state: ViewerState) -> list[str]:
     return [panel.title for panel in all_panels() if (panel.is_open if kept is None else panel.title in kept)]
 
 
+def is_window(state: ViewerState, panel: Panel) -> bool:
+    """Return whether a panel is a window of its own: at the foot, or taken out of the inspector."""
+    return panel.dock == FOOT or panel.title in state.preferences.undocked
+
+
 def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
     """Return the docks of a window `width` units wide, and the windows in them, for hello_imgui to draw."""
     docking = hello_imgui.DockingParams()
     docking.layout_name = INSPECTOR  # what was kept of other layouts is not taken for it
     docking.docking_splits = _splits(viewer.state.preferences.ui_scale, width)
     inspector = Panel(INSPECTOR, draw_inspector, dock=INSPECTOR)
-    windows = (inspector, *(panel for panel in all_panels() if panel.dock == FOOT))
+    windows = (inspector, *(panel for panel in all_panels() if panel.dock))
     docking.dockable_windows = [_window(viewer, panel) for panel in windows]
     docking.dockable_windows[0].can_be_closed = False
     # The scene itself is no panel: nothing is docked over it.
@@ -109,9 +115,10 @@ def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
 
 def draw_inspector(viewer: Viewer) -> None:
     """Draw the sections, each below its header; the one that is wanted is scrolled to."""
-    are_open = opened(viewer.state)
+    are_open, kept = opened(viewer.state), viewer.state.preferences.undocked
+    right = imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x
     for panel in all_panels():
-        if panel.dock != INSPECTOR:
+        if panel.dock != INSPECTOR or panel.title in kept:
             continue
         was_open = panel.title in are_open
         imgui.set_next_item_open(was_open)
@@ -119,7 +126,13 @@ def draw_inspector(viewer: Viewer) -> None:
             settings.take(viewer.state, "wanted_panel")
             imgui.set_scroll_here_y(0.0)
         with theme.styled(frame_border_size=0.0):
-            is_open = imgui.collapsing_header(panel.title)
+            is_open = imgui.collapsing_header(panel.title, imgui.TreeNodeFlags_.allow_overlap)
+            left = right - ui.button_width(TAKE_OUT)
+            imgui.same_line(left)
+            if left > ui.width_of(f"mmm {panel.title}") and imgui.small_button(f"{TAKE_OUT}##{panel.title}"):
+                settings.prefer(viewer, undocked=(*kept, panel.title))
+                settings.open_panel(viewer, panel.title)
+            ui.tip("As a panel of its own, whose title drags it anywhere; its cross puts it back here")
         if is_open != was_open:
             settings.turn_panel(viewer, panel.title, is_open=not was_open)
         if was_open:
@@ -155,26 +168,28 @@ class Docks:
             _widen(scale)
         self._scale = scale
         if settings.take(state, "resets_panels"):
-            settings.prefer(viewer, panels=None)
+            settings.prefer(viewer, panels=None, undocked=())
             docking.docking_splits = _splits(scale, imgui.get_main_viewport().size.x)
             docking.layout_reset = True
         settings.prefer(viewer, panels=tuple(opened(state)))
         for window in docking.dockable_windows:
             if window.label in self._shown and not window.is_visible:  # its cross was clicked
-                settings.turn_panel(viewer, window.label, is_open=False)
+                kept = tuple(title for title in state.preferences.undocked if title != window.label)
+                settings.turn_panel(viewer, window.label, is_open=kept != state.preferences.undocked)
+                settings.prefer(viewer, undocked=kept)  # a section goes back, and stays open
         wanted, shown = state.wanted_panel, state.show_panel and not state.show_start
         if wanted and shown:
             settings.turn_panel(viewer, wanted, is_open=True)
-        are_open = (INSPECTOR, *opened(state)) if shown else ()
+        windows = {panel.title for panel in all_panels() if is_window(state, panel)} & {*opened(state)}
         for window in docking.dockable_windows:
-            window.is_visible = window.label in are_open
+            window.is_visible = shown and window.label in (INSPECTOR, *windows)
         self._shown = [window.label for window in docking.dockable_windows if window.is_visible]
         params.imgui_window_params.show_status_bar = shown
         if wanted and shown:  # in front of those that it shares its place with
-            is_window = wanted in self._shown
-            is_section = any(panel.title == wanted and panel.dock == INSPECTOR for panel in all_panels())
-            if is_window or is_section:
-                docking.focus_dockable_window(wanted if is_window else INSPECTOR)
+            docked = wanted in self._shown
+            is_section = not docked and any(p.title == wanted and p.dock for p in all_panels())
+            if docked or is_section:
+                docking.focus_dockable_window(wanted if docked else INSPECTOR)
             if not is_section:  # which is scrolled to when it is drawn
                 settings.take(state, "wanted_panel")
 
@@ -185,7 +200,8 @@ def draw_titles(viewer: Viewer) -> None:
     are_open = opened(viewer.state)
     for panel in all_panels():
         if imgui.menu_item(panel.title, "", panel.title in are_open)[0]:
-            window = imgui.internal.find_window_by_name(panel.title if panel.dock == FOOT else INSPECTOR)
+            name = panel.title if is_window(viewer.state, panel) else INSPECTOR
+            window = imgui.internal.find_window_by_name(name)
             is_seen = not panel.dock or (window is not None and not window.hidden)  # not behind a tab
             if panel.title in are_open and viewer.state.show_panel and is_seen:
                 settings.turn_panel(viewer, panel.title, is_open=False)
@@ -211,7 +227,7 @@ def draw_over(
         said = f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or press Ctrl+O"
     if said:
         overlays.say(said, free)
-    else:
+    elif not state.show_start:
         overlays.draw_legends(viewer, area)
         outline.draw_legend(viewer, area)
         overlays.draw_pointing(viewer)
