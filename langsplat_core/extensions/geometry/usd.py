@@ -52,7 +52,7 @@ KNOWN |= {*COLUMNS, *(f"{name}h" for name in COLUMNS)}
 OURS = {*(f"primvars:{name}" for name in LEVELS), "semantics:labels:class", "extentsHint"}
 Z_TO_Y = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 MEMORY, SECONDS = 3 << 30, 60  # for reading, beside 100 bytes and a microsecond for each byte of the file
-ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PXR_WORK_THREAD_LIMIT": "1"}
+ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 @optional_imports()
@@ -157,8 +157,9 @@ def _read(
     path: Path, size: int, progress: Progress
 ) -> tuple[list[Any], Kept | None, float | None, list[str]]:
     """Return what `placed_scene` takes, what is kept of a scene of ours, metres per unit, and losses."""
-    from pxr import Sdf
+    from pxr import Sdf, Work
 
+    Work.SetConcurrencyLimit(1)  # each thread would take of the bound on memory
     with suppress(ImportError, ValueError):  # other systems have no such bounds, or lower ones
         import resource
 
