@@ -38,7 +38,7 @@ from langsplat_core.extensions.compaction.clean import CleanConfig, clean
 from langsplat_core.extensions.compaction.compact import BudgetConfig, choose_views, find_reduction
 from langsplat_core.extensions.library.changes import changes
 from langsplat_core.io.cameras import write_cameras
-from langsplat_core.io.scenes import save_scene, writable_suffixes
+from langsplat_core.io.scenes import CORE_FORMATS, save_scene
 from langsplat_core.pipeline.webpage import pack_gaussians, views
 from langsplat_core.progress import silent
 from langsplat_core.query import selection
@@ -463,7 +463,7 @@ def printed(case: Case) -> Found:
 def written(case: Case) -> Found:
     """Every format keeps a scene in any unit, and anywhere, as well as in its own."""
     drawn: dict[str, Any] = {}
-    for suffix in writable_suffixes():
+    for suffix in (row.suffix for row in CORE_FORMATS):
         path, again = case.folder / f"kept{suffix}", case.scene
         try:
             case.run("convert", case.path, path)
