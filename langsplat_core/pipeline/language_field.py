@@ -39,6 +39,7 @@ from langsplat_core.semantics.features import (
     FeatureStore,
     ImageFeatures,
     OnDemand,
+    RegionEncoder,
     embed_regions,
     fingerprint,
     masked_crop,
@@ -303,7 +304,8 @@ CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; ch
 NAMED = (0.6, 0.9)  # costs between which wholes are those that have a name
 UNNAMED = 2.0  # spreads above everyday phrases that the nearest name of anything reaches
 AREA = 0.75  # power of a node's share of the area, by which its name counts
-VIEWS = 3  # that show most of a node, in which the encoder sees it alone
+VIEWS = 8  # in which the encoder sees a node alone
+OUTLIERS = 0.4  # share of these looks, those least like the others, that does not count
 LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing
 AGREED = "what masks agree on"  # which is drawn, named and described: stages
 VERSION = 2
@@ -343,53 +345,76 @@ def agreed_features(
             view, mask = rasterizer.view(gaussians, views[index][0], formed), photographs[index][1]
             patches = draw_patches(view, gaussians, tree.patches, formed)
             write_array(drawn[index], patches if mask is None else np.where(mask, patches, -1))
-    told = stage_key("alone", VERSION, key, NAMED, VIEWS, LEAST, fingerprint(encoder))
-    shown = _alone(stages, tree, drawn, photographs, work / told)
-    names = name_scores(tree, surface_areas(gaussians), shown, encoder)
-    wholes = tree.cut(CUTS[2]) if names is None else tree.cut(*NAMED, names)
-    cuts = [*(np.minimum(tree.cut(cost), wholes) for cost in CUTS[:2]), wholes]  # later nodes are larger
+    described = stage_key("described", VERSION, key, CUTS, NAMED, VIEWS, LEAST, fingerprint(encoder))
+    finer = [tree.cut(cost) for cost in CUTS[:2]]
+    whole = isinstance(encoder, RegionEncoder)  # one look at a photograph describes all its regions
+    used = np.isin(np.arange(len(tree.highest)), [] if whole else finer)
+    nodes = np.flatnonzero(tree.between(*NAMED) | used)
+    vectors = _described(stages, tree, nodes, np.stack(eyes), drawn, photographs, work / described)
+    names = name_scores(tree, surface_areas(gaussians), vectors, encoder)
+    cuts = [*finer, tree.cut(CUTS[2]) if names is None else tree.cut(*NAMED, names)]
     store = FeatureStore(work / "features")
-    made_by = stage_key(told, VERSION, CUTS, UNNAMED, AREA)
-    for index in stages.each(len(views), f"describing {AGREED}"):
+    made_by = stage_key(described, VERSION, UNNAMED, AREA)
+    for index in stages.each(len(views), f"outlining {AGREED}"):
         name = views[index][0].name
         if not store.has(name, made_by):
-            maps = nested_maps(open_array(drawn[index]), cuts, LEAST)
-            vectors = embed_regions(photographs[index][0], maps, encoder)
-            store.save(name, ImageFeatures(maps, vectors), made_by)
+            maps, shown = nested_maps(open_array(drawn[index]), cuts, LEAST)
+            own = embed_regions(photographs[index][0], maps, encoder) if whole else vectors[shown]
+            store.save(name, ImageFeatures(maps, own), made_by)
     return store.of([camera.name for camera, _ in views])
 
 
-def _alone(
+def _described(
     stages: _Stages,
     tree: MergeTree,
+    nodes: Array,
+    eyes: Array,
     drawn: Sequence[Path],
     photographs: Sequence[tuple[Array, Array | None]],
     folder: Path,
 ) -> Array:
-    """Return the (P + K, D) unit vectors of nodes that may be wholes, each alone in its `VIEWS`; else 0.
+    """Return the (P + K, D) unit vectors of what `nodes` show alone in their `best_views`; of others 0.
 
-    drawn: files of the (H, W) patches of each view.
+    The mean of the looks that agree most with all. eyes: (V, 3) positions of cameras; drawn: files of the
+    (H, W) patches of each view.
     """
     encoder, seen = stages.encoder, [open_array(path) for path in drawn]
-    counts = np.stack([np.bincount(one[one >= 0], minlength=tree.count) for one in seen], 1)
-    pixels, members = tree.totals(counts).T, tree.totals(np.eye(tree.count, tree.count + 1, dtype=bool))
-    ranks = np.argsort(np.argsort(-pixels, axis=0, kind="stable"), axis=0)
-    least = np.array([[max(LEAST * one.size, 1)] for one in seen])
-    chosen = tree.between(*NAMED) & (ranks < VIEWS) & (pixels >= least)
+    pixels = tree.totals(np.stack([np.bincount(one[one >= 0], minlength=tree.count) for one in seen], 1)).T
+    pixels[pixels < [[max(LEAST * one.size, 1)] for one in seen]] = 0
+    chosen = best_views(pixels[:, nodes], eyes, VIEWS)
+    members = tree.totals(np.eye(tree.count, tree.count + 1, dtype=bool))  # -1, no patch, is the last column
     files = [folder / f"{index:05d}.npz" for index in range(len(drawn))]
 
     def look(index: int) -> Arrays:
-        nodes, image = np.flatnonzero(chosen[index]), photographs[index][0]
-        masks = (members[node][seen[index]] for node in nodes)  # -1, no patch, is the last column
-        crops = [masked_crop(image, mask, encoder.image_size) for mask in masks]
-        return {"nodes": nodes, "vectors": encoder.encode_images(crops)}
+        masks = (members[node][seen[index]] for node in nodes[chosen[index]])
+        crops = [masked_crop(photographs[index][0], mask, encoder.image_size) for mask in masks]
+        return {"vectors": encoder.encode_images(crops)}
 
-    for index in stages.each(len(drawn), f"naming {AGREED}"):
+    for index in stages.each(len(drawn), f"describing {AGREED}"):
         kept(files[index], partial(look, index))
-    vectors = np.zeros((len(members), encoder.dim), np.float32)
-    for found in map(read_arrays, files):
-        vectors[found["nodes"]] += found["vectors"]
+    looks = np.concatenate([read_arrays(file)["vectors"] for file in files])
+    of, vectors = nodes[np.nonzero(chosen)[1]], np.zeros((len(members), encoder.dim), np.float32)
+    for node in np.unique(of):
+        own = looks[of == node]
+        agreeing = np.argsort(own @ own.sum(0))[int(OUTLIERS * len(own)) :]
+        vectors[node] = own[agreeing].sum(0)
     return unit(vectors)
+
+
+def best_views(pixels: Array, eyes: Array, most: int) -> Array:
+    """Return (V, K) bool, up to `most` views of each of K nodes: those that show much of it, from all sides.
+
+    One after another the view with the largest root of its `pixels` (V, K) times the distance of its place,
+    of `eyes` (V, 3), to the nearest of those before; never one without pixels.
+    """
+    chosen, apart = np.zeros(pixels.shape, bool), np.ones(pixels.shape)
+    distances = np.linalg.norm(eyes[:, None] - eyes, axis=2)
+    for number in range(most):
+        worth = np.sqrt(pixels) * apart
+        best = worth.argmax(0)
+        chosen[best, np.arange(len(best))] |= worth.max(0) > 0
+        apart = np.minimum(apart, distances[best].T) if number else distances[best].T
+    return chosen
 
 
 def name_scores(tree: MergeTree, areas: Array, vectors: Array, encoder: PhraseEncoder) -> Array | None:

@@ -42,9 +42,10 @@ class MaskGroups:
 
 def group_masks(vectors: Sequence[Array], groups: int = 2_048) -> MaskGroups:
     """Return at most `groups` groups of the masks, or each its own; vectors: (M, D) float32 unit a view."""
-    joined = np.concatenate(vectors)
-    of_mask, centres = np.arange(len(joined)), joined
-    if len(joined) > groups:
+    joined, number = np.concatenate(vectors), dict[bytes, int]()
+    of_mask = np.array([number.setdefault(vector.tobytes(), len(number)) for vector in joined], int)
+    centres = joined[np.unique(of_mask, return_index=True)[1]]
+    if len(centres) > groups:
         generator = np.random.default_rng(0)
         sample = joined[np.sort(generator.permutation(len(joined))[:16_384])]
         centres = spherical_kmeans(sample, groups, rounds=6, generator=generator)

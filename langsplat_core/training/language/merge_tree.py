@@ -36,7 +36,6 @@ from langsplat_core.raster.reference import Footprints, project
 from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.scene.surface import Surface, divide, surface_areas
 from langsplat_core.scene.transform import C0
-from langsplat_core.semantics.masks import within
 from langsplat_core.training.language.lift import MaskWeights
 
 SEEN, BENT, COLOUR = 0.5, 0.3, 1.0  # weights of the cost's terms
@@ -392,17 +391,17 @@ def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
     return channel_of, np.array(owners, np.int32).reshape(len(owners), rows, columns)
 
 
-def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> Array:
-    """Return label maps (3, H, W) int32, as of `masks.label_maps`, of the nodes of patches.
+def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> tuple[Array, Array]:
+    """Return label maps (3, H, W) int32, as of `masks.label_maps`, and the (M,) node of each region.
 
     drawn: (H, W) patches, -1 for none; cuts: (P,) node of each patch at each level; least: share of the image
     below which a node is left out.
     """
     maps = np.full((len(cuts), *drawn.shape), -1, np.int32)
-    first, there = 0, drawn >= 0
+    shown, there = np.zeros(0, int), drawn >= 0
     for level, nodes in zip(maps, cuts, strict=True):
         found = nodes[drawn[there]]
         large = np.bincount(found) >= max(least * drawn.size, 1)
-        level[there] = np.where(large[found], first + found, -1)
-        first += len(large)
-    return within(maps, None)
+        level[there] = np.where(large, len(shown) + np.cumsum(large) - 1, -1)[found]
+        shown = np.concatenate([shown, np.flatnonzero(large)])
+    return maps, shown

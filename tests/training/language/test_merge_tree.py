@@ -8,7 +8,7 @@ import pytest
 from scipy import sparse
 
 from langsplat_core.arrays import unit
-from langsplat_core.pipeline.language_field import AREA, name_scores
+from langsplat_core.pipeline.language_field import AREA, best_views, name_scores
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import view_of
@@ -54,12 +54,8 @@ def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]
     children, costs = [], []
 
     def cost(a: list[int], b: list[int]) -> float | None:
-        across = [
-            row
-            for row, ends in enumerate(patches.borders.T)
-            if (ends[0] in a and ends[1] in b) or (ends[0] in b and ends[1] in a)
-        ]
-        if not across:
+        across = (np.isin(patches.borders, a) & np.isin(patches.borders[::-1], b)).any(0)
+        if not across.any():
             return None
         agreed = seen = 0.0
         for k in range(patches.labelling.max() + 1):
@@ -71,8 +67,8 @@ def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]
         agreement = agreed / seen if seen > 0 else 1 - module.UNSEEN
         links, disagreement, concavity = patches.sums[across].sum(0)
         means = [np.average(patches.colours[nodes], axis=0, weights=patches.areas[nodes]) for nodes in (a, b)]
-        between = module.SEEN * (1 - agreement) + module.SEEN * disagreement / links
-        between += module.BENT * concavity / links
+        between = module.SEEN * (1 - agreement)
+        between += (module.SEEN * disagreement + module.BENT * concavity) / links
         between += module.COLOUR * np.linalg.norm(means[0] - means[1])
         smaller = min(patches.areas[a].sum(), patches.areas[b].sum()) / patches.areas.sum()
         return between * (smaller / module.PLAIN) ** module.SMALL
@@ -137,9 +133,8 @@ def test_concavity_is_high_in_corners_and_low_on_ridges():
 def blob_views(wrong: float) -> tuple:
     """A scene of blobs, the blob of each Gaussian, and views with a mask a blob; a share of all pixels has a
     random mask."""
-    scene, rng = blob_scene(), np.random.default_rng(0)
+    scene, rng, views = blob_scene(), np.random.default_rng(0), []
     blob = np.arange(len(scene.gaussians)) // PER_BLOB
-    views = []
     for camera in cameras():
         view = CpuRasterizer().view(scene.gaussians, camera)
         labels = draw_patches(view, scene.gaussians, blob.astype(np.int32))
@@ -249,7 +244,18 @@ def test_empty_scenes_have_empty_trees():
         tree = find_tree(gaussians, build_surface(gaussians), nothing, [7], eyes)
         assert tree.patches.shape == (count,)
         assert (tree.cut(0.5) >= 0).all()
-    gaussians = random_gaussians(3)
     view = CpuRasterizer().view(gaussians, random_camera(0, 8, 6))
     assert (draw_patches(view, gaussians, np.full(3, -1, np.int32)) == -1).all()
-    assert (nested_maps(np.full((6, 8), -1, np.int32), [np.zeros(0, np.int32)] * 3, 0.1) == -1).all()
+    assert (nested_maps(np.full((6, 8), -1, np.int32), [np.zeros(0, np.int32)] * 3, 0.1)[0] == -1).all()
+
+
+def test_label_maps_number_the_nodes_of_all_levels():
+    drawn, cuts = np.array([[0, 0, 1], [2, 2, -1]]), np.array([[0, 1, 2], [3, 3, 2], [4, 4, 4]])
+    maps, nodes = nested_maps(drawn, cuts, 0.2)  # two pixels of six, not one
+    want = np.where((drawn >= 0) & (cuts[:, drawn] != 1), cuts[:, drawn], -1)
+    np.testing.assert_array_equal(np.append(nodes, -1)[maps], want)
+
+
+def test_best_views_show_much_from_far_apart():
+    chosen = best_views(np.array([[100, 99, 50, 0], [0, 0, 0, 9]]).T, np.array([[0], [0.1], [1], [2]]), 2)
+    assert chosen.T.astype(int).tolist() == [[1, 0, 1, 0], [0, 0, 0, 1]]
