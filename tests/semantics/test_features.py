@@ -34,16 +34,14 @@ def test_a_square_region_of_the_right_size_is_copied_exactly() -> None:
 
 
 def test_a_wide_region_is_centred_between_black_bars() -> None:
-    image = np.full((20, 30, 3), 200, np.uint8)
     mask = np.zeros((20, 30), bool)
     mask[5:9, 2:14] = True  # 4 rows, 12 columns: 4 black rows above, 4 below
-    crop = masked_crop(image, mask, 12)
+    crop = masked_crop(np.full((20, 30, 3), 200, np.uint8), mask, 12)
     assert (crop == np.repeat([0, 200, 0], 4)[:, None, None]).all()
 
 
 def test_shrinking_averages_instead_of_picking_pixels() -> None:
-    image = np.zeros((64, 64, 3), np.uint8)
-    image[::2] = 255  # stripes of one pixel: picking would give 0 or 255 everywhere
+    image = np.full((64, 64, 3), [[[255]], [[0]]] * 32, np.uint8)  # picking would give 0 or 255 everywhere
     crop = masked_crop(image, np.ones((64, 64), bool), 8)
     assert abs(crop[2:-2].astype(float) - 127.5).max() < 8
 
@@ -125,8 +123,7 @@ def test_a_store_returns_what_was_saved(tmp_path: Path) -> None:
     back = store.load("frame.001")
     np.testing.assert_array_equal(back.labels, features.labels)
     assert back.labels.dtype == np.int32
-    cosine = (back.vectors * features.vectors).sum(axis=1)
-    assert (1 - cosine).max() < 1e-6  # half floats
+    assert (1 - (back.vectors * features.vectors).sum(axis=1)).max() < 1e-6  # half floats
     np.testing.assert_allclose(np.linalg.norm(back.vectors, axis=1), 1, atol=1e-6)
 
 
@@ -151,9 +148,8 @@ def test_the_key_changes_with_image_mask_source_and_encoder() -> None:
     others.id, thresholds.key = "others", "other thresholds"
     made_by = fingerprint(ColourEncoder())
     first = feature_key(image, None, Halves(), made_by)
-    assert (
-        feature_key(image[::-1], None, Halves(), made_by) == first
-    )  # upside down this picture is the same one
+    # Upside down this picture is the same one.
+    assert feature_key(image[::-1], None, Halves(), made_by) == first
     keys = {
         first,
         feature_key(image, None, thresholds, made_by),
@@ -169,7 +165,6 @@ def test_the_key_changes_with_image_mask_source_and_encoder() -> None:
 
     # Other weights under the same name.
     assert feature_key(image, None, Halves(), fingerprint(Retrained())) not in keys
-    assert feature_key(image, None, Halves(), fingerprint(ColourEncoder())) == first
 
 
 def test_an_interrupted_run_continues_where_it_stopped(tmp_path: Path) -> None:
@@ -203,8 +198,7 @@ class InTwoParts(Halves):
         self.fails, self.log = fails, []
 
     def begin(self, image: np.ndarray, progress: Progress) -> Callable[[], LevelMasks]:
-        number = self.calls
-        found = self(image, progress)
+        number, found = self.calls, self(image, progress)
         self.log.append((number, "asked", get_ident()))
 
         def finish() -> LevelMasks:
