@@ -40,7 +40,7 @@ def _record(tile: int, tiles: Tiles, state: Array, spans: Array, tape: Array) ->
     """
     x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
-    used = 0
+    used, rows = 0, np.empty(3 * TILE, np.float32)
     top, bottom = 0, TILE
     for s in range(first, last):
         if (s - first) % tiling.CHECK_EVERY == tiling.CHECK_EVERY - 1:
@@ -49,16 +49,16 @@ def _record(tile: int, tiles: Tiles, state: Array, spans: Array, tape: Array) ->
                 return tape, used, s
         if used + TILE * _ENTRY > tape.shape[0]:
             tape = tiling.grown(tape, used)
-        low, high = tiling.rows_to_blend(tiles.rows[s], top, bottom)
-        g = tiling.enter(tiles, s, min(s + tiling.AHEAD, last - 1))
-        step, peak, w, v, w_step, v_step = tiling.begin_rows(g, x, y + low)
+        low, high = tiling.rows_to_blend(tiles, s, top, bottom)
+        rank, _ = tiling.enter(tiles, s, min(s + tiling.AHEAD, last - 1))
+        steps = tiling.begin_rows(tiles.geometry[rank], x, y + low, rows)
         start, most = used, ln.lanes(np.float32(0))
         for row in range(low, high):
-            added, before = tiling.blend_row(state, row * TILE, step + w, peak - v * v, tiles.cutoffs)
-            w, v = w + w_step, v + v_step
+            w, peak = steps + rows[row - low], rows[TILE + row - low]
+            added, before = tiling.blend_row(state, row * TILE, w, peak, tiles.cutoffs)
             ln.store(tape, used, added)
             ln.store(tape, used + TILE, before)
-            most = ln.where_greater(added, most, added, most)
+            most = ln.where_at_least(added, most, added, most)
             used += _ENTRY
         if ln.largest(most) > 0:
             spans[s - first, 0], spans[s - first, 1] = low, high
@@ -97,7 +97,7 @@ def backward(
         planes, plane = np.empty(PIXELS * lines, np.float32), np.empty(PIXELS, np.float32)
         tiling.load_tile(planes, image_grad, tile, tiles)
         tiling.load_tile(plane, alpha_grad, tile, tiles)
-        weights = np.empty(PIXELS, np.float32)
+        weights, at_row = np.empty(PIXELS, np.float32), np.empty(3 * TILE, np.float32)
         behind = state
         behind[:] = 0
         for s in range(end - 1, start - 1, -1):
@@ -106,12 +106,12 @@ def backward(
             if low >= high:
                 continue
             used -= (high - low) * _ENTRY
-            g = tiling.enter(tiles, s, max(s - tiling.AHEAD, start))
-            x = values[tiles.ranks[s]]
-            step, _, offset, v, w_step, v_step = tiling.begin_rows(g, left, top + low)
+            rank, _ = tiling.enter(tiles, s, max(s - tiling.AHEAD, start))
+            x = values[rank]
+            steps = tiling.begin_rows(tiles.geometry[rank], left, top + low, at_row)
             q0 = qw = qv = qww = qwv = qvv = none = ln.lanes(np.float32(0))
             for row in range(low, high):
-                w = step + offset
+                w, v = steps + at_row[row - low], at_row[2 * TILE + row - low]
                 at = used + (row - low) * _ENTRY
                 alpha, before = ln.load(tape, at), ln.load(tape, at + TILE)
                 weight = alpha * before
@@ -122,11 +122,10 @@ def backward(
                 hidden = ln.load(behind, row * TILE)
                 ln.store(behind, row * TILE, hidden + weight * slope)
                 q = weight * slope - hidden * alpha / (1.0 - alpha)
-                q = ln.where_greater(tiles.cutoffs.alpha_max, alpha, q, 0.0)
+                q = ln.where_at_least(alpha, tiles.cutoffs.alpha_max, 0.0, q)
                 moved, lifted = q * w, q * v
                 q0, qw, qv = q0 + q, qw + moved, qv + lifted
                 qww, qwv, qvv = qww + moved * w, qwv + moved * v, qvv + lifted * v
-                offset, v = offset + w_step, v + v_step
             ln.store_totals(partial, s * columns, q0, qw, qv, qww)
             ln.store_totals(partial, s * columns + QWV, qwv, qvv, none, none)
             tiling.correlate(planes, lines, weights, low, high, partial, s, MOMENTS)

@@ -20,7 +20,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 LANES = 16
 Lanes = Any  # how a value of sixteen lanes is annotated in kernels
 FLOAT, INT = ir.FloatType(), ir.IntType(32)
-FLOATS, INTS = (ir.VectorType(kind, LANES) for kind in (FLOAT, INT))
+FLOATS, INTS, DOUBLES = (ir.VectorType(kind, LANES) for kind in (FLOAT, INT, ir.DoubleType()))
 _FUSE = ("contract",)  # a * b + c may round once; nothing is reordered
 
 # 2^x on [-0.5, 0.5], minimax in relative error (7.5e-8, found by iteratively reweighted least squares).
@@ -45,13 +45,20 @@ def _constant(value: float) -> ir.Constant:
     return ir.Constant(FLOATS, [float(value)] * LANES)
 
 
-def as_lanes(builder: Any, value: Any) -> Any:
-    """Return a float, double or lanes as lanes."""
-    if value.type == FLOATS:
+def _kept(builder: Any, value: float) -> Any:
+    """Return a constant that loops keep in a register; LLVM would fetch it from memory at every use."""
+    kind = ir.FunctionType(FLOATS, [FLOATS])
+    fence = builder.module.declare_intrinsic(f"llvm.arithmetic.fence.v{LANES}f32", (), kind)
+    return builder.call(fence, [_constant(value)])
+
+
+def as_lanes(builder: Any, value: Any, kind: Any = FLOATS) -> Any:
+    """Return a float, double or lanes as lanes; as sixteen doubles if `kind` is that."""
+    if value.type == kind:
         return value
-    if isinstance(value.type, ir.DoubleType):
+    if isinstance(value.type, ir.DoubleType) and kind == FLOATS:
         value = builder.fptrunc(value, FLOAT)
-    undefined = ir.Constant(FLOATS, ir.Undefined)
+    undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, value, INT(0))
     return builder.shuffle_vector(first, undefined, ir.Constant(INTS, [0] * LANES))
 
@@ -93,16 +100,15 @@ def lanes(typing: Any, value: Any) -> Any:
 
 
 @intrinsic
-def ramp(typing: Any) -> Any:
-    """0, 1, ... 15."""
-    values = ir.Constant(FLOATS, [float(i) for i in range(LANES)])
-    return lanes16(), lambda context, builder, sig, args: values
+def ramp(typing: Any, start: Any, step: Any) -> Any:
+    """Return start + step * (0, 1, ... 15), computed in float64."""
 
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        start, step = (as_lanes(builder, argument, DOUBLES) for argument in arguments)
+        steps = builder.fmul(step, ir.Constant(DOUBLES, [float(i) for i in range(LANES)]), flags=_FUSE)
+        return builder.fptrunc(builder.fadd(start, steps, flags=_FUSE), FLOATS)
 
-@lanewise
-def where_greater(builder: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
-    """Return a > b ? yes : no."""
-    return builder.select(builder.fcmp_ordered(">", a, b), yes, no)
+    return lanes16(types.float64, types.float64), lower
 
 
 @lanewise
@@ -119,19 +125,18 @@ def smaller(builder: Any, a: Any, b: Any) -> Any:
 
 @lanewise
 def exp2(builder: Any, power: Any) -> Any:
-    """2^power for power <= 0.5, relative error 2e-7; powers below -100 give 2^-100."""
-    low = _constant(-100)
-    power = builder.select(builder.fcmp_ordered(">", power, low), power, low)
-    # Conversion truncates, and power - 0.5 <= 0: so this rounds to the nearest integer.
-    whole = builder.fptosi(builder.fsub(power, _constant(0.5)), INTS)
-    rest = builder.fsub(power, builder.sitofp(whole, FLOATS))
-    result = _constant(_EXP2[-1])
+    """2^power for -126 <= power <= 127, relative error 2e-7; other powers give any number."""
+    # So large a float has no digits behind the point: the sum is rounded to an integer, in its lowest bits.
+    large = _kept(builder, 1.5 * 2**23)
+    shifted = builder.fadd(power, large)
+    rest = builder.fsub(power, builder.fsub(shifted, large))
+    result = _kept(builder, _EXP2[-1])
     for coefficient in _EXP2[-2::-1]:
         scaled = builder.fmul(result, rest, flags=_FUSE)
-        result = builder.fadd(scaled, _constant(coefficient), flags=_FUSE)
-    # Multiplying by 2^whole is an addition to the exponent's bits.
-    bits = builder.add(builder.bitcast(result, INTS), builder.shl(whole, ir.Constant(INTS, [23] * LANES)))
-    return builder.bitcast(bits, FLOATS)
+        result = builder.fadd(scaled, _kept(builder, coefficient), flags=_FUSE)
+    # Multiplying by a power of two is an addition to the exponent's bits.
+    exponent = builder.shl(builder.bitcast(shifted, INTS), ir.Constant(INTS, [23] * LANES))
+    return builder.bitcast(builder.add(builder.bitcast(result, INTS), exponent), FLOATS)
 
 
 def shuffle(builder: Any, a: Any, b: Any, picks: list[int]) -> Any:

@@ -29,18 +29,18 @@ from langsplat_core.scene import Camera, Gaussians
 
 
 @helper
-def _fetch_values(work: Any, s: int, later: int) -> Array:
-    ranks, values, _ = work
+def _fetch_values(work: Any, rank: int, later: int) -> Array:
+    values, _ = work
     lines = values.shape[1]
-    ln.prefetch(values, np.int64(ranks[later]) * lines)
-    ln.prefetch(values, np.int64(ranks[later]) * lines + lines - 1)
-    return values[ranks[s]]
+    ln.prefetch(values, later * lines)
+    ln.prefetch(values, later * lines + lines - 1)
+    return values[rank]
 
 
 @helper
 def _add_values(work: Any, x: Array, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
     channels = x.shape[0]
-    tiling.add_weighted(work[2], row * tiling.padded_inside(channels) * TILE, channels, weight, x)
+    tiling.add_weighted(work[1], row * tiling.padded_inside(channels) * TILE, channels, weight, x)
 
 
 @kernel
@@ -50,7 +50,7 @@ def splat_tiles(first: int, last: int, tiles: Tiles, values: Array, image: Array
     for i in range(first, last):
         tile = tiling.tile_at(i, tiles)
         sums[:] = 0
-        work = (tiles.ranks, values, sums)
+        work = ln.borrowed((values, sums))
         transmittance, _ = tiling.walk(tile, tiles, work, _fetch_values, _add_values, tiling.nothing_to_close)
         for n in range(PIXELS):
             transmittance[n] = np.float32(1) - abs(transmittance[n])
@@ -98,15 +98,14 @@ def sum_partials(first: int, last: int, tiles: Tiles, order: Array, partial: Arr
 
 
 @helper
-def _fetch_depth(work: Any, s: int, later: int) -> Any:
-    ranks, depths, _ = work
-    return np.float32(depths[ranks[s]])
+def _fetch_depth(work: Any, rank: int, later: int) -> Any:
+    return np.float32(work[0][rank])
 
 
 @helper
 def _note_half(work: Any, depth: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
-    found, at, half = work[2], row * TILE, np.float32(0.5)
-    passed = ln.where_greater(before, half, ln.lanes(depth), ln.load(found, at))
+    found, at, half = work[1], row * TILE, np.float32(0.5)
+    passed = ln.where_at_least(half, before, ln.load(found, at), ln.lanes(depth))
     ln.store(found, at, ln.where_at_least(half, before - weight, passed, ln.load(found, at)))
 
 
@@ -117,9 +116,7 @@ def median_tiles(first: int, last: int, tiles: Tiles, depths: Array, out: Array)
     for i in range(first, last):
         tile = tiling.tile_at(i, tiles)
         found[:] = 0
-        tiling.walk(
-            tile, tiles, (tiles.ranks, depths, found), _fetch_depth, _note_half, tiling.nothing_to_close
-        )
+        tiling.walk(tile, tiles, (depths, found), _fetch_depth, _note_half, tiling.nothing_to_close)
         tiling.write_tile(found, out, tile, tiles)
 
 
@@ -215,7 +212,7 @@ def label_weights(
     # Sums of each intersection by label, added up in float64 in the order of a Gaussian's intersections.
     columns = [np.tile(met.labels[t, : lines[t]], here[t]) for t in range(number)]
     ends = np.concatenate([[0], np.cumsum(np.repeat(lines, here))])
-    by_intersection = sparse.csr_matrix((sums, np.concatenate(columns), ends), (len(tiles.ranks), shape[1]))
+    by_intersection = sparse.csr_matrix((sums, np.concatenate(columns), ends), (len(tiles.met), shape[1]))
     by_intersection.eliminate_zeros()
     drawn, ones = len(order), np.ones(len(tiles.slots))
     met_by = sparse.csr_matrix((ones, tiles.slots, tiles.firsts), (drawn, len(ones)))
@@ -326,7 +323,7 @@ class CpuView(LiftingView):
         values = np.zeros((self.count, channels), np.float32)
         for start in range(0, channels, CHANNELS_AT_ONCE):
             part = plain(image[..., start : start + CHANNELS_AT_ONCE])
-            partial = np.empty((len(self.tiles.ranks), tiling.padded(part.shape[2])), np.float32)
+            partial = np.empty((len(self.tiles.met), tiling.padded(part.shape[2])), np.float32)
             out = np.zeros((self.count, part.shape[2]), np.float32)
             self._over_tiles(gather_tiles, part, partial)
             self.workers.run(sum_partials, len(self.order), self.tiles, self.order, partial, out)
@@ -352,7 +349,7 @@ class CpuView(LiftingView):
             alpha_grad = np.zeros((height, width), np.float32)
         check_array("alpha_grad", alpha_grad, (height, width))
         grads = (plain(image_grad), plain(alpha_grad)[..., None])
-        met, columns = len(self.tiles.ranks), backward.MOMENTS + tiling.padded(channels)
+        met, columns = len(self.tiles.met), backward.MOMENTS + tiling.padded(channels)
         partial, reached = self._empty((met, columns), np.float32), np.empty(met, bool)
         self._over_tiles(backward.backward, plain(values[self.order]), grads, partial, reached)
         shapes = (3,), (3,), (4,), (), (channels,), (2,)

@@ -30,7 +30,6 @@ from langsplat_core.raster.cpu.lanes import (
     store_totals,
     total,
     where_at_least,
-    where_greater,
 )
 
 TILE = 16
@@ -50,7 +49,7 @@ Size = tuple[int, int]  # width and height of an image, px
 class Cutoffs(NamedTuple):
     """The constants of steps 3 and 4 of `reference.py`."""
 
-    alpha_min: float
+    log2_alpha_min: float  # at least -100
     alpha_max: float
     transmittance_min: float
 
@@ -60,8 +59,7 @@ class Tiles(NamedTuple):
 
     geometry: Array  # (M, 8) float64 footprints, see `projection`
     starts: Array  # (T + 1,) int64: tile t owns intersections starts[t] to starts[t + 1]
-    ranks: Array  # (I,) int32 Gaussian of each intersection, ascending within a tile
-    rows: Array  # (I,) uint16 spans of rows that the footprint touches in the tile, see `_pack`
+    met: Array  # (I,) int64: Gaussian, tile and rows that the footprint touches there, see `_pack`
     firsts: Array  # (M + 1,) int64: Gaussian r has intersections slots[firsts[r] : firsts[r + 1]]
     slots: Array  # (I,) int32
     columns: int  # tiles per row of tiles
@@ -74,7 +72,7 @@ class Tiles(NamedTuple):
 
 @helper
 def _pack(rank: int, tile: int, low: int, high: int) -> int:
-    """One intersection, rows [low, high) of a tile, as one number: it is written once instead of thrice."""
+    """One intersection, rows [low, high) of a tile, as one number; within a tile they rise as ranks do."""
     return (rank << _PLACE | tile) << _SPAN | high << 5 | low
 
 
@@ -132,10 +130,9 @@ def depth_order(depths: Array, rows: Array) -> Array:
 
 @helper
 def _span(centre: float, low: float, high: float, size: int) -> tuple[int, int]:
-    """Pixels [first, last) of `size` whose centres lie in [centre + low, centre + high]."""
-    first = min(max(np.ceil(centre + low - 0.5 - _SLACK), 0.0), float(size))
-    last = min(max(np.floor(centre + high - 0.5 + _SLACK) + 1, 0.0), float(size))
-    return int(first), int(last)
+    """Pixels [first, last) of `size` whose centres lie in [centre + low, centre + high]; int rounds down."""
+    first = int(min(max(centre + low + 0.5 - _SLACK, 0.0), float(size)))
+    return first, int(min(max(centre + high + 0.5 + _SLACK, 0.0), float(size)))
 
 
 @helper
@@ -228,7 +225,7 @@ def _place(first: int, last: int, touched: Array, places: Array, start: int, til
         tile = touched[n] >> _SPAN & (1 << _PLACE) - 1
         place = places[tile]
         places[tile] = place + 1
-        tiles.ranks[place], tiles.rows[place] = touched[n] >> _SPAN + _PLACE, touched[n] & (1 << _SPAN) - 1
+        tiles.met[place] = touched[n]
         tiles.slots[start + n] = place
 
 
@@ -261,19 +258,19 @@ def bin_tiles(
     counts = np.stack([counts[:number] for _, _, counts in found], 1)
     ends = np.cumsum(counts).reshape(counts.shape)
     places = np.ascontiguousarray((ends - counts).T)
+    least = math.log2(max(settings.alpha_min, 2.0**-100))
     golden = max(int(number * 0.6180339887), 1)  # every stretch of tiles then samples the whole image evenly
     tiles = Tiles(
         geometry=geometry,
         starts=np.append(places[0], total),
-        ranks=empty((total,), np.int32),
-        rows=empty((total,), np.uint16),
+        met=empty((total,), np.int64),
         firsts=firsts,
         slots=empty((total,), np.int32),
         columns=columns,
         stride=next(stride for stride in count(golden) if math.gcd(stride, number) == 1),
         width=size[0],
         height=size[1],
-        cutoffs=Cutoffs(*map(float, (settings.alpha_min, settings.alpha_max, settings.transmittance_min))),
+        cutoffs=Cutoffs(least, float(settings.alpha_max), float(settings.transmittance_min)),
     )
     calls = []
     for (first, _), (touched, used, _), places_of_it in zip(pieces, found, places, strict=True):
@@ -376,7 +373,7 @@ def correlate(
 #
 # What an operation does on the way is given as three helpers, compiled into the walk:
 #
-# open_(work, s, later)                        before the rows of intersection s; the next two get its result
+# open_(work, rank, later)                     before an intersection's rows: its Gaussian, a later one's
 # row_(work, mine, s, row, low, weight, before)  at a row of rows from `low`: weight alpha T, and T before it
 # close_(work, mine, s, low, high)             after rows [low, high)
 #
@@ -384,7 +381,7 @@ def correlate(
 # pixel's transmittance is stored negative once the pixel has stopped: its size stays readable, and
 # `T - alpha T > transmittance_min` is then false for every later Gaussian.
 
-AHEAD = 8  # intersections between asking for a footprint and using it
+AHEAD = 16  # intersections between asking for a footprint and using it
 CHECK_EVERY = 16  # Gaussians between two looks at whether a tile still has running pixels
 
 
@@ -417,30 +414,33 @@ def running_rows(transmittance: Array, low: int, high: int) -> tuple[int, int]:
 
 
 @helper
-def rows_to_blend(packed: int, top: int, bottom: int) -> tuple[int, int]:
-    """Return the rows of a packed span that are within the running rows [top, bottom)."""
-    return max(packed & 31, top), min(packed >> 5, bottom)
+def rows_to_blend(tiles: Tiles, s: int, top: int, bottom: int) -> tuple[int, int]:
+    """Return the rows that intersection `s` touches, of the running rows [top, bottom)."""
+    return max(tiles.met[s] & 31, top), min(tiles.met[s] >> 5 & 31, bottom)
 
 
 @helper
-def enter(tiles: Tiles, s: int, later: int) -> Array:
-    """Return the footprint of intersection `s`; that of `later` is asked for, as memory is far away."""
-    prefetch(tiles.geometry, np.int64(tiles.ranks[later]) * cp.COLUMNS)
-    return tiles.geometry[tiles.ranks[s]]
+def enter(tiles: Tiles, s: int, later: int) -> tuple[int, int]:
+    """Return the Gaussians of intersections `s` and `later`, whose footprint is asked for: memory is far."""
+    coming = tiles.met[later] >> _SPAN + _PLACE
+    prefetch(tiles.geometry, coming * cp.COLUMNS)
+    return tiles.met[s] >> _SPAN + _PLACE, coming
 
 
 @helper
-def begin_rows(g: Array, x: float, y: float) -> tuple[Lanes, float, float, float, float, float]:
-    """For rows whose first pixel centre is (x, y): of sixteen pixels the steps in w (see `projection`).
+def begin_rows(g: Array, x: float, y: float, rows: Array) -> Lanes:
+    """Begin sixteen rows whose first pixel centre is (x, y): return the steps in w of a row's pixels.
 
-    The log2 of the peak alpha; w and v at (x, y), and what a step of one row adds to them.
-
-    float64: across a long thin footprint w is the small difference of large numbers.
+    rows[:16] <- w of each row's first pixel (see `projection`), rows[16:32] <- log2 of its peak alpha,
+    rows[32:] <- v. float64: across a long thin footprint w is the small difference of large numbers.
     """
     dy = y - g[cp.MEAN_Y]
     skew = g[cp.FACTOR_A] * g[cp.FACTOR_K]
-    w, v = g[cp.FACTOR_A] * (x - g[cp.MEAN_X]) - skew * dy, g[cp.FACTOR_C] * dy
-    return ramp() * g[cp.FACTOR_A], g[cp.LOG2_OPACITY], w, v, -skew, g[cp.FACTOR_C]
+    v = ramp(g[cp.FACTOR_C] * dy, g[cp.FACTOR_C])
+    store(rows, 0, ramp(g[cp.FACTOR_A] * (x - g[cp.MEAN_X]) - skew * dy, -skew))
+    store(rows, TILE, g[cp.LOG2_OPACITY] - v * v)
+    store(rows, 2 * TILE, v)
+    return ramp(0.0, g[cp.FACTOR_A])
 
 
 @helper
@@ -451,13 +451,12 @@ def blend_row(
 
     All sixteen lanes are stored: a masked store would stall the next Gaussian's load of the same row.
     """
-    before = load(transmittance, at)
-    alpha = smaller(exp2(log2_height - w * w), cutoffs.alpha_max)
-    alpha = where_at_least(alpha, cutoffs.alpha_min, alpha, 0.0)
+    before, power = load(transmittance, at), log2_height - w * w
+    alpha = where_at_least(power, cutoffs.log2_alpha_min, smaller(exp2(power), cutoffs.alpha_max), 0.0)
     after = before - alpha * before
     stopped = smaller(before, 0.0 - before)
-    store(transmittance, at, where_greater(after, cutoffs.transmittance_min, after, stopped))
-    return where_greater(after, cutoffs.transmittance_min, alpha, 0.0), before
+    store(transmittance, at, where_at_least(cutoffs.transmittance_min, after, stopped, after))
+    return where_at_least(cutoffs.transmittance_min, after, 0.0, alpha), before
 
 
 @helper
@@ -472,28 +471,27 @@ def walk(
     """Blend the tile; return its transmittance and the end of the intersections, once no pixel runs."""
     x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
-    transmittance = start_tile(tile, tiles)
+    transmittance, rows = start_tile(tile, tiles), np.empty(3 * TILE, np.float32)
     top, bottom = 0, TILE
     for s in range(first, last):
         if (s - first) % CHECK_EVERY == CHECK_EVERY - 1:
             top, bottom = running_rows(transmittance, top, bottom)
             if top >= bottom:
                 return transmittance, s
-        low, high = rows_to_blend(tiles.rows[s], top, bottom)
-        later = min(s + AHEAD, last - 1)
-        g = enter(tiles, s, later)
-        mine = open_(work, s, later)
-        step, peak, w, v, w_step, v_step = begin_rows(g, x, y + low)
-        for row in range(low, high):
-            added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, tiles.cutoffs)
-            w, v = w + w_step, v + v_step
+        low, high = rows_to_blend(tiles, s, top, bottom)
+        rank, later = enter(tiles, s, min(s + AHEAD, last - 1))
+        mine = open_(work, rank, later)
+        steps = begin_rows(tiles.geometry[rank], x, y + low, rows)
+        for n in range(high - low):
+            row, w, peak = low + n, steps + rows[n], rows[TILE + n]
+            added, before = blend_row(transmittance, row * TILE, w, peak, tiles.cutoffs)
             row_(work, mine, s, row, low, added * before, before)
         close_(work, mine, s, low, high)
     return transmittance, last
 
 
 @helper
-def nothing_to_open(work: Any, s: int, later: int) -> int:
+def nothing_to_open(work: Any, rank: int, later: int) -> int:
     """For operations that keep nothing per intersection."""
     return 0
 
