@@ -214,6 +214,8 @@ class RadianceConfig:
     # up to so many training views, 64 `steps` of each, 60 000 Gaussians and degree 1 are trained at most:
     # more lose on views held out; 0: never
     capped_views: CountOrZero = 24
+    # trainings from other random starts, merged and trained together; 0: two with capped views, else one
+    ensemble: Annotated[int, Range(0, 16)] = 0
     # each photograph has an exposure and white balance of its own; auto: where that explains enough
     exposure: Literal["auto", "on", "off"] = "auto"
     # what moves in a photograph, such as people, does not count; auto: where it explains enough of the error

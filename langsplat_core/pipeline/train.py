@@ -151,9 +151,9 @@ def _train(
             settings = trainer.supported(config.radiance, len(train))
             if settings.steps < config.radiance.steps:
                 log.info(
-                    "training takes %d steps, not %d: with %d photographs more does not pay; "
+                    "training takes %d times %d steps, not %d: with %d photographs more does not pay; "
                     "--radiance.capped-views 0 spends all",
-                    *(settings.steps, config.radiance.steps, len(train)),
+                    *(settings.ensemble, settings.steps, config.radiance.steps, len(train)),
                 )
             made = capture, train, settings, run.work, run.progress, held_out
             gaussians = processes.once(lambda: trained_gaussians(*made))

@@ -176,6 +176,7 @@ VARIANTS: dict[str, dict[str, object]] = {
     "before": {"few_views": 0, "capped_views": 0, "exposure": "off", "transients": "off"},
     "depths": {"capped_views": 0, "exposure": "off", "transients": "off"},
     "depths, exposures": {"capped_views": 0, "transients": "off"},
+    "one training": {"ensemble": 1},
     "all": {},
 }
 

@@ -237,8 +237,6 @@ def radiance_loss(image: Tensor, target: Tensor, lambda_dssim: float) -> Tensor:
         loss: Tensor = _CpuLoss.apply(image, target, lambda_dssim)
         return loss
     l1 = (image - target).abs().mean()
-    if lambda_dssim == 0:
-        return l1
     return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim_map(image, target).mean())
 
 
@@ -268,11 +266,6 @@ def fit_exposure(pairs: Sequence[tuple[Tensor, Tensor]], ridge: float = 0.1) -> 
 def with_exposure(image: Tensor, change: Tensor) -> Tensor:
     """Return the (..., 3) image under the (4, 3) affine change of its colours."""
     return image @ change[:3] + change[3]
-
-
-def no_exposures(views: int, device: torch.device) -> Tensor:
-    """Return the (V, 4, 3) changes of colours that change nothing."""
-    return torch.eye(4, 3, device=device).repeat(views, 1, 1)
 
 
 def fit_exposures(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, float]:

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.differentiable import PARAMETERS, parameters_of
-from langsplat_core.training.radiance.losses import Transients, no_exposures, no_transients
+from langsplat_core.training.radiance.losses import Transients, no_transients
 
 # Fewer points are topped up to this number: features are found where there is detail, and what lies between
 # is covered from random ones better than by splitting what is elsewhere (docs/photographs.md) ...
@@ -101,6 +101,7 @@ class TrainingState:
     values: dict[str, Tensor]  # raw parameters, see `parameters_of`
     first: dict[str, Tensor]  # Adam's first moments, shaped like the values
     second: dict[str, Tensor]  # Adam's second moments
+    finished: dict[str, Tensor]  # values of the members of an ensemble that were trained before
     grad_sum: Tensor  # (N,) norms of the gradients by the projected means, NDC, summed over `seen` views
     seen: Tensor  # (N,) float32: in how many steps since the last round the Gaussian was visible
     exposures: Tensor  # (V, 4, 3) affine changes of colours, of the training views, or none
@@ -108,6 +109,7 @@ class TrainingState:
     rng: np.random.Generator
     updates: dict[str, int]  # how often Adam has updated each parameter
     step: int = 0  # steps done
+    member: int = 0  # how many those are
     queue: list[int] = field(default_factory=list)  # views still to come in this pass over the photographs
 
     def __len__(self) -> int:
@@ -131,13 +133,26 @@ def start(gaussians: Gaussians, seed: int, device: torch.device) -> TrainingStat
         values={name: value.requires_grad_() for name, value in values.items()},
         first={name: torch.zeros_like(value) for name, value in values.items()},
         second={name: torch.zeros_like(value) for name, value in values.items()},
+        finished={name: torch.zeros_like(value[:0]) for name, value in values.items()},
         grad_sum=torch.zeros(len(gaussians), device=device),
         seen=torch.zeros(len(gaussians), device=device),
-        exposures=no_exposures(0, device),
+        exposures=torch.zeros((0, 4, 3), device=device),
         transients=no_transients(0),
         rng=np.random.default_rng(seed),
         updates=dict.fromkeys(PARAMETERS, 0),
     )
+
+
+def members(state: TrainingState) -> dict[str, Tensor]:
+    """Return the values of all members of an ensemble up to this one, one after the other."""
+    return {name: torch.cat([state.finished[name], state.values[name].detach()]) for name in PARAMETERS}
+
+
+def merged(state: TrainingState) -> Gaussians:
+    """Return the Gaussians of all members, of opacities divided by their number."""
+    values = members(state)
+    values["opacity_logits"] = torch.logit(values["opacity_logits"].sigmoid() / (state.member + 1), 1e-6)
+    return replace(state, values=values).gaussians()
 
 
 def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | None = None) -> None:
@@ -267,12 +282,12 @@ def add_opacity_decay(state: TrainingState, strength: float) -> None:
 
 # Checkpoints of radiance training: one safetensors file, written atomically, resumed exactly.
 #
-# Tensors: ``values.*``, ``first.*``, ``second.*`` for every parameter, ``grad_sum``, ``seen``, ``exposures``
-# and ``watched.*``; everything else is JSON in the header. No pickle is involved, so a checkpoint from
-# elsewhere cannot run code.
+# Tensors: ``values.*``, ``first.*``, ``second.*`` and ``finished.*`` for every parameter, ``grad_sum``,
+# ``seen``, ``exposures`` and ``watched.*``; everything else is JSON in the header. No pickle is involved, so
+# a checkpoint from elsewhere cannot run code.
 
-KIND = "langsplat-radiance-checkpoint-3"
-ROWS, TENSORS = ("values", "first", "second"), ("grad_sum", "seen", "exposures")
+KIND = "langsplat-radiance-checkpoint-4"
+ROWS, TENSORS = ("values", "first", "second", "finished"), ("grad_sum", "seen", "exposures")
 WATCHED = tuple(Transients.__dataclass_fields__)
 
 
@@ -294,7 +309,7 @@ def save_checkpoint(path: Path, state: TrainingState, made_from: str) -> None:
     tensors = {name: getattr(state, name) for name in TENSORS}
     tensors |= {f"watched.{name}": torch.from_numpy(getattr(state.transients, name)) for name in WATCHED}
     tensors |= {f"{rows}.{name}": getattr(state, rows)[name].detach() for rows in ROWS for name in PARAMETERS}
-    header = {name: getattr(state, name) for name in ("step", "updates", "queue")}
+    header = {name: getattr(state, name) for name in ("step", "member", "updates", "queue")}
     header |= {"fingerprint": made_from, "rng": state.rng.bit_generator.state}
     with atomic_path(path) as temporary:
         save_file(
@@ -328,6 +343,7 @@ def load_checkpoint(path: Path, made_from: str, device: torch.device) -> Trainin
             **rows,
             **{name: tensors[name] for name in TENSORS},
             transients=Transients(*(tensors[f"watched.{name}"].cpu().numpy() for name in WATCHED)),
+            member=int(header["member"]),
             rng=rng,
             updates={name: int(header["updates"][name]) for name in PARAMETERS},
             step=int(header["step"]),

@@ -47,10 +47,12 @@ class Schedule:
     """
 
     steps: int  # in all
+    joint_from: int  # after this step none are removed, and an ensemble's members are trained together
     densify_from: int  # densification rounds come after this step ...
     densify_until: int  # ... and before this one
     densify_every: int
     reset_every: int  # opacity resets, before `densify_until` only; 0: none
+    transients_from: int  # from this step on they do not count: a fifth of the run has to show what is
     sh_degree: int
     sh_degree_every: int
     coarse_until: int  # up to this step images have half their size
@@ -69,11 +71,7 @@ class Schedule:
 
     def clears_free_space(self, step: int) -> bool:
         """Return True where Gaussians before surfaces go after this step; the last steps mend that."""
-        return self.densify_from < step <= 0.9 * self.steps and step % self.densify_every == 0
-
-    def prunes_large(self, step: int) -> bool:
-        """Return True where a round also removes Gaussians larger than a tenth of the extent."""
-        return 0 < self.reset_every < step
+        return self.densify_from < step <= self.joint_from and step % self.densify_every == 0
 
     def resets_opacity(self, step: int) -> bool:
         """Return True where opacities are capped at 0.01 after the step."""
@@ -102,6 +100,7 @@ def schedule_for(config: RadianceConfig, extent: float) -> Schedule:
 
     return Schedule(
         steps=steps,
+        joint_from=int(0.9 * steps),
         # Positions and opacities say nothing before, but a short run spends no more than a quarter on that.
         densify_from=scaled(config.densify_from, min(150, steps // 4)),
         densify_until=scaled(config.densify_until),
@@ -109,6 +108,7 @@ def schedule_for(config: RadianceConfig, extent: float) -> Schedule:
         densify_every=scaled(config.densify_every, max(20, min(50, steps // 24))),
         # An opacity needs 600 steps to come back from 0.01.
         reset_every=config.opacity_reset_every and scaled(config.opacity_reset_every, 600),
+        transients_from=max(round(steps / 5), 1),
         sh_degree=config.sh_degree,
         sh_degree_every=scaled(config.sh_degree_every, 100),
         coarse_until=round(config.coarse_fraction * steps),
@@ -153,14 +153,12 @@ def train_radiance(
         # takes what no photograph needs instead.
         config = replace(config, opacity_reset_every=0, opacity_decay=max(config.opacity_decay, 0.01))
         depths = find_depths(capture, train_indices, progress)
-        capture = _with_points(capture, depths, config)
-    first = training.initial_gaussians(
-        capture, train_indices, config.sh_degree, config.max_gaussians, config.seed
-    )
+    members = config.ensemble if config.ensemble > 1 else 0
+    config = replace(config, ensemble=members, max_gaussians=max(config.max_gaussians // (members or 1), 1))
+    first = _first_gaussians(capture, train_indices, depths, config)
     extent = _extent(capture, first)
-    renderer = differentiable.renderer_for(
-        config.backend, config.formation(near_plane(first, capture.cameras))
-    )
+    near = near_plane(first, capture.cameras)
+    renderer = differentiable.renderer_for(config.backend, config.formation(near))
     views = _Views(capture, train_indices, renderer.device)
     judged = _Views(capture, held_out[:: -(-len(held_out) // JUDGED) or 1], renderer.device)
     run = _Run(config, schedule_for(config, extent), views, judged, renderer, extent, depths)
@@ -175,13 +173,14 @@ def train_radiance(
     signals: list[int] = []  # held back while a step runs: half a step is no state to resume from
     with one_torch_thread(), handled(lambda number, _: signals.append(number)):
         try:
-            while state.step < config.steps:
+            while state.step < config.steps or state.member < config.ensemble:
+                state = run.current(state, capture, train_indices)
                 recent.append(run.step(state))
                 # Every photograph has another loss: what is told is the mean over each 200th of the run.
                 if state.step * 200 // config.steps > (state.step - 1) * 200 // config.steps:
                     metrics, recent = metrics | {"loss": float(np.mean(recent))}, []
                 metrics = metrics | run.held_out(state)
-                progress(STAGE, run.schedule.work(state.step), f"{len(state)} Gaussians", **metrics)
+                progress(STAGE, run.work(state), f"{len(state)} Gaussians", **metrics)
                 if signals:
                     raise Terminated if signal.SIGTERM in signals else KeyboardInterrupt
                 if checkpoint and (state.step % config.checkpoint_every == 0 or state.step == config.steps):
@@ -242,6 +241,28 @@ class _Run:
     extent: float  # world units
     depths: Sequence[DepthMap]  # of surfaces that Gaussians do not stay before; none for many views
 
+    def work(self, state: TrainingState) -> float:
+        """Return the share of the work that is done; a step on all members counts as one on one of them."""
+        members, before = self.config.ensemble, self.schedule.work(self.schedule.joint_from)
+        done = state.member + self.schedule.work(state.step)
+        return (done - before * (state.member == members)) / (members + 1 - before) if members else done
+
+    def current(self, state: TrainingState, capture: Capture, indices: Sequence[int]) -> TrainingState:
+        """Return the state, or that before the next training's first step if this one's are done."""
+        if state.step < self.config.steps:
+            return state
+        member = state.member + 1
+        seeded = replace(self.config, seed=self.config.seed + (member << 32))  # a seed of no other run
+        if member < self.config.ensemble:
+            first = _first_gaussians(capture, indices, self.depths, seeded)
+            after = training.start(first, seeded.seed, self.renderer.device)
+            after.finished = training.members(state)
+        else:
+            after = training.start(training.merged(state), seeded.seed, self.renderer.device)
+            after.step = self.schedule.joint_from
+        after.member, after.exposures, after.transients = member, state.exposures, state.transients
+        return after
+
     def step(self, state: TrainingState) -> float:
         """One photograph, one update; the loss before it."""
         config, schedule, step = self.config, self.schedule, state.step + 1
@@ -258,15 +279,15 @@ class _Run:
         if len(state.exposures):
             image = losses.with_exposure(image, state.exposures[index])
         self.observe_transients(state, index, image, target, mask)
-        loss = self.emptiness(rendered.alpha, mask)
+        # Where a view shows nothing black Gaussians would look as empty as none.
+        loss = rendered.alpha.masked_fill(mask, 0).mean() if self.views.cut_out and mask is not None else 0.0
         mask = self.counted(state, index, None if self.views.cut_out else mask, camera)
         if mask is not None:  # what is masked differs from nothing, and nothing flows back from it
             image = torch.where(mask[..., None], image, image.detach())
             target = torch.where(mask[..., None], target, image.detach())
         loss = loss + losses.radiance_loss(image, target, config.lambda_dssim)
         loss.backward()
-        if config.opacity_decay > 0:
-            training.add_opacity_decay(state, config.opacity_decay)
+        training.add_opacity_decay(state, config.opacity_decay)
         training.clean_gradients(state)
         if step < schedule.densify_until:
             training.accumulate(
@@ -274,7 +295,7 @@ class _Run:
             )
         training.adam_step(state, schedule.learning_rates(step))
         if schedule.densifies(step):
-            training.densify(state, config, self.extent, prune_large=schedule.prunes_large(step))
+            training.densify(state, config, self.extent, prune_large=0 < schedule.reset_every < step)
         if self.depths and schedule.clears_free_space(step):
             means = state.values["means"].detach().cpu().numpy()
             training.remove_gaussians(state, in_free_space(means, self.depths))
@@ -282,10 +303,6 @@ class _Run:
             training.reset_opacities(state)
         state.step = step
         return float(loss.detach())
-
-    def emptiness(self, alpha: Tensor, mask: Tensor | None) -> Tensor | float:
-        """Return the mean alpha where a view shows nothing: black Gaussians would look as empty as none."""
-        return alpha.masked_fill(mask, 0).mean() if self.views.cut_out and mask is not None else 0.0
 
     def drawn(self, state: TrainingState, camera: Camera, focal: float) -> Tensor:
         """Return the (H, W, 3) image of a camera, without gradients."""
@@ -317,14 +334,7 @@ class _Run:
             pairs.append((image[counted].reshape(-1, 3)[::7], target[counted].reshape(-1, 3)[::7]))
         exposures, gain = losses.fit_exposures(pairs)
         log.debug("exposures of the photographs explain %.2f dB", gain)
-        if gain >= 0.35 or self.config.exposure == "on":
-            return exposures
-        return losses.no_exposures(0, exposures.device)
-
-    @property
-    def transients_from(self) -> int:
-        """Step from which on transients do not count: a fifth of the run has to show what is."""
-        return max(round(self.config.steps / 5), 1)
+        return exposures if gain >= 0.35 or self.config.exposure == "on" else exposures[:0]
 
     def observe_transients(
         self, state: TrainingState, index: int, image: Tensor, target: Tensor, mask: Tensor | None
@@ -333,11 +343,11 @@ class _Run:
 
         Transients that explain less than 24 % of the squared error are given up for the rest of the run.
         """
-        judged = state.step == self.transients_from and self.config.transients == "auto"
+        judged = state.step == self.schedule.transients_from and self.config.transients == "auto"
         if judged and state.transients.explained() < 0.24:
             state.transients = losses.no_transients(0)
         # Of older observations a sixteenth would be left: each new one counts as much as all before.
-        if len(state.transients.moving) and state.step >= self.transients_from - 4 * len(self.views):
+        if len(state.transients.moving) and state.step >= self.schedule.transients_from - 4 * len(self.views):
             rendered = losses.patch_means(image)
             if mask is not None:
                 rendered[losses.patch_means(mask[..., None].float())[..., 0] < 0.5] = np.nan
@@ -348,24 +358,27 @@ class _Run:
     def counted(self, state: TrainingState, index: int, mask: Tensor | None, camera: Camera) -> Tensor | None:
         """(H, W) bool pixels of view `index` that count, of those of its `mask`; None: all of them."""
         moving = state.transients.moving
-        if not len(moving) or state.step < self.transients_from or not moving[index].any():
+        if not len(moving) or state.step < self.schedule.transients_from or not moving[index].any():
             return mask
         size = camera.height, camera.width
         still = state.transients.still_pixels(index, size, self.renderer.device)
         return still if mask is None else mask & still
 
 
-def _with_points(capture: Capture, depths: Sequence[DepthMap], config: RadianceConfig) -> Capture:
-    """Return the capture with points of the depths beside its own, as many as leave room for splitting."""
+def _first_gaussians(
+    capture: Capture, indices: Sequence[int], depths: Sequence[DepthMap], config: RadianceConfig
+) -> Gaussians:
+    """Return what a training begins with: at the capture's points, and at depths while splitting has room."""
     found = [(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)), *(one.points() for one in depths)]
     points, colours = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    wanted = min(20_000, config.max_gaussians // 3)
-    chosen = np.random.default_rng(config.seed).permutation(len(points))[:wanted]
-    return replace(
+    chosen = np.random.default_rng(config.seed).permutation(len(points))
+    chosen = chosen[: min(20_000, config.max_gaussians // 3)]
+    capture = replace(
         capture,
         points=np.concatenate([capture.points, points[chosen]]),
         colours=np.concatenate([capture.colours, colours[chosen]]),
     )
+    return training.initial_gaussians(capture, indices, config.sh_degree, config.max_gaussians, config.seed)
 
 
 def _extent(capture: Capture, gaussians: Gaussians) -> float:
@@ -377,8 +390,8 @@ def _extent(capture: Capture, gaussians: Gaussians) -> float:
 
 # Few photographs can be overfitted, and from some number of steps on they are: views that were held out get
 # worse. That number grows with the photographs (docs/benchmarks/few.md#presets).
-CAPPED = "steps", "max_gaussians", "sh_degree"
-VISITS = 64  # steps for each of few photographs, after which held-out views gain no more
+VISITS = 64  # steps for each of few photographs, after which held-out views gain no more ...
+MEMBERS = 2  # ... but of another training, merged with it: an ensemble (Lakshminarayanan et al. 2017)
 
 
 def supported(config: RadianceConfig, views: int) -> RadianceConfig:
@@ -386,4 +399,5 @@ def supported(config: RadianceConfig, views: int) -> RadianceConfig:
     if views > config.capped_views or config.steps < GOOD["steps"]:
         return config
     most = {**GOOD, "steps": max(VISITS * views, QUICK["steps"])}
-    return replace(config, **{name: min(most[name], getattr(config, name)) for name in CAPPED})
+    capped = {name: min(most[name], getattr(config, name)) for name in most if name != "opacity_decay"}
+    return replace(config, ensemble=config.ensemble or MEMBERS, **capped)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from langsplat_core.arrays import sigmoid
 from langsplat_core.config import RadianceConfig
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.scene import Gaussians
@@ -24,11 +26,12 @@ from langsplat_core.training.radiance.state import (
     fingerprint,
     initial_gaussians,
     load_checkpoint,
+    members,
+    merged,
     reset_opacities,
     save_checkpoint,
     start,
 )
-from tests.support.processes import files_in_use
 from tests.support.scenes import SIZE, capture, random_gaussians, truth
 
 CPU = torch.device("cpu")
@@ -233,45 +236,30 @@ def test_opacity_decay_is_the_gradient_of_the_mean_opacity() -> None:
     torch.testing.assert_close(logits.grad, 2 * want, rtol=1e-5, atol=1e-12)
 
 
-# Checkpoints.
+# Ensembles and checkpoints.
 
 
-def filled_state() -> TrainingState:
-    rng = np.random.default_rng(0)
+def state_of(seed: int) -> TrainingState:
+    rng = np.random.default_rng(seed)
     arrays = [rng.normal(size=shape) for shape in ((9, 3), (9, 3), (9, 4), (9,), (9, 4, 3))]
-    state = start(Gaussians(*arrays), 5, CPU)
-    for name in PARAMETERS:
-        state.first[name] += torch.rand_like(state.first[name])
-        state.second[name] += torch.rand_like(state.second[name])
-    state.grad_sum += 0.25
-    state.seen += 3
-    state.step, state.queue = 17, [2, 0]
-    state.updates["means"] = 17
-    state.rng.standard_normal(3)
-    return state
+    return start(Gaussians(*arrays), 5, CPU)
 
 
-def test_checkpoints_restore_the_exact_state(tmp_path: Path) -> None:
-    state = filled_state()
-    path = tmp_path / "run.safetensors"
-    save_checkpoint(path, state, "abc")
-    back = load_checkpoint(path, "abc", CPU)
-    assert str(path) not in files_in_use()  # what is mapped cannot be written again on Windows
-    for name in PARAMETERS:
-        assert torch.equal(back.values[name], state.values[name])
-        assert back.values[name].requires_grad
-        assert torch.equal(back.first[name], state.first[name])
-        assert torch.equal(back.second[name], state.second[name])
-    assert torch.equal(back.grad_sum, state.grad_sum)
-    assert torch.equal(back.seen, state.seen)
-    assert (back.step, back.queue, back.updates) == (17, [2, 0], state.updates)
-    assert back.rng.standard_normal(4).tolist() == state.rng.standard_normal(4).tolist()
-    assert [file.name for file in tmp_path.iterdir()] == ["run.safetensors"]  # no temporary file left
+def test_members_merge_with_a_share_of_their_opacity() -> None:
+    states = [state_of(seed) for seed in range(3)]
+    for before, state in pairwise(states):
+        state.finished, state.member = members(before), before.member + 1
+    scenes, all_of_them = [state.gaussians() for state in states], merged(states[-1])
+    for name, array in vars(all_of_them).items():
+        want = np.concatenate([getattr(scene, name) for scene in scenes])
+        if name == "opacity_logits":
+            array, want = sigmoid(array.astype(np.float64)), sigmoid(want.astype(np.float64)) / 3
+        np.testing.assert_allclose(array, want, rtol=1e-6, err_msg=name)
 
 
 def test_a_checkpoint_of_another_run_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.safetensors"
-    save_checkpoint(path, filled_state(), "abc")
+    save_checkpoint(path, state_of(0), "abc")
     with pytest.raises(InputError, match="other photographs or settings; delete it") as caught:
         load_checkpoint(path, "def", CPU)
     assert not isinstance(caught.value, FormatError)
@@ -281,7 +269,7 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("damage", ["truncated", "foreign", "missing tensor"])
 def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "run.safetensors"
-    save_checkpoint(path, filled_state(), "abc")
+    save_checkpoint(path, state_of(0), "abc")
     whole = path.read_bytes()
     if damage == "truncated":
         path.write_bytes(whole[:-20])

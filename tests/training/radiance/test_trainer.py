@@ -11,21 +11,17 @@ from PIL import Image
 from safetensors.torch import load_file
 
 from langsplat_core.arrays import psnr
-from langsplat_core.config import (
-    INRIA,
-    RadianceConfig,
-    TrainConfig,
-    with_preset,
-)
+from langsplat_core.config import INRIA, RadianceConfig, TrainConfig, with_preset
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError, InputError
-from langsplat_core.progress import Progress
+from langsplat_core.progress import Progress, WorkCancelledError
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Gaussians, Scene, look_at
 from langsplat_core.training.radiance.differentiable import CpuRenderer, evaluate_views, renderer_for
 from langsplat_core.training.radiance.state import PARAMETERS, initial_gaussians, start
-from langsplat_core.training.radiance.stereo import STAGE
-from langsplat_core.training.radiance.trainer import VISITS, schedule_for, supported, train_radiance
+from langsplat_core.training.radiance.stereo import STAGE as DEPTHS
+from langsplat_core.training.radiance.trainer import STAGE, VISITS, schedule_for, supported, train_radiance
+from tests.support.processes import files_in_use, stop_at
 from tests.support.scenes import SHORT, SIZE, capture, picture, truth
 
 
@@ -49,8 +45,6 @@ def test_the_full_budget_is_the_inria_schedule() -> None:
             "sh_dc": 2.5e-3,
             "sh_rest": 2.5e-3 / 20,
         }
-    assert not schedule.prunes_large(3_000)
-    assert schedule.prunes_large(3_100)
     assert schedule.coarse_until == 0
 
 
@@ -133,6 +127,23 @@ def test_one_view_is_enough_and_none_is_refused() -> None:
         train_radiance(capture(), SHORT, [])
 
 
+def test_an_ensemble_resumes_exactly(tmp_path: Path) -> None:
+    config, path, told = replace(SHORT, ensemble=2), tmp_path / "run", []
+    heard = Progress(lambda at: told.append(at.fraction) if at.stage == STAGE else None)
+    whole = train_radiance(capture(), config, [0, 1, 2], progress=heard)
+    assert told == sorted(set(told))
+    assert told[-1] == pytest.approx(1)
+    assert len(whole) <= config.max_gaussians
+    for fraction in (0.3, 0.6, 0.97):  # in the first member, the second one, and both together
+        with pytest.raises(WorkCancelledError):
+            train_radiance(capture(), config, [0, 1, 2], path, stop_at(STAGE, fraction))
+    assert [file.name for file in tmp_path.iterdir()] == ["run"]  # no temporary file left
+    resumed = train_radiance(capture(), config, [0, 1, 2], path)
+    assert str(path) not in files_in_use()  # what is mapped cannot be written again on Windows
+    for name, array in vars(whole).items():
+        np.testing.assert_array_equal(array, getattr(resumed, name), err_msg=name)
+
+
 @pytest.mark.parametrize("what", ["empty", "masked"])
 def test_views_that_show_nothing_do_not_disturb_training(what: str) -> None:
     away = look_at(np.array([0, 0, -4.0]), np.array([0, 0, -9.0]), np.array([0.0, -1.0, 0.0]), SIZE)
@@ -193,7 +204,7 @@ def test_few_views_alone_use_depths(few_views: int) -> None:
     begun: list[tuple[str, float]] = []
     told = Progress(lambda at: begun.append((at.stage, at.fraction)))
     train_radiance(capture(), replace(SHORT, steps=2, few_views=few_views), [0, 1, 2], progress=told)
-    assert ((STAGE, 0.0) in begun) == (few_views == 3)
+    assert ((DEPTHS, 0.0) in begun) == (few_views == 3)
 
 
 # Budgets that few photographs support, and scores.
@@ -213,13 +224,14 @@ def test_presets_are_capped_with_few_views_only() -> None:
     quick, good = (with_preset(TrainConfig(), preset).radiance for preset in ("quick", "good"))
     full, uncapped = RadianceConfig(), RadianceConfig(capped_views=0)
     assert supported(quick, 9) == quick
-    assert supported(good, 9) == replace(good, steps=9 * VISITS)
-    assert supported(good, 2) == replace(good, steps=quick.steps)
-    assert supported(full, 9) == replace(full, steps=9 * VISITS, max_gaussians=60_000, sh_degree=1)
+    assert supported(good, 9) == replace(good, steps=9 * VISITS, ensemble=2)
+    assert supported(replace(good, ensemble=1), 2) == replace(good, steps=quick.steps, ensemble=1)
+    most = {"max_gaussians": 60_000, "sh_degree": 1, "ensemble": 2}
+    assert supported(full, 9) == replace(full, steps=9 * VISITS, **most)
     assert supported(full, full.capped_views + 1) == full
     assert supported(uncapped, 9) == uncapped
     small = RadianceConfig(steps=1_500, max_gaussians=5_000, sh_degree=0)
-    assert supported(small, 24) == small
+    assert supported(small, 24) == replace(small, ensemble=2)
 
 
 def some_gaussians(scale: float) -> Gaussians:
