@@ -58,7 +58,7 @@ def unit(vectors: Array, epsilon: float = 1e-6) -> Array:
 
 
 def across(direction: Array) -> Array:
-    """(3,) -> (3,) a direction at a right angle to it, of any length but zero."""
+    """Return (3,) a direction at a right angle to one (3,), of any length but zero."""
     return np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
 
 
@@ -103,7 +103,7 @@ class ViewScore:
 
 
 def rotation_matrices(quats_wxyz: Array) -> Array:
-    """(N, 4) quaternions in order w, x, y, z, any non-zero length -> (N, 3, 3) rotations."""
+    """Map (N, 4) quaternions in order w, x, y, z, any non-zero length to (N, 3, 3) rotations."""
     w, x, y, z = np.moveaxis(unit(quats_wxyz, 1e-30), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

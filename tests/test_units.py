@@ -255,7 +255,7 @@ def window(case: Case) -> Found:
 
 
 def clicked(scene: Scene, camera: Camera) -> Array:
-    """(3,) place under the middle of the window's image."""
+    """Return (3,) place under the middle of the window's image."""
     x, y = camera.width / 2, camera.height / 2
     with open_renderer("cpu") as renderer:
         depth = renderer.depth_at(plain_request(scene, camera, PictureConfig()), x, y)

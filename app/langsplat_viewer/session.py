@@ -149,7 +149,7 @@ class Things:
         return replace(self, names={node: name for node, name in self.names.items() if node < count})
 
     def named(self, phrase: str) -> Array | None:
-        """(N,) bool of what was given a name; None where the phrase is none."""
+        """Return (N,) bool of what was given a name; None where the phrase is none."""
         key = phrase_key(phrase)
         return next((bits.mask for name, bits in self.given.items() if phrase_key(name) == key), None)
 

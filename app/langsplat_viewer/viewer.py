@@ -140,16 +140,16 @@ class ShownImage(Protocol):
     """The image on screen, as far as actions need it."""
 
     def point_at(self, u: float, v: float) -> Array | None:
-        """(3,) world point of the surface at a place in the image, fractions from the top left corner."""
+        """Return (3,) world point of the surface at a place in the image, fractions from the top left."""
 
     def depths(self) -> Array | None:
-        """(H, W) camera z of the surface all over the image, world units, 0 where nothing is drawn.
+        """Return (H, W) camera z of the surface all over the image, world units, 0 where nothing is drawn.
 
         Its size may be another than the window's. None while there is no image.
         """
 
     def capture(self, request: RenderRequest) -> Array:
-        """(H, W, 3) uint8, or (H, W, 4) of a transparent image: the request at full resolution."""
+        """Return (H, W, 3) uint8, or (H, W, 4) of a transparent image: the request at full resolution."""
 
 
 @dataclass(frozen=True)

@@ -224,13 +224,13 @@ def _clutter(
 
 
 def _lattice(rng: np.random.Generator) -> Array:
-    """(64 * 64, 3) points of a random plane through noise space."""
+    """Return (64 * 64, 3) points of a random plane through noise space."""
     y, x = np.mgrid[:CROP, :CROP] / CROP
     return np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1) + rng.uniform(0, 10, 3)
 
 
 def _blob(rng: np.random.Generator) -> Array:
-    """(64, 64) random connected-looking mask, now and then the full square."""
+    """Return (64, 64) random connected-looking mask, now and then the full square."""
     y, x = np.mgrid[:CROP, :CROP] / CROP - 0.5
     angle = rng.uniform(0, np.pi)
     u, v = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
@@ -242,7 +242,7 @@ def _blob(rng: np.random.Generator) -> Array:
 
 
 def _coloured(word: str, rng: np.random.Generator) -> Array:
-    """(64, 64, 3) uint8 of mostly one colour word: patches of its shades, light and shadow, highlights."""
+    """Draw (64, 64, 3) uint8 of mostly one colour word: patches of its shades, shadow, highlights."""
     shades = np.stack([random_colour(word, rng) for _ in range(3)])
     near = random_colour(word, rng)
     shades = near + (shades - near) * rng.uniform(0, 1)
@@ -264,7 +264,7 @@ def _coloured(word: str, rng: np.random.Generator) -> Array:
 
 
 def _meaningless(rng: np.random.Generator) -> Array:
-    """(64, 64, 3) uint8 of many colours: noise, stripes, patches."""
+    """Return (64, 64, 3) uint8 of many colours: noise, stripes, patches."""
     planes = np.stack([noise(_lattice(rng), rng.uniform(0.2, 2)) for _ in range(3)], 1)
     style = rng.random()
     if style < 0.35:

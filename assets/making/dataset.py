@@ -98,7 +98,7 @@ class Truth:
         return frozenset(word for region in self.regions.values() for word in region.words)
 
     def labels(self, name: str) -> Array:
-        """(3, H, W) ids of the photograph with this stem, -1 where nothing is."""
+        """Return (3, H, W) ids of the photograph with this stem, -1 where nothing is."""
         with np.load(self.folder / f"{name}.npz", allow_pickle=False) as stored:
             return np.asarray(stored["ids"]).astype(np.int64)
 
@@ -245,7 +245,7 @@ def photographed_room(seed: int, tier: Tier = "clutter") -> World:
 
 
 def truth_ids(world: World, rendered: RenderedView) -> Array:
-    """(3, H, W) int32 label ids of an image at subpart, part and whole level, -1 where nothing is."""
+    """Return (3, H, W) int32 label ids of an image at subpart, part and whole level, -1 where nothing is."""
     ids = np.where(rendered.pieces[..., None] >= 0, world.ids[rendered.pieces], -1)
     return np.moveaxis(ids, -1, 0).astype(np.int32)
 
@@ -309,7 +309,7 @@ def _write_points(world: World, renderer: Renderer, seed: int, path: Path) -> No
 
 
 def camera_to_world_gl(camera: Camera) -> Array:
-    """(4, 4) camera-to-world in OpenGL's frame (x right, y up, z backwards), as transforms.json has it."""
+    """Return (4, 4) camera-to-world in OpenGL's frame (x right, y up, z backwards), as in transforms.json."""
     return np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -431,7 +431,7 @@ def write_3d_ovs(dataset: Path, truth: Truth, names: list[str]) -> None:
 
 
 def outlines(mask: Array) -> list[Array]:
-    """(H, W) bool -> polygons, (K, 2) int x, y each, K >= 3, which filled, border included, give the mask.
+    """Trace (H, W) bool as polygons, (K, 2) int x, y each, K >= 3, which filled with their border give it.
 
     A piece with a hole is cut through it into pieces without one.
     """
@@ -452,7 +452,7 @@ def outlines(mask: Array) -> list[Array]:
 
 
 def _trace(piece: Array) -> Array:
-    """(K, 2) the border of one piece without holes, pixel by pixel."""
+    """Return (K, 2) border of one piece without holes, pixel by pixel."""
     from skimage.measure import find_contours
 
     contours = find_contours(np.pad(piece.astype(float), 1), EDGE, fully_connected="high")

@@ -105,7 +105,7 @@ def _kinds(labels: tuple[RegionLabel, ...]) -> dict[str, str]:
 
 
 def _row(label: RegionLabel, column: dict[str, int]) -> Array:
-    """(P,) int8 of one label: 1 right, 0 wrong, -1 neither."""
+    """Return (P,) int8 of one label: 1 right, 0 wrong, -1 neither."""
     row = np.zeros(len(column), np.int8)
 
     def mark(phrases: list[str] | tuple[str, ...], value: int) -> None:
@@ -204,7 +204,7 @@ def build_model(tokens: int, start: int, end: int) -> Any:
 
 
 def normalised(crops: Array) -> Tensor:
-    """(B, 64, 64, 3) uint8 -> (B, 3, 64, 64) float32 as the encoder takes them."""
+    """Map (B, 64, 64, 3) uint8 to (B, 3, 64, 64) float32 as the encoder takes them."""
     pixels = torch.from_numpy(np.ascontiguousarray(crops)).permute(0, 3, 1, 2).float() / 255
     return (pixels - torch.tensor(MEAN).view(3, 1, 1)) / torch.tensor(STD).view(3, 1, 1)
 
@@ -229,12 +229,12 @@ def image_features(model: Any, pixels: Tensor, keep: float = 1.0) -> Tensor:
 
 
 def image_vectors(model: Any, features: Tensor) -> Tensor:
-    """(B, 512) unit vectors of `image_features`."""
+    """Return (B, 512) unit vectors of `image_features`."""
     return F.normalize(model.visual_projection(features).float(), dim=-1)
 
 
 def text_vectors(model: Any, tokens: Tensor) -> Tensor:
-    """(P, 512) unit vectors of (P, L) tokens."""
+    """Return (P, 512) unit vectors of (P, L) tokens."""
     pooled = model.text_model(input_ids=tokens).pooler_output
     return F.normalize(model.text_projection(pooled).float(), dim=-1)
 
@@ -349,7 +349,7 @@ class Sampler:
 
 
 def _word_classes(book: PhraseBook) -> tuple[Array, list[int]]:
-    """(U, 3) rows of every label's object, region and colour word, -100 for none; how many of each."""
+    """Return (U, 3) rows of every label's object, region and colour word, -100 for none; how many of each."""
     columns, counts = [], []
     for field in ("thing", "word", "colour"):
         words = [getattr(label, field) for label in book.labels]
@@ -497,7 +497,7 @@ def train_encoder(out: Path, config: EncoderConfig, progress: Progress) -> list[
 
 
 def _nameable(model: Any, crops: CropSet, seed: int) -> Tensor:
-    """(M, 512) unit vectors of some crops that show a thing or a part."""
+    """Return (M, 512) unit vectors of some crops that show a thing or a part."""
     rows = [row for row, label in enumerate(crops.labels) if label.thing] or list(range(len(crops.labels)))
     chosen = np.random.default_rng((seed, 19)).permutation(rows)[:_CALIBRATION_CROPS]
     with torch.no_grad():

@@ -46,7 +46,7 @@ class TriMesh:
 
 
 def rotation_about(axis: str, degrees: float) -> Array:
-    """(3, 3) rotation about the named coordinate axis, right-handed."""
+    """Return (3, 3) rotation about the named coordinate axis, right-handed."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.eye(3)
@@ -352,7 +352,7 @@ def to_display(linear: Array) -> Array:
 
 
 def to_lch(display: Array) -> Array:
-    """(..., 3) sRGB in [0, 1] -> (..., 3) CIE lightness [0, 100], chroma, hue in degrees [0, 360)."""
+    """Map (..., 3) sRGB in [0, 1] to (..., 3) CIE lightness [0, 100], chroma, hue in degrees [0, 360)."""
     ratio = to_linear(display) @ _TO_XYZ.T / _WHITE
     f = np.where(ratio > 216 / 24389, np.cbrt(ratio), (24389 / 27 * ratio + 16) / 116)
     a, b = 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])
@@ -379,7 +379,7 @@ def colour_word(display: Array) -> str | None:
 
 
 def random_colour(word: str, rng: np.random.Generator) -> Array:
-    """(3,) sRGB display values in [0, 1] that `word` certainly covers."""
+    """Return (3,) sRGB display values in [0, 1] that `word` certainly covers."""
     l0, l1, c0, c1, h0, h1 = _BOXES[word]
     for _ in range(1000):
         colour = from_lch(rng.uniform((l0, c0, h0), (l1, min(c1, 95), h1)))
@@ -566,5 +566,5 @@ def material_table(materials: tuple[Material, ...]) -> tuple[Array, Array]:
 
 
 def mean_reflectance(materials: tuple[Material, ...]) -> Array:
-    """(P, 3) linear reflectance of every piece on average, for light that bounces off it."""
+    """Return (P, 3) linear reflectance of every piece on average, for light that bounces off it."""
     return np.array([to_linear(0.75 * m.colour + 0.25 * m.second) * finish_of(m).diffuse for m in materials])

@@ -34,7 +34,7 @@ _STEP = 0.0015  # metres between the two points whose heights make relief
 
 @cache
 def noise_volume() -> Array:
-    """(64, 64, 64) float32 periodic fractal noise, about standard normal."""
+    """Return (64, 64, 64) float32 periodic fractal noise, about standard normal."""
     rng = np.random.default_rng(20240624)
     total = np.zeros((_SIDE,) * 3)
     for sigma, weight in ((6, 1.0), (3, 0.6), (1.5, 0.4), (0.7, 0.25)):
@@ -65,7 +65,7 @@ def _noise_many(volume, points, out):  # type: ignore[no-untyped-def]
 
 
 def noise(points: Array, period: float | tuple[float, float, float]) -> Array:
-    """(N,) fractal noise, about standard normal, at (N, 3) points; `period` in the points' unit."""
+    """Return (N,) fractal noise, about standard normal, at (N, 3) points; `period` in the points' unit."""
     out = np.empty(len(points))
     _noise_many(noise_volume(), np.ascontiguousarray(points / np.asarray(period)), out)
     return out
@@ -224,7 +224,7 @@ class Tracer:
         )
 
     def first_hit(self, origins: Array, directions: Array) -> tuple[Array, Array, Array, Array]:
-        """(N,) distance in lengths of the direction (inf: none), triangle, (N, 2) barycentrics, normals."""
+        """Return (N,) distance in lengths of the direction (inf: none), triangle, barycentrics, normals."""
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3], rays[:, 3:] = origins, directions
         hit = self._scene.cast_rays(self._tensor(rays), nthreads=1)
@@ -233,7 +233,7 @@ class Tracer:
         return distance, triangle, uv, normal
 
     def blocked(self, origins: Array, directions: Array, far: float) -> Array:
-        """(N,) whether anything lies between 0 and `far` along unit directions."""
+        """Return (N,) whether anything lies between 0 and `far` along unit directions."""
         rays = np.concatenate([origins, directions], 1).astype(np.float32)
         return np.asarray(self._scene.test_occlusions(self._tensor(rays), tfar=far, nthreads=1).numpy())
 
@@ -265,7 +265,7 @@ def bake(tracer: Tracer, world: World, light: Light, samples: int, cell: float) 
 
 
 def _lattice_cells(world: World, vertices: Array, cell: float) -> Array:
-    """(T,) cells per edge: where light varies, as many as the longest edge needs."""
+    """Return (T,) cells per edge: where light varies, as many as the longest edge needs."""
     if cell <= 0:
         return np.zeros(len(world.triangles), np.int32)
     value = (vertices @ np.array([0.3, 0.4, 0.1, 0.8], np.float32))[world.triangles]
@@ -278,7 +278,7 @@ def _lattice_cells(world: World, vertices: Array, cell: float) -> Array:
 
 
 def _lattice_points(world: World, cells: Array, start: Array, count: int) -> tuple[Array, Array]:
-    """(M, 3) points and unit normals of all lattices."""
+    """Return (M, 3) points and unit normals of all lattices."""
     points, normals = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
     for n in np.unique(cells[cells > 0]):
         rows = np.flatnonzero(cells == n)
@@ -292,7 +292,7 @@ def _lattice_points(world: World, cells: Array, start: Array, count: int) -> tup
 
 
 def _lamp_light(tracer: Tracer, light: Light, points: Array, normals: Array, samples: int) -> Array:
-    """(N,) share of the lamp seen from each point, times cosine and fall-off (1 at the table's middle)."""
+    """Return (N,) share of the lamp seen, times cosine and fall-off (1 at the table's middle)."""
     rng = np.random.default_rng(5)
     total = np.zeros(len(points), np.float32)
     # Off the surface, and where it faces the lamp a little towards it, so that places in a corner are not
@@ -318,7 +318,7 @@ def _lamp_light(tracer: Tracer, light: Light, points: Array, normals: Array, sam
 def _gathered(
     tracer: Tracer, light: Light, points: Array, normals: Array, bounce: tuple[Array, int]
 ) -> Array:
-    """(N, 3) mean light over a cosine-weighted half space; bounce: (T, 3) radiance, number of rays."""
+    """Return (N, 3) mean light over a cosine-weighted half space; bounce: (T, 3) radiance, number of rays."""
     radiance, samples = bounce
     rng = np.random.default_rng(6)
     total = np.zeros((len(points), 3), np.float32)
@@ -506,11 +506,11 @@ class Renderer:
         return np.where(np.isfinite(depth), triangle.astype(np.int64), -1), uv, depth
 
     def colours_at(self, triangle: Array, uv: Array, eye: Array) -> Array:
-        """(N, 3) uint8 colour of surface points, given by triangle and barycentrics, as seen from `eye`."""
+        """Return (N, 3) uint8 colours as seen from `eye`, given by triangle and barycentrics."""
         return _developed(self._shade(triangle, uv, eye))
 
     def _shade(self, triangle: Array, uv: Array, eye: Array) -> Array:
-        """(N, 3) linear light leaving points towards `eye` (3,)."""
+        """Return (N, 3) linear light leaving points towards `eye` (3,)."""
         out = np.empty((len(triangle), 3), np.float32)
         shade(self._surfaces, triangle, uv.astype(np.float32), eye.astype(np.float32), out)
         return out

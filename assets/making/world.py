@@ -239,19 +239,19 @@ class Placed:
 
 
 def bounds(thing: Thing) -> tuple[Array, Array]:
-    """(3,) lowest and highest coordinates of a thing in its own frame, metres."""
+    """Return (3,) lowest and highest coordinates of a thing in its own frame, metres."""
     low = np.min([piece.mesh.vertices.min(0) for piece in thing.pieces], axis=0)
     return low, np.max([piece.mesh.vertices.max(0) for piece in thing.pieces], axis=0)
 
 
 def footprint(placed: Placed) -> Array:
-    """(4, 2) corners of the upright box around a placed thing, seen from above, in world metres."""
+    """Return (4, 2) corners of the upright box around a placed thing, seen from above, in world metres."""
     world: Array = (_base(placed.thing) * placed.scale) @ placed.turn.T + placed.offset
     return world[:, :2]
 
 
 def _base(thing: Thing) -> Array:
-    """(4, 3) corners, in order around, of the box around a thing in its own frame, at height 0."""
+    """Return (4, 3) corners, in order around, of the box around a thing in its own frame, at height 0."""
     low, high = bounds(thing)
     return np.array([(x, y, 0) for x, y in (low[:2], (high[0], low[1]), high[:2], (low[0], high[1]))])
 

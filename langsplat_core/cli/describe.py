@@ -247,7 +247,7 @@ class Teach:
 
 
 def _pointed(engine: QueryEngine, camera: int, at: str, level: Level) -> Array:
-    """(N,) bool: the region in a pixel "X,Y"; InputError for none of the camera's, or without a region."""
+    """Return (N,) bool: the region in a pixel "X,Y"; InputError outside of the image, or without one."""
     scene, place = engine.scene, re.fullmatch(r"([0-9]{1,9}), ?([0-9]{1,9})", at)
     if not scene.cameras:
         raise InputError("the scene has no cameras, so --at means nothing")

@@ -31,7 +31,7 @@ class BrownDistortion:
     k6: float = 0.0
 
     def __call__(self, xy: Array) -> Array:
-        """(N, 2) normalised -> (N, 2) distorted coordinates, float64."""
+        """Map (N, 2) normalised to (N, 2) distorted coordinates, float64."""
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -51,7 +51,7 @@ class FisheyeDistortion:
     k4: float = 0.0
 
     def __call__(self, xy: Array) -> Array:
-        """(N, 2) normalised -> (N, 2) distorted coordinates, float64."""
+        """Map (N, 2) normalised to (N, 2) distorted coordinates, float64."""
         r = np.linalg.norm(xy, axis=-1)
         theta = np.arctan(r)
         t2 = theta * theta
@@ -90,7 +90,7 @@ class PhotoIntrinsics(Intrinsics):
         return replace(self, **vars(self.resized(width, height)))
 
     def pixels(self, xy: Array) -> Array:
-        """(N, 2) normalised coordinates -> (N, 2) pixel positions in the photograph."""
+        """Map (N, 2) normalised coordinates to (N, 2) pixel positions in the photograph."""
         distorted = xy if self.distortion is None else self.distortion(xy)
         return distorted * (self.fx, self.fy) + (self.cx, self.cy)
 
@@ -119,7 +119,7 @@ def _radial_profile(distortion: Distortion) -> tuple[Array, Array]:
 
 
 def _jacobian(distortion: Distortion, xy: Array, step: float = 1e-6) -> Array:
-    """(N, 2, 2) by central differences; Newton's method needs no better."""
+    """Return (N, 2, 2) by central differences; Newton's method needs no better."""
     columns = [
         (distortion(xy + offset) - distortion(xy - offset)) / (2 * step) for offset in np.eye(2) * step
     ]
@@ -127,7 +127,7 @@ def _jacobian(distortion: Distortion, xy: Array, step: float = 1e-6) -> Array:
 
 
 def undistorted_points(distortion: Distortion, distorted: Array) -> Array:
-    """(N, 2) distorted -> (N, 2) normalised coordinates, by Newton's method from the radial inverse.
+    """Map (N, 2) distorted to (N, 2) normalised coordinates, by Newton's method from the radial inverse.
 
     Points that the lens cannot have seen within the invertible radius come back on that radius.
     Raises ValueError if the distortion is singular on the axis itself.
@@ -191,7 +191,7 @@ def _inner_rectangle(intrinsics: PhotoIntrinsics) -> tuple[float, float, float, 
 
 
 def source_positions(intrinsics: PhotoIntrinsics, camera: Camera) -> Array:
-    """(H, W, 2) float64 position in the photograph of the centre of each of the camera's pixels."""
+    """Return (H, W, 2) float64 position in the photograph of the centre of each of the camera's pixels."""
     grid = (camera.pixel_centres() - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     return intrinsics.pixels(grid.reshape(-1, 2)).reshape(grid.shape)
 

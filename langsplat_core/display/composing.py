@@ -37,7 +37,7 @@ class Style(NamedTuple):
 
 
 def compose(channels: Channels, picture: PictureConfig, ranges: displays.Ranges = ()) -> Array:
-    """(H, W, 3) uint8 image; with `picture.transparent` (H, W, 4), its colours not premultiplied.
+    """Return (H, W, 3) uint8 image; with `picture.transparent` (H, W, 4), its colours not premultiplied.
 
     Where a display's further channel is absent it shows the plain colours. `ranges`: see `full_ranges`.
     """
@@ -46,7 +46,7 @@ def compose(channels: Channels, picture: PictureConfig, ranges: displays.Ranges 
 
 
 def compose_upwards(channels: Channels, picture: PictureConfig, ranges: displays.Ranges = ()) -> Array:
-    """(H, W, 4) uint8, the image of `compose` as OpenGL has it: row 0 at the bottom, opaque by default."""
+    """Compose (H, W, 4) uint8 as OpenGL has it: row 0 at the bottom, opaque by default."""
     extra = channels.alpha[..., None] if channels.extra is None else channels.extra
     planes = tuple(np.asarray(plane, np.float32) for plane in (channels.rgb, channels.alpha, extra))
     drawing = displays.drawing_of(picture.display, channels.extra is not None)

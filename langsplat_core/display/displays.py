@@ -44,7 +44,7 @@ MAX_QUERIES = len(QUERY_COLOURS)  # shown at a time: one colour each, one channe
 
 
 def mapped(t: Array, name: ColourMap) -> Array:
-    """(...,) values in [0, 1] -> (..., 3) colours in [0, 1] of a colour map."""
+    """Map (...,) values in [0, 1] to (..., 3) colours in [0, 1] of a colour map."""
     position = np.clip(t, 0, 1) * (NODES - 1)
     low = np.minimum(position.astype(int), NODES - 2)
     fraction = (position - low)[..., None]
@@ -53,7 +53,7 @@ def mapped(t: Array, name: ColourMap) -> Array:
 
 
 def oklab(colours: Array) -> Array:
-    """(..., 3) colours in [0, 1] -> lightness, a and b in OKLab (B. Ottosson 2020).
+    """Map (..., 3) colours in [0, 1] to lightness, a and b in OKLab (B. Ottosson 2020).
 
     Squares stand for sRGB's curve, which is close and costs nothing.
     """
@@ -120,7 +120,7 @@ def painted(answers: Answers) -> list[int]:
 
 
 def heats(subject: Subject) -> Array | None:
-    """(N, Q) float32 heat per Gaussian and slot; None where no slot paints anything.
+    """Return (N, Q) float32 heat per Gaussian and slot; None where no slot paints anything.
 
     One number, as every channel costs time, says where an answer is and how hot: from `HEAT_BASE` to 1, over
     the answer's own range, for its members, and 0 for all others. "everywhere", and of a level that is asked
@@ -140,7 +140,7 @@ def heats(subject: Subject) -> Array | None:
 
 
 def members(subject: Subject) -> Array | None:
-    """(N, Q) float32, 1 for the Gaussians of each slot's answer; None where no slot paints anything."""
+    """Return (N, Q) float32, 1 for Gaussians of each slot's answer; None where none paints anything."""
     return _by_slot(subject, lambda one: one.members)
 
 
@@ -188,7 +188,7 @@ _LATENT: WeakKeyDictionary[LanguageField, Array] = WeakKeyDictionary()
 
 
 def latents(subject: Subject) -> Array | None:
-    """(N, 3) colours of the latents at a level; None without a language field or level."""
+    """Return (N, 3) colours of the latents at a level; None without a language field or level."""
     if subject.language is None or subject.level is None:
         return None
     colours: Array = latent_colours(subject.language)[subject.level]
@@ -196,7 +196,7 @@ def latents(subject: Subject) -> Array | None:
 
 
 def latent_colours(field: LanguageField) -> Array:
-    """(3, N, 3) float32 colours in [0, 1] of the latents at each level; grey where nothing was observed.
+    """Return (3, N, 3) float32 colours in [0, 1] of latents at each level; grey where nothing was seen.
 
     Made once for each field.
 
@@ -216,7 +216,7 @@ UNLIKE = 0.35, 0.6, 0.85  # brightnesses that nodes of one hue are told apart by
 
 
 def nodes(subject: Subject) -> Array | None:
-    """(N, 3) colours of the tree's nodes at a level, grey where there is none; None without a tree."""
+    """Return (N, 3) colours of the tree's nodes at a level, grey where there is none; None without a tree."""
     if subject.language is None or subject.language.tree is None or subject.level is None:
         return None
     found, of = np.unique(subject.language.tree.at(subject.level), return_inverse=True)
@@ -279,7 +279,7 @@ def gated_mean(total: Array, alpha: Array, gate: float) -> Array:
 
 
 def full_ranges(ranges: Ranges) -> Array:
-    """(MAX_QUERIES, 2) `ranges` of the components of a channel; all of [0, 1] for those without one."""
+    """Return (MAX_QUERIES, 2) `ranges` of a channel's components; all of [0, 1] for those without one."""
     return np.array([*ranges, *[(0.0, 1.0)] * MAX_QUERIES][:MAX_QUERIES])
 
 

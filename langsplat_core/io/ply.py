@@ -567,6 +567,6 @@ def _codes(ply: PlyFile, element: PlyElement, names: Sequence[str], kind: str) -
 
 
 def _fractions(packed: Array, *bits: int) -> Array:
-    """(N,) uint32 of fields of so many bits, the first on top -> (N, fields) fractions in [0, 1]."""
+    """Map (N,) uint32 of fields of so many bits, the first on top to (N, fields) fractions in [0, 1]."""
     most = 2 ** np.array(bits) - 1
     return (packed[:, None] >> 32 - np.cumsum(bits) & most) / most

@@ -198,7 +198,7 @@ class _Planes:
         return pixels[:rows].reshape(rows * PALETTE_ROW, coefficients, 4)[:entries, :, :3]
 
     def _image(self, name: str, suits: Callable[[int, int], bool]) -> Array:
-        """(H, W, 4) uint8; `suits` judges (width, height) before anything is decoded."""
+        """Return (H, W, 4) uint8; `suits` judges (width, height) before anything is decoded."""
         if not hostile.is_plain_name(name):
             raise malformed(self.path, f"{quoted(name)} is no plain file name")
         self.read.add(name)

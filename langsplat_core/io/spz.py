@@ -333,7 +333,7 @@ def _fractional_bits(drawn: Gaussians, path: Path) -> int:
 
 
 def _positions(packed: _Packed) -> Array:
-    """(N, 3) positions along the axes of the file."""
+    """Return (N, 3) positions along the axes of the file."""
     data = packed.blocks["positions"]
     if packed.header.version == 1:
         return np.ascontiguousarray(data).view("<f2").astype(np.float32)
@@ -343,7 +343,7 @@ def _positions(packed: _Packed) -> Array:
 
 
 def _rotations(packed: _Packed, tell: Tell) -> Array:
-    """(N, 4) unit quaternions w x y z."""
+    """Return (N, 4) unit quaternions w x y z."""
     data = packed.blocks["rotations"]
     if packed.header.version < 3:
         return smallest_three(data / 127.5 - 1, np.zeros(len(data), np.intp), tell)  # all but w
@@ -355,7 +355,7 @@ def _rotations(packed: _Packed, tell: Tell) -> Array:
 
 
 def _rotation_codes(quats_wxyz: Array) -> Array:
-    """(N, 4) quaternions of any length -> (N, 4) bytes of version 3."""
+    """Map (N, 4) quaternions of any length to (N, 4) bytes of version 3."""
     three, largest = without_largest(quats_wxyz[:, [1, 2, 3, 0]])
     codes = np.rint(np.abs(three) * np.sqrt(2) * 511).clip(0, 511).astype(np.uint32)
     codes |= (three < 0) * np.uint32(512)
@@ -364,6 +364,6 @@ def _rotation_codes(quats_wxyz: Array) -> Array:
 
 
 def _signs_to_rdf(axes: int) -> Array:
-    """(3,) 1 or -1 from `axes` (less 1: bits of right, up, front) to right, down, front of the PLY."""
+    """Return (3,) 1 or -1 from `axes` (less 1: bits of right, up, front) to right, down, front of the PLY."""
     right, up, front = (axes - 1 >> bit & 1 for bit in range(3))
     return np.array([1 if right else -1, -1 if up else 1, 1 if front else -1])

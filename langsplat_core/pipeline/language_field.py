@@ -223,7 +223,7 @@ class _Stages:
         return codec_from_tensors(kind, made), codec_fit.CodecReport(*figures)
 
     def lifted_samples(self) -> tuple[Array, Array]:
-        """(M, D) float32 vectors of Gaussians that a codec is fitted to, and of others that judge it."""
+        """Return (M, D) float32 vectors of Gaussians that a codec is fitted to, and of its judges."""
         order = np.random.default_rng(self.config.codec.seed).permutation(len(self.gaussians))
         robust, samples = self.lift.mode == "median", []
         for rows in (order[:FITTED], order[FITTED : FITTED + JUDGED]):

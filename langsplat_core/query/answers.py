@@ -89,7 +89,7 @@ class QueryResult(Judged):
 
     @cached_property
     def smooth(self) -> Array:
-        """(N,) float32 relevancy at the level: of members the mean over members around each."""
+        """The (N,) float32 relevancy at the level: of members the mean over members around each."""
         values = self.relevancy[self.level].copy()
         values[self.members] = smoothed(self.points[self.members], values[self.members])
         return values
@@ -100,7 +100,7 @@ SIDE = 5.0  # of that grid, in standard deviations of the points along the axis 
 
 
 def smoothed(points: Array, values: Array) -> Array:
-    """(K,) means of `values` (K,) around (K, 3) points, over about as many as a surface has neighbours.
+    """Return (K,) means of `values` around (K, 3) points, of about as many as a surface has neighbours.
 
     Values are shared among the corners of the cells of a grid, which grows with the answer, and read there
     again, in the exported page, too: no neighbours need to be looked for.
@@ -158,11 +158,11 @@ class Regions:
 
     @cached_property
     def counts(self) -> Array:
-        """(M,) numbers of the Gaussians that count: they are in a region at every level."""
+        """The (M,) numbers of the Gaussians that count: they are in a region at every level."""
         return np.flatnonzero(self.weights > 0)
 
     def mixtures(self, features: Array, count: int) -> csr_matrix:
-        """(3, N) numbers of features -> (R, `count`) float64 shares of each in the regions of all levels."""
+        """Return (R, `count`) float64 shares of each of (3, N) features in the regions of all levels."""
         counts, parts = self.counts, []
         weights = self.weights[counts].astype(np.float64)
         for of, own, total in zip(self.everywhere[:, counts], features[:, counts], self.totals, strict=True):
@@ -236,7 +236,7 @@ class Spread:
     own: Relevancy  # of what is in none of them
 
     def __call__(self) -> Array:
-        """(N,) float32."""
+        """Return (N,) float32."""
         return self.regions.spread(self.level, self.values, self.own.of_level(self.level))
 
 

@@ -73,7 +73,7 @@ class WordScores:
 
     @cached_property
     def _of_codewords(self) -> Array | None:
-        """(K, V + C) float32 probabilities of all codewords; None where there are none, or too many."""
+        """The (K, V + C) float32 probabilities of all codewords; None where there are none, or too many."""
         if not isinstance(self.codec, CodebookCodec) or self.codec.size * len(self.vectors) > CELLS:
             return None
         return self._softmax(np.arange(self.codec.size)[:, None])
@@ -194,7 +194,7 @@ class Describer:
 
     @cached_property
     def areas(self) -> Array:
-        """(N,) float64 surface of every Gaussian, see `surface_areas`."""
+        """The (N,) float64 surface of every Gaussian, see `surface_areas`."""
         return surface_areas(self.engine.scene.gaussians)
 
     def at_gaussians(self, rows: Array, weights: Array | None = None, top: int = 5) -> Levels:

@@ -145,7 +145,7 @@ class QueryEngine:
         return answers
 
     def relevancy(self, vector: Array) -> Array:
-        """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
+        """Map (D,) unit text vector to (3, N) float32 relevancy per level and Gaussian."""
         return next(self._lookup.relevancies(vector[None]))()
 
     def _fits_of_names(self, phrases: Sequence[str]) -> dict[str, Array]:
@@ -271,7 +271,7 @@ class QueryEngine:
 
     @cached_property
     def chance(self) -> Array | None:
-        """(R, V) fits of everyday phrases in the regions of all levels; None where there are none."""
+        """The (R, V) fits of everyday phrases in the regions of all levels; None where there are none."""
         if self.rule == "peak":
             return None
         return chance_in(self.regions.table, self._mixtures, self._lookup, self.scale)
@@ -329,7 +329,7 @@ class QueryEngine:
         return () if key in self.taught or key in self._vectors else self.load_encoder().unknown_words(key)
 
     def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
-        """(Q, D) unit vectors of phrases, from the scene's phrasebook, else encoded together.
+        """Return (Q, D) unit vectors of phrases, from the scene's phrasebook, else encoded together.
 
         Raises InputError for an empty phrase and one of stop words alone, UnknownWordError for words that the
         encoder was never taught, and EncoderError for one that is not the scene's or cannot be loaded.
@@ -365,7 +365,7 @@ class QueryEngine:
         return known, self._stacked(known)
 
     def _stacked(self, keys: Sequence[str]) -> Array:
-        """(Q, D) vectors of phrases that are all known already."""
+        """Return (Q, D) vectors of phrases that are all known already."""
         vectors = [self._vectors[key] for key in keys]
         return np.stack(vectors) if vectors else np.zeros((0, self.field.codec.vector_dim), np.float32)
 

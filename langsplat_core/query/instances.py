@@ -26,13 +26,13 @@ class OrientedBox:
 
     @property
     def corners(self) -> Array:
-        """(8, 3) corners of the box, world units."""
+        """The (8, 3) corners of the box, world units."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
         return self.centre + (signs * self.half_extents) @ self.axes.T
 
 
 def axis_aligned_box(points: Array) -> Array:
-    """(M, 3), M >= 1 -> (2, 3) float64 lower and upper corner between the `INNER` quantiles."""
+    """Map (M, 3), M >= 1 to (2, 3) float64 lower and upper corner between the `INNER` quantiles."""
     return np.quantile(np.ascontiguousarray(points.T, np.float64), INNER, axis=1)
 
 
@@ -118,7 +118,7 @@ class Instance:
 
     @cached_property
     def box(self) -> Array:
-        """(2, 3) lower and upper corner along the world's axes, world units, between 2 % and 98 %."""
+        """The (2, 3) lower and upper corner along the world's axes, world units, between 2 % and 98 %."""
         return axis_aligned_box(self.points)
 
     @cached_property
@@ -128,7 +128,7 @@ class Instance:
 
     @property
     def size(self) -> Array:
-        """(3,) sides of the oriented box, longest first, world units."""
+        """The (3,) sides of the oriented box, longest first, world units."""
         return 2 * self.oriented.half_extents
 
 
@@ -233,7 +233,7 @@ def _ranked(
 
 
 def _extent(gaussians: Gaussians, rows: Array) -> Array:
-    """(K,) float64: opacity times the largest cross-section; of flat Gaussians the volume is nothing."""
+    """Return (K,) float64 opacity times the largest cross-section: flat Gaussians have no volume."""
     x, y, z = np.maximum(gaussians.log_scales[rows].astype(np.float64), _FLAT).T
     opacity = sigmoid(gaussians.opacity_logits[rows].astype(np.float64))
     return opacity * np.exp(x + y + z - np.minimum(np.minimum(x, y), z))

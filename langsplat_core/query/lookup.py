@@ -33,14 +33,14 @@ class Relevancy:
     features: Array  # (3, N) number of the feature of each Gaussian at each level
 
     def __call__(self) -> Array:
-        """(3, N) float32."""
+        """Return (3, N) float32."""
         found = np.empty(self.features.shape, np.float32)
         flat = self.features.reshape(-1), found.reshape(-1)
         shared_workers().run(_fetch, found.size, self.values, *flat)
         return found
 
     def of_level(self, level: int) -> Array:
-        """(N,) float32 at a level."""
+        """Return (N,) float32 at a level."""
         return np.asarray(self.values[self.features[level]])
 
 

@@ -35,7 +35,7 @@ class Body:
 
     @property
     def centre(self) -> Array:
-        """(3,) centre of its bounding box."""
+        """The (3,) centre of its bounding box."""
         return (self.low + self.high) / 2
 
     @property
@@ -55,7 +55,7 @@ class Body:
 
 
 def upright(up: Array) -> Array:
-    """(3,) unit -> (3, 3) rotation of world points into axes of which the last is up."""
+    """Map (3,) unit to (3, 3) rotation of world points into axes of which the last is up."""
     first = across(up)
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(up, first), up])
@@ -79,14 +79,14 @@ def _seen(what: Body, seen_by: Array) -> tuple[float, float]:
 
 
 def body(positions: Array, frame: Array) -> Body:
-    """(P, 3) world points of one thing, P >= 1 -> its body in the axes of `frame`."""
+    """Map (P, 3) world points of one thing, P >= 1 to its body in the axes of `frame`."""
     points = positions[:: max(1, -(-len(positions) // SAMPLE))] @ frame.T
     low, high = axis_aligned_box(points)
     return Body(points, low, high)
 
 
 def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[Array]:
-    """(M,) bool -> surface numbers of each thing, by the tree's voted wholes, largest first, no specks."""
+    """Divide (M,) bool into surface numbers of each thing, by voted wholes, largest first, no specks."""
     wholes = None if tree is None else tree.voted_wholes
     parts = told_apart(surface, np.flatnonzero(inside), wholes, join=True)
     parts.sort(key=len, reverse=True)

@@ -22,14 +22,14 @@ from langsplat_core.scene.surface import Surface
 
 
 def of_rows(rows: Array, count: int) -> Array:
-    """(K,) rows of `count` Gaussians -> (count,) bool."""
+    """Map (K,) rows of `count` Gaussians to (count,) bool."""
     selected = np.zeros(count, bool)
     selected[rows] = True
     return selected
 
 
 def in_sphere(means: Array, centre: Array, radius: float) -> Array:
-    """(N, 3) -> (N,) bool: finite, and at most `radius` from `centre` (3,), world units."""
+    """Map (N, 3) to (N,) bool: finite, and at most `radius` from `centre` (3,), world units."""
     offsets = np.asarray(means, np.float64) - centre
     with np.errstate(invalid="ignore"):
         squares: Array = (offsets**2).sum(1)
@@ -37,7 +37,7 @@ def in_sphere(means: Array, centre: Array, radius: float) -> Array:
 
 
 def in_box(means: Array, low: Array, high: Array) -> Array:
-    """(N, 3) -> (N,) bool: between two corners (3,) along the world's axes, faces included."""
+    """Map (N, 3) to (N,) bool: between two corners (3,) along the world's axes, faces included."""
     return np.all((means >= np.asarray(low)) & (means <= np.asarray(high)), axis=1)
 
 
@@ -99,7 +99,7 @@ class Projected(NamedTuple):
 
 
 def project(means: Array, camera: Camera) -> Projected:
-    """(N, 3) world points as `camera` sees them."""
+    """Return (N, 3) world points as `camera` sees them."""
     with np.errstate(invalid="ignore", over="ignore"):
         pixels, depths = camera.project(np.asarray(means, np.float64))
         known = (depths > 0) & np.isfinite(depths) & np.isfinite(pixels).all(1)
@@ -107,7 +107,7 @@ def project(means: Array, camera: Camera) -> Projected:
 
 
 def in_rectangle(seen: Projected, corner: Array, opposite: Array) -> Array:
-    """(N,) bool: between two opposite corners (2,), pixels, borders included."""
+    """Return (N,) bool: between two opposite corners (2,), pixels, borders included."""
     corners = np.stack([corner, opposite]).astype(np.float64)
     low, high = corners.min(0), corners.max(0)
     return (seen.depths > 0) & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
@@ -142,7 +142,7 @@ def _in_mask(seen: Projected, mask: Image.Image) -> Array:
 def _cells(
     seen: Projected, across: float, down: float, width: int, height: int
 ) -> tuple[Array, Array, Array]:
-    """(N,) bool, which lie in a grid of that size, and the columns and rows of those, at cells per pixel."""
+    """Return (N,) bool, which lie in a grid of that size, and their columns and rows."""
     columns, rows = np.floor(seen.pixels * (across, down)).T
     inside = (seen.depths > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     return inside, columns[inside].astype(np.intp), rows[inside].astype(np.intp)

@@ -111,7 +111,7 @@ def compared(word: TaughtWord, space: WordSpace, vectors: Array, level: int) -> 
 
 
 def _examples(word: TaughtWord, space: WordSpace) -> tuple[Array, Array]:
-    """(T, W) unit examples, and (3, T) similarity from which something is as each of them, at each level."""
+    """Return (T, W) unit examples, and (3, T) similarity from which something is as these, by level."""
     rivals = np.maximum((word.rivals + space.rival) / 2, 0.08)  # of a few regions it says little
     base, times = np.array(FOUND).T
     bars = np.minimum(base[:, None] + np.outer(times, rivals), HIGHEST)

@@ -30,11 +30,11 @@ class View(ABC):
 
     @abstractmethod
     def splat(self, values: Array) -> tuple[Array, Array]:
-        """(N, C) values -> (H, W, C) image ``W x`` without background, and (H, W) alpha = row sums of W."""
+        """Blend (N, C) values into (H, W, C) ``W x`` without background, and (H, W) alpha, row sums of W."""
 
     @property
     def rows(self) -> Array:
-        """(M,) int32 rows of which `splat_rows` takes values: those drawn, where the backend knows them."""
+        """The (M,) int32 rows of which `splat_rows` takes values: those drawn, if the backend knows."""
         return np.arange(self.count, dtype=np.int32)
 
     def splat_rows(self, values: Array) -> tuple[Array, Array]:
@@ -43,10 +43,10 @@ class View(ABC):
 
     @abstractmethod
     def depth(self) -> Array:
-        """(H, W) alpha-weighted mean depth along camera z, world units; 0 where nothing is drawn."""
+        """Return (H, W) alpha-weighted mean depth along camera z, world units; 0 where nothing is drawn."""
 
     def median_depth(self) -> Array:
-        """(H, W) camera z, world units, of the Gaussian at which the transmittance falls to 0.5 or below.
+        """Return (H, W) camera z of the Gaussian at which the transmittance falls to 0.5 or below.
 
         0 where it never does. A backend that cannot tell gives the mean depth there.
         """
@@ -68,14 +68,14 @@ class LiftingView(View):
 
     @abstractmethod
     def gather(self, image: Array) -> Array:
-        """(H, W, C) image -> (N, C) values ``W^T y``."""
+        """Map (H, W, C) image to (N, C) values ``W^T y``."""
 
     def contributions(self) -> Array:
-        """(N,) blending weight of each Gaussian summed over the image, in pixels: ``W^T 1``."""
+        """Return (N,) blending weight of each Gaussian summed over the image, in pixels: ``W^T 1``."""
         return self.gather(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
 
     def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> sparse.csr_matrix:
-        """(L, H, W) int32 labels below `count`, -1 for none -> (N, count) float32 ``W^T onehot``, in pixels.
+        """Sum (L, H, W) int32 labels below `count`, -1 for none, into (N, count) ``W^T onehot``, pixels.
 
         A pixel counts once for every label that it has in any map. Entries of at most `least` are left out.
         """
@@ -125,7 +125,7 @@ def farthest(settings: RasterSettings) -> float:
 
 
 def mean_depth(sums: Array, weights: Array) -> Array:
-    """(H, W) blended depths and their weights -> mean depth, 0 where nothing is drawn."""
+    """Map (H, W) blended depths and their weights to mean depth, 0 where nothing is drawn."""
     return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
 
 

@@ -27,7 +27,7 @@ from langsplat_core.scene.transform import sh_basis
 
 
 def colours(sh: Array, means: Array, camera_position: Array) -> Array:
-    """(N, K, 3) coefficients seen from `camera_position` -> (N, 3) float64 display colours >= 0.
+    """Map (N, K, 3) coefficients seen from `camera_position` to (N, 3) float64 display colours >= 0.
 
     Not clamped above: values over 1 are legal until the image is quantised. Invalid rows give 0.
     """
@@ -127,7 +127,7 @@ def alphas_in(f: Footprints, index: int, window: tuple[slice, slice], settings: 
 
 
 def rim(f: Footprints, settings: RasterSettings, relative: float) -> Array:
-    """(N, 2) half extents of the contour alpha = alpha_min (1 - relative), px, a little generous."""
+    """Return (N, 2) half extents of the contour alpha = alpha_min (1 - relative), px, a little generous."""
     squared = 2 * np.log(np.maximum(f.opacities / settings.alpha_min, 1 + 1e-9))
     return f.extents_px * np.sqrt(1 + 2.1 * relative / squared)[:, None] + 1e-3
 
@@ -165,7 +165,7 @@ class ReferenceView(LiftingView):
             yield Step(int(i), window, was_running, alpha, before, weights, transmittance[window])
 
     def cut_off_band(self, relative: float) -> Array:
-        """(H, W) True where some Gaussian's alpha, or T behind it, is within `relative` of a cut-off.
+        """Return (H, W) True where some Gaussian's alpha, or T behind it, is within `relative` of a cut-off.
 
         There rounding decides, and a fast rasterizer may come out on the other side.
         """
@@ -202,7 +202,7 @@ class ReferenceView(LiftingView):
         return np.append(self.footprints.depths, 0)[self.median_rows()]
 
     def median_rows(self) -> Array:
-        """(H, W) int64 the Gaussian at which the transmittance falls to 0.5 or below, -1 where never."""
+        """Return (H, W) int64 Gaussian at which the transmittance falls to 0.5 or below, -1 for none."""
         rows = np.full((self.camera.height, self.camera.width), -1)
         for step in self.steps():
             passed = (step.weights > 0) & (step.after <= 0.5)

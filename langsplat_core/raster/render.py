@@ -96,7 +96,7 @@ def splat_colours(view: protocol.View, gaussians: Gaussians, values: Array | Non
 
 
 def colours_seen(gaussians: Gaussians, camera: Camera, rows: Array | None = None) -> Array:
-    """(N, 3) float32 colours >= 0 seen from the camera, 0 if invalid; rows: (M,) int32, these alone."""
+    """Return (N, 3) float32 colours >= 0 seen from the camera, 0 if invalid; rows: these alone."""
     from langsplat_core.raster.cpu.projection import colours  # numba takes a second to import
 
     if camera.orthographic:
@@ -112,7 +112,7 @@ def pixel_weights(
     rasterizer: protocol.LiftingRasterizer | None = None,
     settings: RasterSettings | None = None,
 ) -> tuple[Array, Array]:
-    """(M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and their (M,) float32 weights.
+    """Return (M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and (M,) float32 weights.
 
     The weights, alpha_i T_i > 0, add up to the pixel's alpha; rasterizer and settings as in `view_of`. Only
     those that could reach the pixel are projected, in their order: weights are those of the whole view. The
@@ -132,7 +132,7 @@ def pixel_weights(
 def _may_reach(
     gaussians: Gaussians, camera: Camera, pixel: tuple[int, int], settings: RasterSettings
 ) -> Array:
-    """(N,) bool, True for every Gaussian whose footprint may cover the pixel, and for few others.
+    """Return (N,) bool, True for every Gaussian whose footprint may cover the pixel, and for few others.
 
     The footprint's covariance is J R S S^T R^T J^T + dilation, so its largest eigenvalue is at most
     |J|^2 s_max^2 + dilation with |J|^2 <= (f/z)^2 (1 + (x/z)^2 + (y/z)^2), and f^2 of an orthographic camera;

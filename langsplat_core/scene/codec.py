@@ -56,14 +56,14 @@ class Codec(ABC):
 
     @abstractmethod
     def encode(self, vectors: Array) -> Array:
-        """(M, D) unit CLIP vectors -> (M, d) latents of the codec's type."""
+        """Map (M, D) unit CLIP vectors to (M, d) latents of the codec's type."""
 
     @abstractmethod
     def decode(self, latents: Array) -> Array:
-        """(M, d) latents -> (M, D) float32 unit vectors."""
+        """Map (M, d) latents to (M, D) float32 unit vectors."""
 
     def cosines(self, latents: Array, vectors: Array) -> Array:
-        """(M, d) latents of any length, (Q, D) unit vectors -> (M, Q) float32 cosines; zero gives zeros."""
+        """Return (M, Q) float32 cosines of (M, d) latents and (Q, D) unit vectors; zero gives zeros."""
         towards, known = _directions(latents)
         return np.where(known[:, None], self.decode(towards) @ vectors.T, 0).astype(np.float32)
 
@@ -80,20 +80,20 @@ class Codec(ABC):
         """ValueError for (M, d) latents that no vector has."""
 
     def known(self, latents: Array) -> Array:
-        """(M, d) latents -> (M,) bool, False for one without a meaning: a vector of zeros."""
+        """Map (M, d) latents to (M,) bool, False for one without a meaning: a vector of zeros."""
         known: Array = np.linalg.norm(latents, axis=1) > SHORTEST
         return known
 
     def unique(self, latents: Array) -> tuple[Array, Array]:
-        """(M, d) latents -> (U, d) ones, distinct where they repeat, and (M,) int64 index of each in them."""
+        """Return (U, d) latents, distinct where they repeat, and (M,) int64 index of each in them."""
         return latents, np.arange(len(latents))
 
     def directions(self, latents: Array) -> Array:
-        """(M, d) latents -> (M, c) float32 unit vectors, or zero, with about the cosines of the decoded."""
+        """Return (M, c) float32 unit vectors, or zero, with about the cosines of the decoded latents."""
         return _directions(latents)[0]
 
     def distances(self, latents: Array, first: Array, second: Array) -> Array:
-        """(M, d) latents -> (E,) 1 - cosine between the latents at the (E,) indices `first` and `second`."""
+        """Return (E,) 1 - cosine between the latents at the (E,) indices `first` and `second`."""
         distinct, of = self.unique(latents)
         directions, first, second = self.directions(distinct), of[first], of[second]
         if len(directions) ** 2 <= len(first):
@@ -111,12 +111,12 @@ class Codec(ABC):
         return max(1 - float(mean @ mean), 0.0)
 
     def colours(self, latents: Array, weights: Array) -> Array:
-        """(M, d) latents, (M,) how often each occurs -> (M, 3) float32 in [0, 1], near for near vectors."""
+        """Return (M, 3) float32 in [0, 1], near for near vectors; weights: (M,) how often each occurs."""
         return principal_colours(latents, weights)
 
 
 def _directions(latents: Array) -> tuple[Array, Array]:
-    """(M, d) latents scaled to length 1, float32, and (M,) bool, False for those without a direction."""
+    """Scale (M, d) latents to length 1, float32; (M,) bool is False for those without a direction."""
     length = np.linalg.norm(latents, axis=1)
     known = length > SHORTEST
     return (latents / np.where(known, length, 1)[:, None]).astype(np.float32), known
@@ -301,7 +301,7 @@ class CodebookCodec(Codec):
 
 
 def principal_colours(vectors: Array, weights: Array) -> Array:
-    """(K, c) vectors -> (K, 3) float32 colours in [0, 1], near ones for near vectors.
+    """Map (K, c) vectors to (K, 3) float32 colours in [0, 1], near ones for near vectors.
 
     Their first three principal axes, each between its 2 % and 98 % quantiles; an axis that is missing or flat
     is grey. weights: (K,) >= 0, how often each occurs; axes and quantiles are those of what occurs.

@@ -65,7 +65,7 @@ class Gaussians:
         return some.take(some.valid() & (some.opacity_logits >= float(logit(np.array(INRIA.alpha_min)))))
 
     def valid(self) -> Array:
-        """(N,) True where a row can be drawn, see `invalid_rows` for why it cannot."""
+        """Return (N,) True where a row can be drawn, see `invalid_rows` for why it cannot."""
         return self._faults == 0
 
     def invalid_rows(self) -> dict[str, int]:
@@ -75,7 +75,7 @@ class Gaussians:
 
     @cached_property
     def _faults(self) -> Array:
-        """(N,) uint8 number, from 1, of the first of `FAULTS` that a row has; 0: none."""
+        """The (N,) uint8 number, from 1, of the first of `FAULTS` that a row has; 0: none."""
         faults = np.zeros(len(self), np.uint8)
         for start in range(0, len(self), 8192):  # what is compared is not held of all at once
             rows = slice(start, start + 8192)
@@ -133,7 +133,7 @@ class Merged:
     weights: "sparse.csr_matrix"  # (M, N) float32: what each is made of; rows sum to 1
 
     def values(self, values: Array | None) -> Array | None:
-        """(N, C) values of the original Gaussians -> (M, C) float32."""
+        """Map (N, C) values of the original Gaussians to (M, C) float32."""
         return None if values is None else self.weights @ np.asarray(values, np.float32)
 
 
@@ -160,7 +160,7 @@ def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
 
 
 def along_curve(points: Array) -> Array:
-    """(N, 3) -> (N,) place on a Morton curve: near numbers are mostly near points."""
+    """Map (N, 3) to (N,) place on a Morton curve: near numbers are mostly near points."""
     if len(points) == 0:
         return np.zeros(0, np.uint64)
     # Neither a single floater nor a far background may use up the grid.
@@ -182,13 +182,13 @@ def _kept(gaussians: Gaussians, rows: Array) -> _Part:
 
 
 def _area(scales: Array) -> Array:
-    """(..., 3) -> (...) what an ellipsoid covers, seen from everywhere, up to a constant."""
+    """Map (..., 3) to (...) what an ellipsoid covers, seen from everywhere, up to a constant."""
     a, b, c = np.moveaxis(scales, -1, 0)
     return np.asarray(a * b + b * c + c * a)
 
 
 def _merge(gaussians: Gaussians, rows: Array) -> Iterator[_Part]:
-    """(G, GROUP) rows -> those that were merged, and those that were not."""
+    """Map (G, GROUP) rows to those that were merged, and those that were not."""
     members = gaussians.take(rows.ravel())
     scales = np.exp(members.log_scales.astype(np.float64))
     axes = rotation_matrices(members.quats_wxyz.astype(np.float64)) * scales[:, None, :]
@@ -212,7 +212,7 @@ def _merge(gaussians: Gaussians, rows: Array) -> Iterator[_Part]:
 
 
 def _ellipsoids(covariances: Array) -> tuple[Array, Array, Array]:
-    """(G, 3, 3) -> (G, 3) logarithms of the scales, (G, 4) quaternions wxyz, (G,) `_area`."""
+    """Map (G, 3, 3) to (G, 3) logarithms of the scales, (G, 4) quaternions wxyz, (G,) `_area`."""
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, no reflection
     from scipy.spatial.transform import Rotation

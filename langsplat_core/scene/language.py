@@ -106,7 +106,7 @@ class Tree:
         return len(self.parents)
 
     def at(self, level: int) -> Array:
-        """(N,) int32 largest node of at most `level` of each Gaussian, else its smallest; or NO_NODE."""
+        """Return (N,) int32 largest node of at most `level` of each Gaussian, or its smallest, or NO_NODE."""
         owners = [*range(self.count), NO_NODE]
         low = [*(self.levels <= level).tolist(), False]  # the last: of what is part of none
         for node, parent in zip(range(self.count - 1, -1, -1), self.parents[::-1].tolist(), strict=True):
@@ -121,7 +121,7 @@ class Tree:
         return np.where(votes[at], at, np.int32(NO_NODE))
 
     def members(self, node: int) -> Array:
-        """(N,) bool: the Gaussians of a node, those of its descendants included."""
+        """Return (N,) bool: the Gaussians of a node, those of its descendants included."""
         inside = [False] * (self.count + 1)  # the last: in no node
         inside[node] = True
         for other, parent in zip(range(node - 1, -1, -1), self.parents[:node][::-1].tolist(), strict=True):

@@ -82,12 +82,12 @@ class Camera:
 
     @property
     def position(self) -> Array:
-        """(3,) centre of projection, or the point of the principal pixel in the plane z = 0; world units."""
+        """Centre of projection (3,), or the point of the principal pixel in the plane z = 0; world units."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
     @property
     def rotation(self) -> Array:
-        """(3, 3) world-to-camera rotation; its rows are the camera's right, down and forward axes."""
+        """The (3, 3) world-to-camera rotation; its rows are the camera's right, down and forward axes."""
         return self.world_to_camera[:3, :3]
 
     def moved(self, offset: Array) -> "Camera":
@@ -114,14 +114,14 @@ class Camera:
         return self.resized(max(round(share * self.width), 1), max(round(share * self.height), 1))
 
     def project(self, points_world: Array) -> tuple[Array, Array]:
-        """(N, 3) world points -> (N, 2) pixel positions and (N,) depths along z (may be <= 0)."""
+        """Map (N, 3) world points to (N, 2) pixel positions and (N,) depths along z (may be <= 0)."""
         in_camera = points_world @ self.rotation.T + self.world_to_camera[:3, 3]
         depth = in_camera[:, 2]
         safe = 1.0 if self.orthographic else np.where(np.abs(depth) < 1e-12, 1e-12, depth)[:, None]
         return in_camera[:, :2] / safe * (self.fx, self.fy) + (self.cx, self.cy), depth
 
     def unproject(self, pixels: ArrayLike, depths: ArrayLike) -> Array:
-        """(..., 2) pixel positions and (...) depths along z, or one for all -> (..., 3) world points."""
+        """Map (..., 2) pixel positions and (...) depths along z, or one for all to (..., 3) world points."""
         places, z = np.asarray(pixels, np.float64), np.asarray(depths, np.float64)[..., None]
         offsets = (places - (self.cx, self.cy)) / (self.fx, self.fy) * (1.0 if self.orthographic else z)
         in_camera = np.concatenate([offsets, np.broadcast_to(z, (*offsets.shape[:-1], 1))], -1)
@@ -129,12 +129,12 @@ class Camera:
         return points
 
     def pixel_centres(self) -> Array:
-        """(H, W, 2) positions x, y of the centres of all pixels."""
+        """Return (H, W, 2) positions x, y of the centres of all pixels."""
         x, y = np.meshgrid(np.arange(self.width), np.arange(self.height))
         return np.stack([x, y], -1) + 0.5
 
     def in_image(self, pixels: Array, depths: Array) -> Array:
-        """(N,) bool, which points, as `project` returns them, lie before the camera and inside its image."""
+        """Return (N,) bool, which points, as of `project`, lie before the camera and inside its image."""
         with np.errstate(invalid="ignore"):
             inside: Array = (depths > 0) & ((pixels >= 0) & (pixels < (self.width, self.height))).all(1)
         return inside
@@ -209,7 +209,7 @@ def bounds_of(gaussians: Gaussians) -> tuple[Array, float]:
 
 
 def geometric_median(points: Array) -> Array:
-    """(N, 3) points, N >= 1 -> (3,) float64, from where the sum of distances to them is least (Weiszfeld)."""
+    """Return (3,) float64, from where the sum of distances to (N, 3) points is least (Weiszfeld)."""
     centre = np.median(points, axis=0)
     for _ in range(100):
         offsets = points - centre
@@ -254,7 +254,7 @@ def origin_of(points: Array) -> Array:
 
 
 def about_origin(points: Array) -> tuple[Array, Array]:
-    """(N, 3) positions in the world -> (N, 3) positions about their origin, and that origin (3,)."""
+    """Map (N, 3) positions in the world to (N, 3) positions about their origin, and that origin (3,)."""
     origin = origin_of(points)
     return (points - origin if origin.any() else points), origin
 
@@ -311,7 +311,7 @@ class Scene:
         return str(self.show()._repr_html_())
 
     def in_world(self, points: Array) -> Array:
-        """(..., 3) positions in this scene -> (..., 3) float64 positions in the world."""
+        """Map (..., 3) positions in this scene to (..., 3) float64 positions in the world."""
         return np.asarray(points, np.float64) + self.origin
 
     def world_gaussians(self) -> Gaussians:
@@ -355,7 +355,7 @@ class Scene:
         return float(focal) if focal > WIDEST * width else None
 
     def up(self) -> Array:
-        """(3,) the world's up direction: the mean of the cameras' up axes, else -y as COLMAP has it."""
+        """Return (3,) the world's up direction: the mean of the cameras' up axes, else -y as in COLMAP."""
         if self.cameras:
             mean = -np.mean([camera.rotation[1] for camera in self.cameras], axis=0)
             if np.linalg.norm(mean) > 0.2:  # cameras that roll in every direction tell nothing
@@ -374,7 +374,7 @@ class Scene:
         return side, np.cross(up, side)
 
     def _across(self, centre: Array, radius: float, up: Array) -> Array:
-        """(3,) the level direction along which the scene covers the most of an image."""
+        """Return (3,) the level direction along which the scene covers the most of an image."""
         side, ahead = self._level(up)
         some = self.gaussians.take(np.arange(0, len(self.gaussians), len(self.gaussians) // SAMPLES + 1))
         offsets = (some.means[some.valid()] - centre) / radius

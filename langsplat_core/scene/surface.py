@@ -36,13 +36,13 @@ class Surface:
 
     @cached_property
     def ends(self) -> tuple[Array, Array]:
-        """(E,) int32 numbers at either end of the links, each link once."""
+        """The (E,) int32 numbers at either end of the links, each link once."""
         links = self.links.tocoo()
         once = links.row < links.col
         return links.row[once].astype(np.int32), links.col[once].astype(np.int32)
 
     def smooth(self, values: Array, numbers: Array | None = None) -> Array:
-        """(N,) float32 values of all Gaussians -> (K,) float32 opacity-weighted means over neighbourhoods.
+        """Return (K,) float32 opacity-weighted means over neighbourhoods of all Gaussians' (N,) values.
 
         numbers: (K,) whose neighbourhoods, by default those of all M. In 3D what the paper's mean filter is
         in an image (section 4.1, "implementation details"): one stray Gaussian decides nothing.
@@ -61,13 +61,13 @@ class Surface:
         return [np.sort(part) for part in np.split(order, starts)]
 
     def connected(self, inside: Array, seed: int) -> Array:
-        """(M,) bool, and a member of it -> numbers of all that are linked to that member through members."""
+        """Return numbers of all that are linked to a member of (M,) bool through members."""
         order, _ = _search(self.links.indptr, self.links.indices, np.array([seed]), inside.copy())
         return order
 
 
 def surface_weights(gaussians: Gaussians, min_opacity: float = 0.1) -> Array:
-    """(N,) float32 opacity of valid Gaussians with `min_opacity`, of all if none has it; else 0."""
+    """Return (N,) float32 opacity of valid Gaussians with `min_opacity`, of all if none has it; else 0."""
     valid = gaussians.valid()
     opacity = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
     counts = opacity >= min_opacity
@@ -104,7 +104,7 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
 
 
 def surface_areas(gaussians: Gaussians) -> Array:
-    """(N,) float64 opacity times the two longest axes, units^2, at most the 99 % quantile; 0 if invalid."""
+    """Return (N,) float64 opacity times the two longest axes, units^2, cut at the 99 % quantile."""
     valid = gaussians.valid()
     scales = np.sort(np.where(valid[:, None], gaussians.log_scales, -np.inf).astype(np.float64), axis=1)
     opacity = sigmoid(np.where(valid, gaussians.opacity_logits, -np.inf).astype(np.float64))
@@ -197,7 +197,7 @@ def divide(surface: Surface, steps: Array, order: Array, scale: float, smallest:
 def merge_patches(
     count: int, first: Array, second: Array, steps: Array, order: Array, scale: float, smallest: int
 ) -> Array:
-    """(M,) a member of each Gaussian's patch, the same for all of a patch."""
+    """Return (M,) a member of each Gaussian's patch, the same for all of a patch."""
     parent, size = np.arange(count, dtype=np.int32), np.ones(count, np.int32)
     largest = np.zeros(count, np.float32)  # step within each patch
     for gathering in range(2):  # the criterion, then the small ones
@@ -251,7 +251,7 @@ def build_tree(
 def _divided(
     surface: Surface, codec: Codec, latents: Array, known: Array, above: Array | None, things: Array
 ) -> Array:
-    """(M,) int32 number, from 0, of the patch of each Gaussian at one level, within those `above` (M,)."""
+    """Return (M,) int32 number, from 0, of each Gaussian's patch at a level, within `above` (M,)."""
     a, b = surface.ends
     # 1 - cosine between what the two ends of each link mean.
     both, neither = known[a] & known[b], ~known[a] & ~known[b]

@@ -31,7 +31,7 @@ class Similarity:
 
     @property
     def matrix(self) -> Array:
-        """(4, 4) float64 homogeneous matrix of the map."""
+        """The (4, 4) float64 homogeneous matrix of the map."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
         return matrix
@@ -42,7 +42,7 @@ class Similarity:
         return bool((self.matrix == np.eye(4)).all())
 
     def points(self, points: Array) -> Array:
-        """(..., 3) points -> (..., 3) float64 images of them."""
+        """Map (..., 3) points to (..., 3) float64 images of them."""
         with np.errstate(invalid="ignore", over="ignore"):
             moved: Array = np.asarray(points, np.float64) @ (self.scale * self.rotation.T) + self.translation
         return moved
@@ -61,7 +61,7 @@ class Similarity:
         return moving(-np.asarray(centre)).then(self).then(moving(centre))
 
     def quaternions(self, quats_wxyz: Array) -> Array:
-        """(N, 4) rotations followed by this one, float64, of the lengths they had; zero ones stay zero."""
+        """Return (N, 4) rotations followed by this one, float64, of the same lengths; zero stays zero."""
         w, x, y, z = rotation_quaternion(self.rotation)
         left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
         with np.errstate(invalid="ignore"):
@@ -153,7 +153,7 @@ def turned_origin(rotation: Array, origin: Array) -> Array:
 
 
 def rotation_quaternion(rotation: Array) -> Array:
-    """(3, 3) -> (4,) unit quaternion wxyz with w >= 0."""
+    """Map (3, 3) to (4,) unit quaternion wxyz with w >= 0."""
     from scipy.spatial.transform import Rotation  # here, since every program that opens a scene comes by
 
     quat: Array = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
@@ -219,7 +219,7 @@ C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901
 
 
 def sh_basis(directions: Array, count: int) -> Array:
-    """(N, 3) unit directions from the camera to the Gaussians -> (N, count) basis values."""
+    """Map (N, 3) unit directions from the camera to the Gaussians to (N, count) basis values."""
     x, y, z = np.moveaxis(directions, -1, 0)
     values = [np.full_like(x, C0)]
     if count > 1:
@@ -261,7 +261,7 @@ def sh_rotations(rotation: Array, degree: int) -> list[Array]:
 
 
 def rotated_harmonics(sh: Array, rotation: Array) -> Array:
-    """(N, K, 3) coefficients -> float32 coefficients of the same colours seen from rotated directions."""
+    """Map (N, K, 3) coefficients to float32 coefficients of the same colours seen from rotated directions."""
     degree = math.isqrt(sh.shape[1]) - 1
     if degree == 0 or (rotation == np.eye(3)).all():
         return sh

@@ -175,7 +175,7 @@ def _tensors(folder: Path, config: TextConfig, prefix: str, projection: str, oth
 
 
 def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) -> Array:
-    """(B, L) token numbers, and (B,) where the end token of each row is -> (B, D) float32, of any length."""
+    """Return (B, D) float32 of (B, L) tokens, of any length; ends: (B,) where each end token is."""
     eps, length = config.layer_norm_eps, ids.shape[1]
     later = np.triu(np.full((length, length), -np.inf, np.float32), 1)
     x = tensors[TOKENS][ids] + tensors[POSITIONS][:length]
@@ -185,7 +185,7 @@ def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) 
 
 
 def _layers(tensors: Tensors, prefix: str, config: TextConfig, x: Array, later: Array | None = None) -> Array:
-    """(B, L, W) tokens behind all layers; `later` as of `_attention`."""
+    """Return (B, L, W) tokens behind all layers; `later` as of `_attention`."""
     for number in range(config.num_hidden_layers):
         layer, eps = f"{prefix}encoder.layers.{number}.", config.layer_norm_eps
         before = _norm(tensors, f"{layer}layer_norm1", x, eps)

@@ -51,7 +51,7 @@ class TextTower(Protocol):
     temperature: float  # factor of a difference of cosines before the sigmoid, 10 for CLIP
 
     def encode(self, texts: list[str]) -> Array:
-        """(B, D) float32 vectors, of any length, of B > 0 phrases.
+        """Return (B, D) float32 vectors, of any length, of B > 0 phrases.
 
         Raises InputError and EncoderError as `check_whole`: no part of a phrase is left out in silence.
         """
@@ -64,7 +64,7 @@ class ImageTower(Protocol):
     statistics: tuple[Array, Array]  # (3,) mean and deviation to be taken out, of values in [0, 1]
 
     def encode(self, pixels: Array) -> Array:
-        """(B, 3, S, S) float32, normalised -> (B, D) float32 vectors, of any length."""
+        """Map (B, 3, S, S) float32, normalised to (B, D) float32 vectors, of any length."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class PhraseEncoder:
         return next((form for form in (word, word.partition("'")[0]) if form in (self.words or ())), None)
 
     def encode_texts(self, texts: Sequence[str]) -> Array:
-        """(M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat.
+        """Return (M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat.
 
         An encoder of a closed vocabulary is given its words and nothing else: any mark that its tokenizer
         lacks might end the phrase. Raises InputError for a phrase without a letter or digit or with more
@@ -209,7 +209,7 @@ class Encoder(PhraseEncoder):
         self.image_size = images.image_size  # side of the images it takes, px
 
     def encode_images(self, crops: Array | Sequence[Array]) -> Array:
-        """(M, D) float32 unit vectors of M images (image_size, image_size, 3) uint8, display values."""
+        """Return (M, D) float32 unit vectors of M uint8 images of side `image_size`, display values."""
         size = self.image_size
         for crop in crops:
             if crop.shape != (size, size, 3):
@@ -219,7 +219,7 @@ class Encoder(PhraseEncoder):
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
     def _encode(self, images: Array, forward: Callable[[Array], Array] | None = None) -> Array:
-        """(B, H, W, 3) uint8 -> unit vectors that `forward`, if not the tower itself, has for pixels."""
+        """Map (B, H, W, 3) uint8 to unit vectors that `forward`, if not the tower itself, has for pixels."""
         mean, std = self._images.statistics
         pixels = (images.astype(np.float32) / 255 - mean) / std
         return unit((forward or self._images.encode)(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))))

@@ -142,7 +142,7 @@ class ImageEncoder(Protocol):
     image_size: int  # side of the images it takes, px
 
     def encode_images(self, crops: Array) -> Array:
-        """(M, S, S, 3) uint8 -> (M, D) float32 unit vectors."""
+        """Map (M, S, S, 3) uint8 to (M, D) float32 unit vectors."""
 
 
 def masked_crop(image: Array, mask: Array, size: int) -> Array:

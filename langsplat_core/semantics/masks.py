@@ -45,7 +45,7 @@ class MaskSource(Protocol):
 
 
 def label_maps(levels: LevelMasks) -> Array:
-    """(3, H, W) int32: the row of the mask that is on top at each pixel, -1 where there is none.
+    """Return (3, H, W) int32: the row of the mask that is on top at each pixel, -1 where there is none.
 
     Rows count through all three levels, subpart first, as in LangSplat's `*_s.npy` (without its "default"
     level); within a level later masks cover earlier ones. Unlike there, a mask that ends with no visible
@@ -76,7 +76,7 @@ EIGHT = np.ones((3, 3), bool)  # diagonal neighbours are connected, as in SAM's 
 
 
 def mask_boxes(masks: Array) -> Array:
-    """(M, H, W) bool, none empty -> (M, 4) int64 left, top, right, bottom; the last two exclusive."""
+    """Map (M, H, W) bool, none empty to (M, 4) int64 left, top, right, bottom; the last two exclusive."""
     boxes = np.zeros((len(masks), 4), np.int64)
     for box, mask in zip(boxes, masks, strict=True):
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
@@ -132,7 +132,7 @@ def clean_regions(mask: Array, min_region: int) -> tuple[Array, bool]:
 
 
 def common_pixels(masks: Array) -> Array:
-    """(M, H, W) bool -> (M, M) int64: pixels in both masks; areas on the diagonal."""
+    """Map (M, H, W) bool to (M, M) int64: pixels in both masks; areas on the diagonal."""
     flat = masks.reshape(len(masks), -1)
     total = np.zeros((len(masks), len(masks)), np.int64)
     for start in range(0, flat.shape[1], PIXELS_PER_PRODUCT):
@@ -142,7 +142,7 @@ def common_pixels(masks: Array) -> Array:
 
 
 def mask_nms(masks: Array, scores: Array, config: MaskConfig) -> Array:
-    """(K,) indices of the masks that stay, rising.
+    """Return (K,) indices of the masks that stay, rising.
 
     masks: (M, H, W) bool, none empty; scores: (M,) stability times predicted IoU. A mask goes when its IoU
     with any higher-scored mask, gone or not, is > nms_iou; when its score is <= nms_score; or when it lies
@@ -211,7 +211,7 @@ class RegionGraph:
             alive = alive[alive != smallest]
 
     def partition(self) -> Array:
-        """(H, W) int: the regions as they are now, numbered 0..M-1."""
+        """Return (H, W) int: the regions as they are now, numbered 0..M-1."""
         roots = self._parent
         while not np.array_equal(roots, roots[roots]):
             roots = roots[roots]
@@ -305,7 +305,7 @@ class GraphMasks(MaskSource):
 
 
 def nested_partitions(image: Array) -> Array:
-    """(3, H, W) int32 regions of an image (H, W, 3) uint8, each a union of regions of the level before."""
+    """Divide (H, W, 3) uint8 into (3, H, W) int32 regions, each a union of those of the level before."""
     from skimage.color import rgb2lab
     from skimage.restoration import denoise_tv_chambolle
     from skimage.segmentation import slic
@@ -336,7 +336,7 @@ def nested_partitions(image: Array) -> Array:
 
 
 def _paint(lab: Array) -> Array:
-    """(H, W, 3) CIELAB -> (H, W, 3) colours of which shading changes only the first channel, lightness.
+    """Map (H, W, 3) CIELAB to (H, W, 3) colours of which shading changes only the first channel, lightness.
 
     In CIELAB both a, b and L + 16 are differences of cube roots, so all three scale alike with the light that
     falls on a surface: a / (L + 16) and b / (L + 16) hardly depend on it. Large chromas are compressed, since

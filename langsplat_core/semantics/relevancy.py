@@ -46,7 +46,7 @@ def relevancy_of(cosines: Array, zero: Array, rate: Array | float) -> Array:
 def relevancy(
     vectors: Array, phrases: Array, canonical: Array, temperature: float = LanguageField.temperature
 ) -> Array:
-    """(M, D) unit vectors, (Q, D) unit phrase vectors, (C, D) unit canonical vectors -> (M, Q) in (0, 1)."""
+    """Return (M, Q) in (0, 1) of (M, D), (Q, D) phrases and (C, D) canonical unit vectors."""
     return relevancy_of(vectors @ phrases.T, (vectors @ canonical.T).max(1, keepdims=True), temperature)
 
 
@@ -85,7 +85,7 @@ class Scale:
 
     @property
     def texts(self) -> Array:
-        """(T, D) unit vectors of all phrases that `of` compares with."""
+        """The (T, D) unit vectors of all phrases that `of` compares with."""
         return self.canonical if self.everyday is None else np.concatenate([self.canonical, self.everyday])
 
     def of(self, cosines: Array) -> tuple[Array, Array]:
@@ -154,7 +154,7 @@ class TextEncoder(Protocol):
     """The text half of a CLIP model."""
 
     def encode_texts(self, texts: list[str]) -> Array:
-        """(M, D) float32 unit vectors."""
+        """Return (M, D) float32 unit vectors."""
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
         """Words of `text` that the encoder was never taught; empty if it cannot tell."""
@@ -177,7 +177,7 @@ def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]
 
 
 def everyday_vectors(encoder: TextEncoder) -> Array | None:
-    """(V, D) float32 unit vectors of the everyday phrases, of float16 precision; None if it knows too few."""
+    """Return (V, D) float32 unit vectors of everyday phrases, as of float16; None if it knows too few."""
     phrases = everyday_phrases(encoder.unknown_words)
     if len(phrases) < FEWEST:
         return None

@@ -52,7 +52,7 @@ class EncodedImage:
 
     @models.asking_errors("the segmenter")
     def masks_at(self, points: Array) -> tuple[Any, Any]:
-        """(P, 2) float32 x, y, px of the image -> (P, 3) predicted IoU, (P, 3, h, w) small logits."""
+        """Map (P, 2) float32 x, y, px of the image to (P, 3) predicted IoU, (P, 3, h, w) small logits."""
         import torch
 
         height, width = self.size or (self.side, self.side)
@@ -63,7 +63,7 @@ class EncodedImage:
         return (ious, logits) if self.ordered else by_area(ious, logits)
 
     def enlarge(self, logits: Any) -> Any:
-        """(B, h, w) low-resolution logits -> (B, H, W) of the image."""
+        """Map (B, h, w) low-resolution logits to (B, H, W) of the image."""
         from torch.nn.functional import interpolate
 
         square = logits[:, None].float()
@@ -88,7 +88,7 @@ class TextSegmenter(Protocol):
     """A model that outlines what a phrase names."""
 
     def segment(self, image: Array, phrases: Sequence[str]) -> Array:
-        """(H, W, 3) uint8 -> (H, W, P) bool: pixels of all that each phrase names, seen in one pass."""
+        """Map (H, W, 3) uint8 to (H, W, P) bool: pixels of all that each phrase names, seen in one pass."""
 
 
 def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
@@ -260,7 +260,7 @@ def grid_points(per_side: int, size: tuple[int, int]) -> Array:
 
 
 def crop_boxes(shape: tuple[int, int], layers: int) -> Array:
-    """(C, 4) int64 left, top, right, bottom, px, exclusive: the image, then 2^k x 2^k crops a layer."""
+    """Return (C, 4) int64 left, top, right, bottom, exclusive: the image, then 2^k x 2^k crops a layer."""
     height, width = shape
     boxes = [(0, 0, width, height)]
     for layer in range(1, layers + 1):
@@ -308,7 +308,7 @@ class Proposal:
     crop_area: int  # px, of the crop that it was found in
 
     def mask(self, shape: tuple[int, int]) -> Array:
-        """(H, W) bool: the mask in an image of `shape`."""
+        """Return (H, W) bool: the mask in an image of `shape`."""
         left, top, right, bottom = self.box
         size = bottom - top, right - left
         mask = np.zeros(shape, bool)

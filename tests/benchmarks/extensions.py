@@ -47,7 +47,7 @@ def scene_of(room: Room) -> Scene:
 
 
 def true_points(room: Room) -> Array:
-    """(P, 3) points spread evenly over the room's true surfaces, world units, which are metres."""
+    """Return (P, 3) points spread evenly over the room's true surfaces, world units, which are metres."""
     world = photographed_room(room.seed, room.tier)
     return surface_points(world.vertices, world.triangles, np.random.default_rng(0), density=DENSITY)
 
@@ -303,7 +303,7 @@ class Done:
 
 
 def middle(placed: Placed) -> Array:
-    """(3,) of the upright box around a placed thing, metres."""
+    """Return (3,) of the upright box around a placed thing, metres."""
     points = np.concatenate([piece.mesh.vertices for piece in placed.thing.pieces])
     points = (points * placed.scale) @ placed.turn.T + placed.offset
     return np.asarray((points.min(0) + points.max(0)) / 2)

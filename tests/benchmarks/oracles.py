@@ -113,7 +113,7 @@ def moved_to_images(told: Sequence[ImageFeatures], seen: Sequence[ImageFeatures]
 def surface_points(
     vertices: Array, triangles: Array, rng: np.random.Generator, *, count: int = 0, density: float = 0.0
 ) -> Array:
-    """(P, 3) points spread evenly over triangles: `count` of them, or `density` on a square unit."""
+    """Return (P, 3) points spread evenly over triangles: `count` of them, or `density` on a square unit."""
     a, b, c = (vertices[triangles[:, corner]].astype(np.float64) for corner in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     which = rng.choice(len(areas), count or int(density * areas.sum()), p=areas / areas.sum())
@@ -162,7 +162,7 @@ def true_labels(
 
 
 def _as_rows(ids: Array) -> tuple[Array, Array]:
-    """(3, H, W) ids -> the same as rows that count through the levels, and (M,) the id of each row."""
+    """Map (3, H, W) ids to the same as rows that count through the levels, and (M,) the id of each row."""
     rows = np.full(ids.shape, -1, np.int32)
     numbers: list[int] = []
     for level, truth in enumerate(ids):
@@ -237,7 +237,7 @@ class TruthEncoder(ABC):
         return ()
 
     def encode_images(self, crops: Array | Sequence[Array]) -> Array:
-        """(M, D): all the same, until `describe` says what the masks show."""
+        """Return (M, D): all the same, until `describe` says what the masks show."""
         return np.tile(unit(np.ones(DIM, np.float32)), (len(crops), 1))
 
     def encode_texts(self, texts: Sequence[str]) -> Array:
@@ -265,7 +265,7 @@ class TruthEncoder(ABC):
         return [piece for piece in pieces if piece not in LITTLE]
 
     def direction(self, text: str) -> Array:
-        """(D,) unit: what is a phrase's own. Its head counts most: the last word before "of"."""
+        """Return (D,) unit: what is a phrase's own. Its head counts most: the last word before "of"."""
         pieces = self.pieces(phrase_key(text)) or [text]
         before = self.pieces(phrase_key(text).split(" of ")[0])
         head = before[-1] if before else pieces[-1]
@@ -353,7 +353,7 @@ class ClipGeometry(TruthEncoder):
         return np.sqrt(1 - LASTING) * self._noise_scale * noise(generator, count, self._axes)
 
     def _shows(self, region: Region | None) -> Array:
-        """(D,) of the region's words, so long that its plain phrase has the cosine `own`."""
+        """Return (D,) of the region's words, so long that its plain phrase has the cosine `own`."""
         if region is None or not region.thing:
             return np.zeros(DIM)
         thing = self.direction(region.thing)
@@ -395,7 +395,7 @@ class ClipGeometry(TruthEncoder):
 
     @cached_property
     def _own(self) -> Array:
-        """(V, D) unit directions of the file's words beside the middle."""
+        """The (V, D) unit directions of the file's words beside the middle."""
         vectors = self._file[1]
         return np.asarray(unit(vectors - (vectors @ self._middle)[:, None] * self._middle))
 
@@ -404,7 +404,7 @@ class ClipGeometry(TruthEncoder):
         return ({}, np.zeros((0, DIM))) if self.vectors is None else named_vectors(self.vectors)
 
     def word(self, word: str) -> Array:
-        """(D,) unit: the file's own, else between two of its others by chance, always the same."""
+        """Return (D,) unit: the file's own, else between two of its others by chance, always the same."""
         names, vectors = self._file
         singular = word.removesuffix("s")
         row = names.get(word, names.get(singular))
@@ -566,7 +566,7 @@ class RealSpace(TruthEncoder):
         return np.asarray(unit(vector - (vector @ self._middle) * self._middle))
 
     def _place(self, region: Region | None, generator: np.random.Generator) -> Array:
-        """(3,) unit: where on the set a region lies in all views."""
+        """Return (3,) unit: where on the set a region lies in all views."""
         points, said = self._points, self._said(region)
         if said:
             used = {self.names[piece] for text in said for piece in self.pieces(text)}
@@ -634,12 +634,12 @@ class RealSpace(TruthEncoder):
 
     @cached_property
     def _cosines(self) -> Array:
-        """(P, V) of the set with all names."""
+        """The (P, V) of the set with all names."""
         return np.asarray(self._decoded @ self._vectors.T)
 
     @cached_property
     def _centred(self) -> Array:
-        """(P, V) cosines less the mean of the name, and of the point."""
+        """The (P, V) cosines less the mean of the name, and of the point."""
         own = self._cosines - self._cosines.mean(0)
         return np.asarray(own - own.mean(1, keepdims=True))
 
@@ -724,5 +724,5 @@ def random(text: str) -> np.random.Generator:
 
 
 def drawn(text: str) -> Array:
-    """(D,) unit, always the same for a text."""
+    """Return (D,) unit, always the same for a text."""
     return np.asarray(unit(random(text).normal(size=DIM)))

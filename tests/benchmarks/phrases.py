@@ -68,7 +68,7 @@ class Case:
     without: tuple[int, ...] = ()  # truth ids that are taken away from these
 
     def mask(self, labels: Array) -> Array:
-        """(3, ...) truth ids -> (...) bool."""
+        """Map (3, ...) truth ids to (...) bool."""
         right = np.isin(labels, self.ids).any(0) & ~np.isin(labels, self.without).any(0)
         return np.asarray(right)
 
@@ -406,7 +406,7 @@ def name_regions(room: Room) -> RoomWords:
 
 
 def _regions(labels: Array) -> dict[int, Array]:
-    """(N,) truth ids -> the numbers of the Gaussians of each, where there are enough."""
+    """Map (N,) truth ids to the numbers of the Gaussians of each, where there are enough."""
     found = {int(key): np.flatnonzero(labels == key) for key in np.unique(labels[labels >= 0])}
     return {key: rows for key, rows in found.items() if len(rows) >= MIN_GAUSSIANS}
 

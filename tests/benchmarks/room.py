@@ -220,7 +220,7 @@ class Room:
 
     @cached_property
     def labels(self) -> Array:
-        """(3, N) truth ids of every Gaussian."""
+        """The (3, N) truth ids of every Gaussian."""
         path = self.folder / f"{stage_key('labels', 1, means_checksum(self.gaussians.means))}.npy"
         if not path.exists():
             views = [(camera, self.truth.labels(camera.name)) for camera in self.capture.cameras]

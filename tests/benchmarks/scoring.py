@@ -165,7 +165,7 @@ def half_way(peak: float) -> float:
 
 
 def majority(mask: Array, window: int = 7) -> Array:
-    """(H, W) boolean mask after a `window` x `window` majority vote; a tie is False."""
+    """Return (H, W) boolean mask after a `window` x `window` majority vote; a tie is False."""
     return uniform_filter(mask.astype(np.float64), size=window, mode="nearest") > 0.5 + 1e-9
 
 

@@ -145,7 +145,7 @@ def row_of_things(tmp_path, name: str = "room") -> tuple[Truth, np.ndarray, Imag
 
 
 def seen(encoder: TruthEncoder, tmp_path, views: int = 12, name: str = "room") -> np.ndarray:
-    """(V, R, D) vectors of every region in several views."""
+    """Return (V, R, D) vectors of every region in several views."""
     truth, ids, features = row_of_things(tmp_path, name)
     return np.stack([encoder.describe(features, ids, truth, view).vectors for view in range(views)])
 

@@ -150,20 +150,20 @@ LENS = PhotoIntrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)
 
 
 def places_at(metres: Array, around: tuple[float, float] = HERE) -> Array:
-    """(K, 2) metres east and north -> (K, 2) degrees, on a sphere."""
+    """Map (K, 2) metres east and north to (K, 2) degrees, on a sphere."""
     north = np.degrees(metres[:, 1] / 6_371_000)
     east = np.degrees(metres[:, 0] / 6_371_000 / math.cos(math.radians(around[0])))
     return np.stack([around[0] + north, (around[1] + east + 180) % 360 - 180], 1)
 
 
 def walk(count: int = 40, length: float = 80.0) -> Array:
-    """(K, 2) metres: a bent way."""
+    """Return (K, 2) metres: a bent way."""
     along = np.linspace(0, 1, count)
     return length * np.stack([along, 0.3 * np.sin(4 * along)], 1)
 
 
 def located(metres: Array, unit: float) -> Array:
-    """(K, 3) camera positions of another world, in which a unit is so many metres."""
+    """Return (K, 3) camera positions of another world, in which a unit is so many metres."""
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     return np.column_stack([metres, np.zeros(len(metres))]) @ turn / unit + 7.0
 

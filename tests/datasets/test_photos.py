@@ -438,7 +438,7 @@ WIDTH, HEIGHT = 96, 64
 
 
 def scene(step: int, blur: float = 0.0) -> Array:
-    """(H, W, 3) uint8: plain stripes that wander, red above and blue below."""
+    """Return (H, W, 3) uint8: plain stripes that wander, red above and blue below."""
     image = np.zeros((HEIGHT, WIDTH, 3))
     image[: HEIGHT // 2, :, 0] = image[HEIGHT // 2 :, :, 2] = 200
     image[:, (np.arange(WIDTH) + step) % 12 < 4] += 50

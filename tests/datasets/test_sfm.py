@@ -62,7 +62,7 @@ def walk(folder: Path, count: int, step: float = 0.8) -> list[str]:
 
 
 def _seen_from(y: float) -> Array:
-    """(2 H, 2 W) uint8."""
+    """Return (2 H, 2 W) uint8."""
     width, height, focal = 2 * SIZE[0], 2 * SIZE[1], 2 * FOCAL
     v, u = np.mgrid[:height, :width] + 0.5
     right, up = (u - width / 2) / focal, (height / 2 - v) / focal - 0.03  # a little downward

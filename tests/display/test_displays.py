@@ -138,7 +138,7 @@ BASE = np.array([0.2, 0.5, 0.7])
 
 
 def patch(*values: float, **picture) -> np.ndarray:
-    """(24, 24, 3) colours in [0, 1] of opaque pixels over `BASE`, heat in the queries' own colours."""
+    """Return (24, 24, 3) colours in [0, 1] of opaque pixels over `BASE`, heat in the queries' own colours."""
     shown = Channels(np.full((24, 24, 3), BASE), np.ones((24, 24)), np.full((24, 24, len(values)), values))
     return compose(shown, replace(HEAT, own_colours=True, **picture), ((0.0, 1.0),) * len(values)) / 255
 
@@ -163,7 +163,7 @@ SQUARE = np.s_[10:30, 8:22]
 
 
 def framed() -> tuple[np.ndarray, np.ndarray]:
-    """(40, 30, 1) values of a square, and (40, 30) bool its edge."""
+    """Return (40, 30, 1) values of a square, and (40, 30) bool its edge."""
     values, edge = np.zeros((40, 30, 1)), np.zeros((40, 30), bool)
     values[SQUARE] = edge[SQUARE] = 1
     edge[10 + EDGE_PX : 30 - EDGE_PX, 8 + EDGE_PX : 22 - EDGE_PX] = False

@@ -96,7 +96,7 @@ def exported(tmp_path: Path, scene: Scene, engine: QueryEngine | None = None) ->
 def drawn(
     gl: moderngl.Context, scene: Scene, camera: Camera, values: Array | None = None, **look: Any
 ) -> Array:
-    """(H, W, 3) uint8 of the OpenGL backend."""
+    """Return (H, W, 3) uint8 of the OpenGL backend."""
     rasterizer = GlRasterizer(gl, "single")
     image = splat_colours(view_of(scene, camera, rasterizer), scene.gaussians, values)
     rasterizer.release()

@@ -324,7 +324,7 @@ def regions_by(surface: Surface, sizes: tuple[int, ...]) -> Regions:
 
 
 def spread_out(surface: Surface, regions: Regions, fits) -> Array:
-    """(3, N) relevancy that has the given fits, of each level and region."""
+    """Return (3, N) relevancy that has the given fits, of each level and region."""
     relevancy = np.zeros((3, len(surface.anchors)), np.float32)
     for level, row in enumerate(fits):
         of = regions.everywhere[level, surface.rows]

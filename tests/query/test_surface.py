@@ -164,7 +164,7 @@ def assert_same_partition(got, want) -> None:
 
 
 def on_surface_of(regions: Regions, surface: Surface) -> np.ndarray:
-    """(3, M) region of every Gaussian of the surface."""
+    """Return (3, M) region of every Gaussian of the surface."""
     return regions.everywhere[:, surface.rows]
 
 
@@ -297,7 +297,7 @@ def sheet(side: int = 20, spacing: float = 0.1) -> Gaussians:
 
 
 def walked(surface: Surface, seeds: np.ndarray) -> np.ndarray:
-    """(M,) lengths of the shortest ways along links, by Dijkstra's book, in float64."""
+    """Return (M,) lengths of the shortest ways along links, by Dijkstra's book, in float64."""
     lengths = np.where(seeds, 0.0, inf)
     waiting = [(0.0, int(i)) for i in np.flatnonzero(seeds)]
     while waiting:
@@ -387,14 +387,14 @@ def plainly_from_segment(x: float, y: float, start, end) -> float:
 
 
 def from_line(seen: Projected, line) -> np.ndarray:
-    """(N,) distances from the line, pixels, by a loop."""
+    """Return (N,) distances from the line, pixels, by a loop."""
     return np.array(
         [min(plainly_from_segment(x, y, a, b) for a, b in pairwise(line.tolist())) for x, y in seen.pixels]
     )
 
 
 def within(seen: Projected) -> np.ndarray:
-    """(N,) bool: ahead and in the image."""
+    """Return (N,) bool: ahead and in the image."""
     return (seen.depths > 0) & (seen.pixels >= 0).all(1) & (seen.pixels < SIZE).all(1)
 
 
@@ -465,13 +465,13 @@ def balls(sizes: list[int]) -> tuple[Gaussians, Array]:
 
 
 def extents(gaussians: Gaussians) -> Array:
-    """(N,) float64, as documented: opacity times the largest cross-section."""
+    """Return (N,) float64, as documented: opacity times the largest cross-section."""
     scales = np.exp(np.sort(gaussians.log_scales.astype(np.float64), axis=1))
     return sigmoid(gaussians.opacity_logits.astype(np.float64)) * scales[:, 1] * scales[:, 2]
 
 
 def smoothed(surface: Surface, values: Array) -> Array:
-    """(M,) float64: the weighted mean over each neighbourhood."""
+    """Return (M,) float64: the weighted mean over each neighbourhood."""
     weights = surface.weights.astype(np.float64)[surface.neighbours]
     return (weights * values.astype(np.float64)[surface.rows][surface.neighbours]).sum(1) / weights.sum(1)
 

@@ -189,7 +189,7 @@ def test_wrong_shapes_are_named():
 
 
 def label_maps(count: int, width: int = 70, height: int = 45) -> Array:
-    """(3, height, width) int32 labels from -1, none, to `count` - 1."""
+    """Return (3, height, width) int32 labels from -1, none, to `count` - 1."""
     return np.random.default_rng(count).integers(-1, count, (3, height, width)).astype(np.int32)
 
 

@@ -209,7 +209,7 @@ CLOSE = 1e-5  # of unit vectors
 
 
 def by_transformers(folder: Path, phrases: list[str]) -> np.ndarray:
-    """(M, D) float64 unit vectors, one phrase at a time and so without padding."""
+    """Return (M, D) float64 unit vectors, one phrase at a time and so without padding."""
     model = CLIPModel.from_pretrained(folder, dtype=torch.float64).eval()
     tokenizer = CLIPTokenizerFast.from_pretrained(folder)
     with torch.inference_mode():

@@ -309,7 +309,7 @@ def test_boxes_and_stability_are_those_of_whole_masks() -> None:
 
 
 def plain_answer(model: Any, image: np.ndarray, point: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """(3,) scores and (3, H, W) logits of subpart, part and whole at one point, by the whole model."""
+    """Return (3,) scores and (3, H, W) logits of subpart, part and whole at one point, by the whole model."""
     height, width = image.shape[:2]
     pixels, size = sam.normalised(image, SIDE, padded=not isinstance(model, Sam2Model))
     scale = np.array([size[1] / width, size[0] / height])

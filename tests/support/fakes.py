@@ -32,7 +32,7 @@ COUNT = 64
 
 
 def everyday_about(canonical: Array, spread: float = 0.2, seed: int = 8) -> Array:
-    """(64, D) float32 unit vectors around a (D,) canonical phrase: nothing in particular fits them."""
+    """Return (64, D) float32 unit vectors around a (D,) canonical phrase: nothing in particular fits them."""
     noise = np.random.default_rng(seed).normal(scale=spread, size=(COUNT, len(canonical)))
     return unit(canonical + noise).astype(np.float32)
 

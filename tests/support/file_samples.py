@@ -108,7 +108,7 @@ def mixed_ply(g: Gaussians) -> bytes:
 
 
 def _fields(values: Array, bits: tuple[int, ...]) -> Array:
-    """(N, len(bits)) fractions in [0, 1] -> (N,) uint32, the first field on top."""
+    """Map (N, len(bits)) fractions in [0, 1] to (N,) uint32, the first field on top."""
     packed = np.zeros(len(values), np.uint32)
     for column, width in enumerate(bits):
         code = np.floor(values[:, column] * (2**width - 1) + 0.5).astype(np.uint32)
@@ -171,7 +171,7 @@ def _webp(pixels: Array) -> bytes:
 
 
 def _plane(codes: Array, width: int) -> Array:
-    """(N, C) codes -> (H, W, C) with zero pixels at the end."""
+    """Map (N, C) codes to (H, W, C) with zero pixels at the end."""
     height = -(-len(codes) // width)
     out = np.zeros((height * width, codes.shape[1]), np.uint8)
     out[: len(codes)] = codes
@@ -254,7 +254,7 @@ def parts(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def glb_column(content: dict[str, Any], binary: bytes, name: str) -> Array:
-    """(N, k) an attribute of the first primitive, as glTF says it is stored."""
+    """Return (N, k) an attribute of the first primitive, as glTF says it is stored."""
     about = content["accessors"][content["meshes"][0]["primitives"][0]["attributes"][name]]
     view, kind = content["bufferViews"][about["bufferView"]], {5123: "<u2", 5126: "<f4"}
     data = binary[view["byteOffset"] :][: view["byteLength"]]

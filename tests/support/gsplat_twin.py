@@ -86,7 +86,7 @@ def _det(m: Tensor) -> Tensor:
 
 
 def _radii(means2d: Tensor, covariances: Tensor, opacities: Tensor, size: tuple[int, int]) -> Tensor:
-    """(N, 2) int32: how many pixels a Gaussian reaches to both sides; 0 where it is not drawn."""
+    """Return (N, 2) int32: how many pixels a Gaussian reaches to both sides; 0 where it is not drawn."""
     drawn = (_det(covariances) > 0) & (opacities >= ALPHA_MIN)
     reach = (2 * (opacities / ALPHA_MIN).log()).sqrt().clamp(max=WIDEST)
     extents = (reach[:, None] * covariances.diagonal(dim1=1, dim2=2).sqrt()).ceil()
@@ -100,7 +100,7 @@ def _radii(means2d: Tensor, covariances: Tensor, opacities: Tensor, size: tuple[
 def _blend(
     pixels: Tensor, means2d: Tensor, covariances: Tensor, colors: Tensor, opacities: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """(P, 2) pixels, G Gaussians front to back -> (P, C) colours, (P,) alphas."""
+    """Map (P, 2) pixels, G Gaussians front to back to (P, C) colours, (P,) alphas."""
     x, y = (means2d[None] - pixels[:, None]).unbind(2)
     (xx, xy), (_, yy) = (row.unbind(1) for row in covariances.unbind(1))
     conics = torch.stack([yy, -xy, xx]) / _det(covariances)

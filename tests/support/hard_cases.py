@@ -23,7 +23,7 @@ class Drawing:
     values: Array | None = None  # (N, C); random ones if None
 
     def features(self) -> Array:
-        """(N, C) values to splat."""
+        """Return (N, C) values to splat."""
         return random_values(len(self.gaussians), 3) if self.values is None else self.values
 
 

@@ -37,7 +37,7 @@ TEXTURES = [_texture(seed) for seed in range(3)]
 
 
 def photograph(intrinsics: PhotoIntrinsics, world_to_camera: Array) -> Array:
-    """(H, W, 3) uint8: what a camera in the room sees, sampled at pixel centres."""
+    """Return (H, W, 3) uint8: what a camera in the room sees, sampled at pixel centres."""
     y, x = np.mgrid[: intrinsics.height, : intrinsics.width].reshape(2, -1) + 0.5
     xy = np.stack([(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy], -1)
     if intrinsics.distortion is not None:
@@ -72,7 +72,7 @@ def poses(count: int) -> list[Array]:
 
 
 def distance_to_room(points: Array) -> Array:
-    """(N,) distance of points from the nearest of the room's planes."""
+    """Return (N,) distance of points from the nearest of the room's planes."""
     return np.abs(points - (ROOM, ROOM, 0.0)).min(1)
 
 

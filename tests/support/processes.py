@@ -218,7 +218,7 @@ class Tab:
         return found
 
     def image(self, camera: Camera, origin: Array, display: str = "rgb", phrase: str = "") -> Array:
-        """(H, W, 3) uint8 of a camera, which stands `origin` (3,) away from where the page has it."""
+        """Return (H, W, 3) uint8 of a camera, which stands `origin` (3,) away from where the page has it."""
         pose = {"rotation": camera.rotation.ravel().tolist(), "position": (camera.position - origin).tolist()}
         inner = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
         letters = self.run(IMAGE, [pose | inner, display, phrase])

@@ -99,7 +99,7 @@ def without_perspective(camera: Camera, distance: float = 3.0) -> Camera:
 
 
 def covariances(g: Gaussians) -> Array:
-    """(N, 3, 3) in world units, float64."""
+    """Return (N, 3, 3) in world units, float64."""
     axes = rotation_matrices(g.quats_wxyz.astype(float)) * np.exp(g.log_scales.astype(float))[:, None]
     return axes @ axes.transpose(0, 2, 1)
 
@@ -187,7 +187,7 @@ def tree_of_wholes(things: Array) -> Tree:
 
 
 def chain_of_levels(leaves: Array) -> Tree:
-    """(N,) int32 numbers from 0, NO_NODE for none -> a tree of these sets, the same at all levels."""
+    """Map (N,) int32 numbers from 0, NO_NODE for none to a tree of these sets, the same at all levels."""
     count = int(leaves.max(initial=-1)) + 1
     parents = np.concatenate([np.arange(count, 3 * count), np.full(count, -1)]).astype(np.int32)
     levels = np.repeat(np.arange(3, dtype=np.uint8), count)
@@ -225,7 +225,7 @@ def make_views(count: int = 3) -> list[tuple[Camera, ImageFeatures]]:
 
 
 def dense_weights(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """(H, W, N): column i is the splat of the i-th unit vector."""
+    """Return (H, W, N): column i is the splat of the i-th unit vector."""
     return ReferenceRasterizer().view(gaussians, camera).splat(np.eye(len(gaussians)))[0]
 
 
@@ -303,7 +303,7 @@ SHORT = RadianceConfig(  # its own reference, so that nothing is rescaled: 40 st
 
 
 def picture(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> Array:
-    """(H, W, 3) float64 colours on black, by the reference."""
+    """Return (H, W, 3) float64 colours on black, by the reference."""
     values = colours(gaussians.sh, gaussians.means, camera.position)
     return ReferenceRasterizer().view(gaussians, camera, settings).splat(values)[0]
 

@@ -171,7 +171,7 @@ CHANGES = {  # of what is seen, after a search
 
 
 def on_screen(canvas: Canvas) -> list[np.ndarray]:
-    """(H, W, 3) bytes of each pane."""
+    """Return (H, W, 3) bytes of each pane."""
     raw = [(np.frombuffer(texture.read(), np.uint8), texture.size) for texture in canvas.textures]
     return [pixels.reshape(height, width, 4)[::-1, :, :3] for pixels, (width, height) in raw]
 
@@ -187,7 +187,7 @@ STRAYS = 0.06  # of a blob, in a picture: what is nearer to the eye is farther f
 
 
 def blob(word: str) -> np.ndarray:
-    """(360,) bool: the Gaussians of one blob."""
+    """Return (360,) bool: the Gaussians of one blob."""
     return np.repeat([word == other for other in WORDS], PER_BLOB)
 
 

@@ -415,7 +415,7 @@ MEANS = BLOBS.gaussians.means.astype(np.float64)
 
 
 def exact(view: OrbitCamera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 2) pixels in an orthographic picture of the target's scale, and depths from the eye."""
+    """Return (N, 2) pixels in an orthographic picture of the target's scale, and depths from the eye."""
     x, y, z = view.rotation @ (points - view.eye).T
     inner = view.intrinsics.fitted(*FULL)
     pixels = [inner.fx / view.distance * x + inner.cx, inner.fy / view.distance * y + inner.cy]

@@ -200,7 +200,7 @@ class Session:
         self.rest(frames)
 
     def shot(self, name: str) -> np.ndarray:
-        """(H, W, 3) the whole window."""
+        """Return (H, W, 3) the whole window."""
         self.settle()
         self.capture(path := self.folder / f"{name}.png")
         return image(path)
@@ -218,7 +218,7 @@ class Session:
         return float(pixels[0, 0] + area.left), float(pixels[0, 1] + area.top)
 
     def at(self, shot: np.ndarray, point: np.ndarray) -> np.ndarray:
-        """(3,) mean colour of the 5 x 5 pixels around a world point."""
+        """Return (3,) mean colour of the 5 x 5 pixels around a world point."""
         column, row = map(int, self.on_screen(point))
         return shot[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).mean(0)
 
@@ -265,7 +265,7 @@ class Session:
 
 
 def image(path: Path) -> np.ndarray:
-    """(H, W, 3)"""
+    """Return (H, W, 3)"""
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 

@@ -260,7 +260,7 @@ def set_gizmo(viewer: Viewer, kind: Gizmo) -> None:
 
 
 def pivot(viewer: Viewer) -> Array | None:
-    """(3,) middle of what is transformed, world units: the selection, else the scene; None without one."""
+    """Return (3,) middle of what is transformed, world units: selection, else scene; None without one."""
     state = viewer.state
     if state.scene is None or state.extent is None:
         return None

@@ -86,7 +86,7 @@ def filtered(viewer: Viewer, rows: Iterable[Outline], text: str) -> Iterator[Out
 
 
 def hidden_nodes(viewer: Viewer) -> Array:
-    """(K,) bool: nodes of which nothing is shown."""
+    """Return (K,) bool: nodes of which nothing is shown."""
     state, view, marks = viewer.state, viewer.state.outline, viewer.state.marks
     if view is None or view.tree is None:
         return np.zeros(0, bool)

@@ -280,7 +280,7 @@ def ask_export(viewer: Viewer, title: str, only_selected: bool = False) -> None:
 
 
 def exported(viewer: Viewer, form: ExportForm) -> Array:
-    """(N,) bool of what is written."""
+    """Return (N,) bool of what is written."""
     marks = viewer.state.marks
     return marks.selected if form.only_selected else marks.kept
 

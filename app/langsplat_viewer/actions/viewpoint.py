@@ -135,7 +135,7 @@ def go_to_camera(viewer: Viewer, index: int) -> None:
 
 
 def camera_frusta(viewer: Viewer) -> Array:
-    """(C, 8, 2, 3) edges of the pyramids of the training cameras; none without a scene."""
+    """Return (C, 8, 2, 3) edges of the pyramids of the training cameras; none without a scene."""
     scene, extent, kept = viewer.state.scene, viewer.state.extent, viewer.state.frusta
     if scene is None or extent is None:
         return np.zeros((0, 8, 2, 3))

@@ -99,7 +99,7 @@ def depth_share(sample: Sample, eye: Array, forward: Array, share: float) -> flo
 
 
 def _ordered(values: Array, weights: Array) -> tuple[Array, Array]:
-    """(M,) values in rising order and the share of the weight up to each."""
+    """Return (M,) values in rising order and the share of the weight up to each."""
     order = np.argsort(values)
     cumulative = np.cumsum(weights[order])
     return values[order], cumulative / cumulative[-1]
@@ -185,7 +185,7 @@ class OrbitCamera:
 
 
 def _about(axis: Array, angle: float) -> Array:
-    """(3, 3) right-handed rotation by `angle` radians about a unit axis."""
+    """Return (3, 3) right-handed rotation by `angle` radians about a unit axis."""
     return Rotation.from_rotvec(np.asarray(axis) * angle).as_matrix()
 
 

@@ -100,13 +100,13 @@ class Benchmark:
 
 
 def read_grey(path: Path) -> Array:
-    """(H, W) uint8 brightness of an image file; FormatError where it cannot be read."""
+    """Return (H, W) uint8 brightness of an image file; FormatError where it cannot be read."""
     with opened(path) as image:
         return np.asarray(image.convert("L"))
 
 
 def resized(mask: Array, size: Size) -> Array:
-    """(H, W) bool mask on a grid of `size`, by the nearest pixel."""
+    """Return (H, W) bool mask on a grid of `size`, by the nearest pixel."""
     if mask.shape == (size[1], size[0]):
         return mask
     image = Image.fromarray(mask.astype(np.uint8))
@@ -236,7 +236,7 @@ def _corners(stored: list[tuple[float, float]], size: Size, where: str) -> Array
 
 
 def _box(stored: Any, polygon: Array) -> Array:
-    """(4,) the label's box, the polygon's own where there is none."""
+    """Return (4,) the label's box, the polygon's own where there is none."""
     try:
         box = np.array(msgspec.convert(stored, tuple[float, float, float, float]))
     except msgspec.ValidationError:

@@ -140,7 +140,7 @@ class Prediction:
 
 
 def read_maps(maps: Array, rule: MapRule) -> Prediction:
-    """(L, H, W) relevancy per level, L >= 1 -> mask and place."""
+    """Map (L, H, W) relevancy per level, L >= 1 to mask and place."""
     maps = np.asarray(maps, np.float64)
     blended = [
         (1 - rule.raw_share) * mean_filtered(level, rule.window, rule.border) + rule.raw_share * level
@@ -160,7 +160,7 @@ def read_maps(maps: Array, rule: MapRule) -> Prediction:
 
 
 def peak_pixels(maps: Array, rule: MapRule) -> Array:
-    """(P, 2) column and row of the highest pixels over all filtered maps; one, or all of a level's ties."""
+    """Return (P, 2) column and row of the highest pixels over all maps; one, or a level's ties."""
     smooth = [mean_filtered(level, rule.peak_window, rule.border) for level in maps]
     best = smooth[int(np.argmax([values.max() for values in smooth]))]
     pixels = np.argwhere(best == best.max())[:, ::-1]
@@ -168,7 +168,7 @@ def peak_pixels(maps: Array, rule: MapRule) -> Array:
 
 
 def mean_filtered(values: Array, window: int, border: Border) -> Array:
-    """(H, W) means over `window`^2 pixels; an even one reaches further up and left, as cv2's does."""
+    """Return (H, W) means over `window`^2 pixels; an even one reaches further up and left, as cv2's does."""
     if window <= 1:
         return values
     if border == "mirror":
@@ -178,7 +178,7 @@ def mean_filtered(values: Array, window: int, border: Border) -> Array:
 
 
 def voted(mask: Array, vote: Vote, window: int) -> Array:
-    """(H, W) bool majority of `window`^2 pixels, ties False; "clipped": last row and column never count."""
+    """Return (H, W) bool majority of `window`^2 pixels, ties False; "clipped": no last row and column."""
     if vote == "none" or window <= 1:
         return mask
     counted = np.ones(mask.shape)
@@ -217,7 +217,7 @@ def own_prediction(view: View, result: QueryResult, rule: OwnRule) -> Prediction
 
 
 def _read_relevancy(path: Path) -> Array:
-    """(L, H, W) float64 maps in a file; FormatError for a damaged one."""
+    """Return (L, H, W) float64 maps in a file; FormatError for a damaged one."""
     values = read_npy(path) if path.suffix == ".npy" else _image(path)
     values = values[None] if values.ndim == 2 else values
     if values.ndim != 3 or 0 in values.shape or len(values) > len(LEVELS):
@@ -228,7 +228,7 @@ def _read_relevancy(path: Path) -> Array:
 
 
 def _image(path: Path) -> Array:
-    """(H, W) relevancy in [0, 1] of an image file."""
+    """Return (H, W) relevancy in [0, 1] of an image file."""
     with opened(path) as image:
         if image.mode.startswith("I"):
             return np.asarray(image, np.float64) / 65535

@@ -272,7 +272,7 @@ def _language(elements: tuple[Any, ...], count: int, path: Path, tell: Tell) -> 
 
 
 def _wide(array: Array | None, count: int) -> Array | None:
-    """(N, D), (N, 1, D) or (N, D, 1) floats as (N, D) where D > 1; None for anything else."""
+    """Return (N, D), (N, 1, D) or (N, D, 1) floats as (N, D) where D > 1; None for anything else."""
     if array is None or array.dtype.kind != "f" or array.ndim not in (2, 3) or len(array) != count:
         return None
     flat = array.reshape(count, -1) if 1 in array.shape[1:] or array.ndim == 2 else array
@@ -341,7 +341,7 @@ def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:
 
 
 def partners(means: Array, carrier: Carrier, may_lack: bool) -> Array | None:
-    """(N,) row of the `carrier`'s Gaussian at each of (N, 3) `means`, -1 where it has none.
+    """Return (N,) row of the `carrier`'s Gaussian at each of (N, 3) `means`, -1 where it has none.
 
     None where they are the same Gaussians. Raises FormatError where they are not of one scene.
 
@@ -360,7 +360,7 @@ def partners(means: Array, carrier: Carrier, may_lack: bool) -> Array | None:
 
 
 def _row_of(means: Array, theirs: Array, count: int, carrier: Carrier) -> Array:
-    """(N,) row of `theirs` at the same position, -1 for none; of several the k-th goes with the k-th.
+    """Return (N,) row of `theirs` at the same position, -1 for none; of several the k-th goes with the k-th.
 
     FormatError where too few of `count` have one.
     """
@@ -379,7 +379,7 @@ def _row_of(means: Array, theirs: Array, count: int, carrier: Carrier) -> Array:
 
 
 def _ranked(places: Array) -> Array:
-    """(N,) whole numbers -> (N,) numbers of them and of their rank among equals."""
+    """Map (N,) whole numbers to (N,) numbers of them and of their rank among equals."""
     order = np.argsort(places, kind="stable")
     ordered = places[order]
     rank = np.empty(len(places), np.int64)

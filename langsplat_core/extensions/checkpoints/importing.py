@@ -281,7 +281,7 @@ def _codec(
 
 
 def _samples(foreign: ForeignScene, seed: int) -> tuple[Array, Array]:
-    """(M, D) float32 unit vectors of Gaussians of all levels to fit a codec to, and others to judge it."""
+    """Return (M, D) float32 unit vectors of all levels to fit a codec to, and others to judge it."""
     order = np.random.default_rng(seed).permutation(len(foreign.scene.gaussians))
     judges = min(JUDGED, len(order) // 6)
     samples = []
@@ -310,7 +310,7 @@ def _unit_rows(foreign: ForeignScene, level: int, rows: Array) -> tuple[Array, A
 
 
 def _latents(foreign: ForeignScene, codec: Codec, progress: Progress) -> tuple[Array, Array]:
-    """(3, N, d) of the codec's type, and (3, N) float32: 1 where a Gaussian has a meaning."""
+    """Return (3, N, d) of the codec's type, and (3, N) float32: 1 where a Gaussian has a meaning."""
     count = len(foreign.scene.gaussians)
     latents = np.zeros((len(LEVELS), count, codec.latent_dim), codec.dtype)
     confidence = np.zeros((len(LEVELS), count), np.float32)

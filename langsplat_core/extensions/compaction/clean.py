@@ -92,7 +92,7 @@ def find_floaters(
 
 
 def _gaps(gaussians: Gaussians, surface: Surface) -> Array:
-    """(M, k) distance of each Gaussian of the surface to its neighbours, over both extents along it."""
+    """Return (M, k) distance of each Gaussian of the surface to its neighbours, over both extents."""
     count, width = surface.neighbours.shape
     first, second = np.repeat(np.arange(count), width), surface.neighbours.ravel()
     apart = surface.positions[second] - surface.positions[first]

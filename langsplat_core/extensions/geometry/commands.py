@@ -336,7 +336,7 @@ def write_voxels(
 
 
 def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array) -> Array:
-    """(V,) the whole of the Gaussian nearest to each voxel, NO_NODE far from any."""
+    """Return (V,) the whole of the Gaussian nearest to each voxel, NO_NODE far from any."""
     from scipy.spatial import cKDTree
 
     whole = engine.tree.at(LEVELS.index("whole"))

@@ -66,7 +66,7 @@ class Mesh:
         return int(np.count_nonzero(volumes < 0))
 
     def areas(self) -> Array:
-        """(T,) areas of the triangles, square world units."""
+        """Return (T,) areas of the triangles, square world units."""
         a, b, c = (self.vertices[self.triangles[:, corner]] for corner in range(3))
         return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
@@ -189,7 +189,7 @@ def _pieces(edges: Array, count: int) -> Array:
 
 
 def _distinct(rows: Array) -> tuple[Array, Array]:
-    """(N, k) integers >= 0 -> one row of each kind, in rising order, and (N,) the kind of each row."""
+    """Map (N, k) integers >= 0 to one row of each kind, in rising order, and (N,) the kind of each row."""
     kind = first = np.zeros(len(rows), np.int64)
     for column in rows.T:  # as single numbers: np.unique along an axis is twenty times slower
         keys = kind * (column.max(initial=0) + 1) + column
@@ -198,7 +198,7 @@ def _distinct(rows: Array) -> tuple[Array, Array]:
 
 
 def _rims(triangles: Array) -> tuple[Array, Array]:
-    """(R, 2) directed edges that no triangle runs back, and (R,) the number of their loop."""
+    """Return (R, 2) directed edges that no triangle runs back, and (R,) the number of their loop."""
     sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     edges, which = _distinct(np.sort(sides, axis=1))
     net = np.bincount(which, np.where(sides[:, 0] < sides[:, 1], 1, -1)).astype(int)

@@ -42,16 +42,16 @@ class Occupancy:
 
     @property
     def occupied(self) -> Array:
-        """(X, Y, Z) bool, the voxels in which enough of the rays end."""
+        """The (X, Y, Z) bool, the voxels in which enough of the rays end."""
         return np.asarray((self.hits > 0) & (self.hits >= HIT * (self.hits + self.passes.astype(np.float64))))
 
     @property
     def seen(self) -> Array:
-        """(X, Y, Z) bool, the voxels that some ray reaches."""
+        """The (X, Y, Z) bool, the voxels that some ray reaches."""
         return np.asarray((self.hits > 0) | (self.passes > 0))
 
     def metres(self, points: Array) -> Array:
-        """(P, 3) points of the scene -> (P, 3) in the axes of the map."""
+        """Map (P, 3) points of the scene to (P, 3) in the axes of the map."""
         return _moved(points, self.to_map)
 
 
@@ -65,7 +65,7 @@ class FloorMap:
     free: Array  # (X, Y) bool: seen there, and nothing stands
 
     def centres(self, cells: Array) -> Array:
-        """(P, 2) cells -> (P, 2) their middles, metres."""
+        """Map (P, 2) cells to (P, 2) their middles, metres."""
         return np.asarray(self.origin + (cells + 0.5) * self.resolution)
 
 

@@ -45,7 +45,7 @@ def sample_surface(gaussians: Gaussians, count: int, seed: int = 0) -> tuple[Arr
 
 
 def cloud(points: Array, normals: Array | None = None) -> "PointCloud":
-    """(P, 3) points, with (P, 3) normals where there are such, as Open3D has them."""
+    """Return (P, 3) points, with (P, 3) normals where there are such, as Open3D has them."""
     import open3d
 
     made = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))

@@ -97,7 +97,7 @@ def quarter_turns(scene: Scene) -> list[Array]:
 def _aligned(
     moving: Array, fixed: Array, turns: list[Array], radius: float, scaled: bool, seed: int
 ) -> tuple[Array, float]:
-    """(4, 4) that lays points (P, 3) onto others, and their error; turns: (4, 4) each, tried after RANSAC."""
+    """Return the (4, 4) that lays points (P, 3) onto others, and its error; turns: tried after RANSAC."""
     import open3d
 
     methods = open3d.pipelines.registration

@@ -88,7 +88,7 @@ class _Piece:
 
     @cached_property
     def box(self) -> Array:
-        """(2, 3) corners."""
+        """The (2, 3) corners."""
         return axis_aligned_box(self.points)
 
 
@@ -140,7 +140,7 @@ _CHANNELS = 10
 def _evidence(
     first: Scene, second: Scene, into: Array, rasterizer: LiftingRasterizer, progress: Progress
 ) -> tuple[Array, Array]:
-    """(N, `_CHANNELS`) float64 of the Gaussians of both scenes."""
+    """Return (N, `_CHANNELS`) float64 of the Gaussians of both scenes."""
     there = similarity(into)
     back = there.inverse()
     own, others = (some_cameras(scene.cameras, VIEWS, SIDE) for scene in (first, second))
@@ -182,7 +182,7 @@ def _evidence(
 
 
 def to_lab(colours: Array) -> Array:
-    """(..., 3) sRGB in [0, 1] -> CIE L*a*b* of D65."""
+    """Map (..., 3) sRGB in [0, 1] to CIE L*a*b* of D65."""
     mixed = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
     x, y, z = np.moveaxis(linear_light(colours) @ mixed.T / (0.9505, 1.0, 1.089), -1, 0)
     x, y, z = (np.where(v > 216 / 24389, np.cbrt(v), (24389 / 27 * v + 16) / 116) for v in (x, y, z))
@@ -251,7 +251,7 @@ def _has_changed(size: int, sums: Array, images: float) -> bool:
 
 
 def _codewords_seen(engine: QueryEngine) -> tuple[Array, Array, Array]:
-    """(U, D) codewords less their mean, (N,) numbers at level whole, -1 for none, and (N,) areas."""
+    """Return (U, D) codewords less their mean, (N,) numbers at level whole, -1 for none, and (N,) areas."""
     field, level = engine.field, len(LEVELS) - 1
     number, areas = np.full(len(field), -1), surface_areas(engine.scene.gaussians)
     known = field.known[level]

@@ -77,7 +77,7 @@ def backward(
     partial: Array,
     reached: Array,
 ) -> None:
-    """(M, C) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha.
+    """Return (M, C) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha.
 
     Fills (I,) bool `reached`, and (I, 8 + padded(C)) partial sums where that is True. float32, for tiles
     [first, last).

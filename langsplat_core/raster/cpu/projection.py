@@ -420,7 +420,7 @@ def _backward(
 
 
 def colours(sh: Array, means: Array, camera_position: Array, rows: Array | None = None) -> Array:
-    """(N, K, 3) float32 coefficients, (N, 3) float32 means -> (N, 3) float32 display colours >= 0.
+    """Map (N, K, 3) float32 coefficients, (N, 3) float32 means to (N, 3) float32 display colours >= 0.
 
     With `rows`, (M,) int32, those of these Gaussians.
 

@@ -45,7 +45,7 @@ def _add_values(work: Any, x: Array, s: int, row: int, low: int, weight: Lanes, 
 
 @kernel
 def splat_tiles(first: int, last: int, tiles: Tiles, values: Array, image: Array, alpha: Array) -> None:
-    """(M, C) values in depth order -> fills (H, W, C) image and (H, W, 1) alpha, all float32."""
+    """Map (M, C) values in depth order to fills (H, W, C) image and (H, W, 1) alpha, all float32."""
     sums = np.empty(PIXELS * tiling.padded_inside(image.shape[2]), np.float32)
     for i in range(first, last):
         tile = tiling.tile_at(i, tiles)
@@ -71,7 +71,7 @@ def _correlate(work: Any, mine: Any, s: int, low: int, high: int) -> None:
 
 @kernel
 def gather_tiles(first: int, last: int, tiles: Tiles, image: Array, partial: Array) -> None:
-    """(H, W, C) float32 image -> fills (I, padded(C)) partial sums of ``W^T y``, a row per intersection."""
+    """Fill (I, padded(C)) partial sums of ``W^T y``, a row per intersection; image: (H, W, C) float32."""
     planes, weights = np.empty(PIXELS * partial.shape[1], np.float32), np.empty(PIXELS, np.float32)
     for i in range(first, last):
         tile = tiling.tile_at(i, tiles)
@@ -111,7 +111,7 @@ def _note_half(work: Any, depth: Any, s: int, row: int, low: int, weight: Lanes,
 
 @kernel
 def median_tiles(first: int, last: int, tiles: Tiles, depths: Array, out: Array) -> None:
-    """(M,) depths in depth order -> (H, W, 1) depth of the Gaussian that takes T to 0.5 or below, else 0."""
+    """Fill (H, W, 1) with the one of (M,) sorted depths that takes T to 0.5 or below, else 0."""
     found = np.empty(PIXELS, np.float32)
     for i in range(first, last):
         tile = tiling.tile_at(i, tiles)
@@ -181,7 +181,7 @@ def _fill_planes(planes: Array, maps: Array, tile: int, tiles: Tiles, labels: Ar
 def _gather_regions(
     first: int, last: int, tiles: Tiles, maps: Array, labels: Array, lines: Array, offsets: Array, sums: Array
 ) -> None:
-    """(L, H, W) int32 maps -> tile t has lines[t] `sums` for each intersection, from offsets[t] on."""
+    """Map (L, H, W) int32 maps to tile t has lines[t] `sums` for each intersection, from offsets[t] on."""
     planes, weights = np.empty(PIXELS * lines.max(), np.float32), np.empty(PIXELS, np.float32)
     for i in range(first, last):
         tile = tiling.tile_at(i, tiles)
@@ -198,7 +198,7 @@ def _gather_regions(
 def label_weights(
     tiles: Tiles, order: Array, workers: Workers, maps: Array, shape: tuple[int, int], least: float
 ) -> sparse.csr_matrix:
-    """(L, H, W) int32 maps, labels -1 for none -> float32 weights, pixels, of `shape` (N, labels).
+    """Map (L, H, W) int32 maps, labels -1 for none to float32 weights, pixels, of `shape` (N, labels).
 
     `order`: (M,) rows of the drawn Gaussians. Entries of at most `least` are left out.
     """
@@ -367,7 +367,7 @@ class CpuView(LiftingView):
         return self._at_half(self._depths[self.order])
 
     def median_rows(self) -> Array:
-        """(H, W) int64 the Gaussian at which the transmittance falls to 0.5 or below, -1 where it never does.
+        """Return (H, W) int64 Gaussian at which the transmittance falls to 0.5 or below, -1 where never.
 
         Of more than 2^24 that are drawn it may be the next in depth.
         """
@@ -375,7 +375,7 @@ class CpuView(LiftingView):
         return np.append(self.order, -1)[place - 1]
 
     def _at_half(self, values: Array) -> Array:
-        """(H, W) the one of (M,) numbers above 0, in depth order, that belongs to that Gaussian, else 0."""
+        """Return (H, W) that one of (M,) numbers > 0, in depth order, that is of that Gaussian, else 0."""
         found = np.empty((self.camera.height, self.camera.width, 1), np.float32)
         self._over_tiles(median_tiles, values, found)
         return found[..., 0]

@@ -83,7 +83,7 @@ def _digit_of(key: Any, digit: int) -> Any:
 
 @kernel
 def _sort_depths(keys: Array, depths: Array, order: Array) -> bool:
-    """(2, M) uint32 keys and int32 rows, first those of rising rows -> order[1]: by depth, ties by row.
+    """Map (2, M) uint32 keys and int32 rows, first those of rising rows to order[1]: by depth, ties by row.
 
     False where it gave up, as very many depths are nearly equal. Sorted by key (radix, least significant
     digit first, each pass stable); then neighbours of one key that are in the wrong order change places.
@@ -118,7 +118,7 @@ def _sort_depths(keys: Array, depths: Array, order: Array) -> bool:
 
 
 def depth_order(depths: Array, rows: Array) -> Array:
-    """(N,) positive float64 depths, (M,) int32 rising rows -> the rows by depth, ties by row."""
+    """Map (N,) positive float64 depths, (M,) int32 rising rows to the rows by depth, ties by row."""
     keys, order = np.empty((2, len(rows)), np.uint32), np.empty((2, len(rows)), np.int32)
     with np.errstate(over="ignore"):  # infinity is the largest key
         keys[0] = depths[rows].astype(np.float32).view(np.uint32)  # positive floats order as their bits do
@@ -237,7 +237,7 @@ def bin_tiles(
     workers: Workers,
     empty: Callable[[tuple[int, ...], Any], Array],
 ) -> Tiles:
-    """(N, 8) footprints, (M,) the drawn ones in depth order -> the tiles of an image of `size`.
+    """Map (N, 8) footprints, (M,) the drawn ones in depth order to the tiles of an image of `size`.
 
     `empty` makes arrays as `numpy.empty` does.
     """

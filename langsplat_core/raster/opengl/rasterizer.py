@@ -183,7 +183,7 @@ class SceneTextures:
         return texture
 
     def upload(self, values: Array) -> moderngl.Texture:
-        """(N, C <= 3) values, a row a Gaussian -> a texture that a splat draws; the caller releases it."""
+        """Return (N, C <= 3) values, a row a Gaussian, as a texture to draw; the caller releases it."""
         padded = np.zeros((self.size[0] * self.size[1], 4), np.float32)
         padded[: len(self.rows), : values.shape[1]] = values[self.rows]
         return self._ctx.texture(self.size, 4, padded, dtype="f4")

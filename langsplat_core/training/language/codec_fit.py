@@ -31,7 +31,7 @@ class Vocabulary:
     scale: Scale
 
     def relevancy(self, vectors: Array) -> Array:
-        """(M, D) unit vectors -> (M, Q) in [0, 1]."""
+        """Map (M, D) unit vectors to (M, Q) in [0, 1]."""
         zero, rate = self.scale.of(vectors @ self.scale.texts.T)
         return relevancy_of(vectors @ self.phrases.T, zero[:, None], rate[:, None])
 
@@ -253,7 +253,7 @@ def nearest_centres(vectors: Array, centres: Array) -> tuple[Array, Array]:
 
 
 def _assigned(vectors: Array, centres: Array, gains: bool = False) -> tuple[Array, Array, Array]:
-    """(M,) nearest centre of each vector, its cosine, and, where asked, by how much the next is further."""
+    """Return (M,) nearest centre of each vector, its cosine, and, if asked, how much further the next is."""
     nearest, cosines = np.empty(len(vectors), np.int64), np.empty(len(vectors), np.float32)
     gain = np.zeros(len(vectors), np.float32)
     for start in range(0, len(vectors), CHUNK):
@@ -296,7 +296,7 @@ def spherical_kmeans(
 
 
 def _worth_keeping(vectors: Array, centres: Array, size: int) -> tuple[Array, Array]:
-    """(M,) nearest centre of each vector, and (K,) bool: all that serve some, without those missed least.
+    """Return (M,) nearest centre of each vector, and (K,) bool: those that serve some and are missed.
 
     Where there are more than `size`. Only one in `STEP` goes at a time, because of two that are alike neither
     is missed.
@@ -332,7 +332,7 @@ def _badly_fitted(distance: Array, count: int, generator: np.random.Generator) -
 
 
 def _means(vectors: Array, nearest: Array, count: int) -> Array:
-    """(K, D) float32 directions of the sums over each centre's vectors."""
+    """Return (K, D) float32 directions of the sums over each centre's vectors."""
     places = nearest, np.arange(len(vectors))
     return unit(csr_matrix((np.ones(len(vectors), np.float32), places), (count, len(vectors))) @ vectors)
 

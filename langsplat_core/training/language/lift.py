@@ -198,7 +198,7 @@ def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> 
 
 
 def _overlapping(claims: sparse.csr_matrix, view_of: Array) -> sparse.csr_matrix:
-    """(M, M) links between masks of different views whose overlap over union, where both see, is large."""
+    """Return (M, M) links between masks of different views whose overlap over union is large."""
     count, views = len(view_of), int(view_of.max(initial=-1)) + 1
     both = (claims.T @ claims).tocoo()
     a, b = both.row, both.col
@@ -240,7 +240,7 @@ def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) ->
 
 
 def _descendants(tree: Tree) -> sparse.csr_matrix:
-    """(K, K) float32, 1 where the column's node is the row's or a descendant of it."""
+    """Return (K, K) float32, 1 where the column's node is the row's or a descendant of it."""
     rows, columns = [np.arange(tree.count)], [np.arange(tree.count)]
     while len(rows[-1]):
         above = tree.parents[rows[-1]]

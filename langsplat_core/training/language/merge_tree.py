@@ -62,7 +62,7 @@ class MergeTree:
 
     @cached_property
     def highest(self) -> Array:
-        """(P + K,) float64 the most that stood between what a node is made of; 0 of a patch."""
+        """The (P + K,) float64 the most that stood between what a node is made of; 0 of a patch."""
         highest = np.zeros(self.count + len(self.children))
         for node, (children, own) in enumerate(zip(self.children, self.costs, strict=True), self.count):
             highest[node] = max(own, *highest[children])
@@ -200,7 +200,7 @@ def link_concavity(surface: Surface, eyes: Array) -> Array:
 
 
 def _normals(surface: Surface) -> Array:
-    """(M, 3) unit normals of the planes through the neighbourhoods, of either sign."""
+    """Return (M, 3) unit normals of the planes through the neighbourhoods, of either sign."""
     normals = np.empty((len(surface.rows), 3))
     for start in range(0, len(normals), 65_536):
         near = surface.neighbours[start : start + 65_536]
@@ -363,7 +363,7 @@ def draw_patches(
 
 
 def _boxes(footprints: Footprints, camera: Camera, patches: Array, count: int) -> Array:
-    """(P, 4) left, top, right, bottom cell of what each patch may paint, the last two exclusive."""
+    """Return (P, 4) left, top, right, bottom cell of what each patch may paint, the last two exclusive."""
     drawn = np.flatnonzero((patches >= 0) & (footprints.opacities > 0))
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     np.minimum.at(low, patches[drawn], footprints.means_px[drawn] - footprints.extents_px[drawn] - 1)
@@ -374,7 +374,7 @@ def _boxes(footprints: Footprints, camera: Camera, patches: Array, count: int) -
 
 
 def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
-    """(P,) channel of each patch or -1, the largest box first, and (C, rows, columns) patches of cells."""
+    """Return (P,) channel of each patch or -1, the largest box first, and (C, rows, columns) owners."""
     channel_of = np.full(len(boxes), -1)
     owners: list[Array] = []
     rows, columns = (int(boxes[:, side].max(initial=0)) for side in (3, 2))

@@ -46,7 +46,7 @@ class DifferentiableRenderer(Protocol):
 
 
 def _coefficients(parameters: dict[str, Tensor], sh_degree: int) -> Tensor:
-    """(N, (degree + 1)^2, 3) coefficients in use, without a copy when degree 0 is all there is."""
+    """Return (N, (degree + 1)^2, 3) coefficients in use, without a copy when degree 0 is all there is."""
     if sh_degree == 0:
         return parameters["sh_dc"]
     return torch.cat([parameters["sh_dc"], parameters["sh_rest"][:, : (sh_degree + 1) ** 2 - 1]], dim=1)

@@ -82,7 +82,7 @@ def _usable_points(points: Array, rgb: Array, cameras: Sequence[Camera]) -> tupl
 
 
 def _neighbour_distance(points: Array) -> Array:
-    """(N,) root mean square distance to the three nearest other points, world units, > 0."""
+    """Return (N,) root mean square distance to the three nearest other points, world units, > 0."""
     if len(points) < 2:
         return np.ones(len(points))
     distances, _ = cKDTree(points).query(points, k=min(4, len(points)))

@@ -274,7 +274,7 @@ def _choose_planes(first: int, last: int, scores: Array, at: Array, score: Array
 
 
 def _confirmed(one: DepthMap, others: Sequence[DepthMap]) -> Array:
-    """(H, W) depths of the map, NaN where their score is low or no other map confirms them."""
+    """Return (H, W) depths of the map, NaN where their score is low or no other map confirms them."""
     depth = np.where(one.score > 0.6, one.depth, np.nan)
     points, _ = replace(one, depth=depth).points()
     kept = np.zeros(len(points), bool)

@@ -323,7 +323,7 @@ class _Run:
         return {"psnr": float(np.mean(scores))}
 
     def find_exposures(self, state: TrainingState) -> Tensor:
-        """(V, 4, 3) exposures of the training views; none where they explain too little."""
+        """Return (V, 4, 3) exposures of the training views; none where they explain too little."""
         pairs: list[tuple[Tensor, Tensor]] = []
         for index in range(len(self.views)):
             camera, target, mask = self.views.at(index, coarse=True)
@@ -356,7 +356,7 @@ class _Run:
             state.transients.observe(index, cameras, rendered, losses.patch_means(target), depths)
 
     def counted(self, state: TrainingState, index: int, mask: Tensor | None, camera: Camera) -> Tensor | None:
-        """(H, W) bool pixels of view `index` that count, of those of its `mask`; None: all of them."""
+        """Return (H, W) bool pixels of view `index` that count, of those of its `mask`; None: all of them."""
         moving = state.transients.moving
         if not len(moving) or state.step < self.schedule.transients_from or not moving[index].any():
             return mask

@@ -405,7 +405,7 @@ def test_boxes_have_their_borders_inside():
 
 
 def seen(index: int, camera) -> np.ndarray:
-    """(H, W) where a blob is what one mostly sees."""
+    """Return (H, W) where a blob is what one mostly sees."""
     scene = blob_scene()
     member = np.zeros((3 * PER_BLOB, 1), np.float32)
     member[index * PER_BLOB : (index + 1) * PER_BLOB] = 1

@@ -111,7 +111,7 @@ def cameras() -> list[Camera]:
 
 
 def wall(camera: Camera) -> Array:
-    """(GRID, GRID) depths of the wall."""
+    """Return (GRID, GRID) depths of the wall."""
     patches = camera.resized(GRID, GRID)
     ray = patches.unproject(patches.pixel_centres(), np.ones((GRID, GRID))) - camera.position
     return -camera.position[2] / ray[..., 2]
@@ -226,7 +226,7 @@ def row_of_cameras() -> list[Camera]:
 
 
 def true_depth(camera: Camera) -> Array:
-    """(H, W) depth of the surface."""
+    """Return (H, W) depth of the surface."""
     ray = camera.unproject(camera.pixel_centres(), np.ones((camera.height, camera.width))) - camera.position
     return (TILT * camera.position[0] - camera.position[2]) / (ray[..., 2] - TILT * ray[..., 0])
 
