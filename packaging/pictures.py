@@ -209,7 +209,7 @@ def _trained(ctx: Any, window: Window) -> None:
     opening.start_training(viewer)
     process = viewer.training
     assert process is not None
-    while process.exit_code is None and len(process.progress.losses) < 120:
+    while process.exit_code is None and len(process.progress.curves.get("psnr", [])) < 8:
         looks = disk.is_preview(viewer.state.path) or viewer.state.opening is not None
         if not looks and viewer.worker.current is None and disk.newest(process.out):
             opening.look_at_training(viewer)
