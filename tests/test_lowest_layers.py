@@ -78,7 +78,7 @@ def test_progress_as_lines_for_other_programs(capsys):
     reports = [Report.from_json(line) for line in capsys.readouterr().err.splitlines()]
     assert reports == [Report("a\n", 0.25, "one", {"loss": 0.25}), Report("b", 1.0)]
     assert reports[0].text == "a\n: one, loss 0.2500"
-    assert Report("a", 0.5, "b", {"psnr": 20.06}).text == "a: b, PSNR 20.1 dB"
+    assert Report("a", 0.5, "b", {"psnr": 20.06}).text == "a: b, held-out PSNR 20.1 dB"
     for line in ("words", '{"stage": 3}', '"text"', "[1]", '{"stage": "a", "fraction": 0, "metrics": 1}'):
         with pytest.raises(ValueError):
             Report.from_json(line)
