@@ -66,7 +66,7 @@ BOOK_KINDS = ("colour", "material", "object", "colour+object", "material+object"
 
 @dataclass(frozen=True, eq=False)
 class PhraseBook:
-    """All phrases of a training run and how each fits each distinct label."""
+    """Table of all phrases of a training run, and how each fits each distinct label."""
 
     phrases: tuple[str, ...]  # P; the four canonical phrases come first
     kinds: tuple[str, ...]  # (P) "canonical", one of BOOK_KINDS
@@ -136,7 +136,7 @@ def _row(label: RegionLabel, column: dict[str, int]) -> Array:
 
 
 def word_list(book: PhraseBook) -> list[str]:
-    """All words of the phrases, and the function words, in alphabetical order."""
+    """Return all words of the phrases, and the function words, in alphabetical order."""
     return sorted({word for phrase in book.phrases for word in phrase.split()} | set(FUNCTION_WORDS))
 
 

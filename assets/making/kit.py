@@ -474,7 +474,7 @@ class Kit:
         return self.paint(word, "plain", 0.95, 8, substance="glass")
 
     def cloth(self, word: str) -> Material:
-        """Woven and dull."""
+        """Return a woven and dull material."""
         return self.paint(word, "cloth", 0.02)
 
     def steel(self, word: str) -> Material:
