@@ -166,7 +166,7 @@ def _score_planes(
     """
     _, height, width = own.shape
     warped, second = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-    along, sums = np.empty((3, height, width), np.float32), np.empty((3, width), np.float32)
+    along = np.zeros((3, height + 2 * RADIUS, width), np.float32)  # nothing above and below the image
     places, ways = np.empty(width, np.int32), np.empty((2, width), np.float32)
     padded = np.zeros((3, width + 2 * RADIUS), np.float32)
     for plane in range(first, last):
@@ -180,20 +180,16 @@ def _score_planes(
             for row in range(height):
                 p = corner + (row + 0.5) * down
                 _warp_row(other, p.astype(np.float32), step.astype(np.float32), places, ways, warped[row])
-                _sum_along(own[0, row], warped[row], padded, along[:, row])
+                _sum_along(own[0, row], warped[row], padded, along, row)
             for row in range(height):
-                sums[:] = 0
-                for r in range(max(row - RADIUS, 0), min(row + RADIUS + 1, height)):
-                    for m in range(3):
-                        _add(sums[m], along[m, r])
-                _keep_best(own[1:, row], sums, warped[row], best[row], second[row])
+                _keep_best(own, along, row, warped[row], best[row], second[row])
         if len(sizes) > 1:
             best += second
             best *= np.float32(1 / BEST)
 
 
 @helper
-def _sum_along(grey: Array, warped: Array, padded: Array, along: Array) -> None:
+def _sum_along(grey: Array, warped: Array, padded: Array, along: Array, row: int) -> None:
     """Sum y, y^2 and x y along windows of a row; `padded` (3, W + 2 RADIUS) has zeros at both ends."""
     width = grey.shape[0]
     middle = slice(RADIUS, RADIUS + width)
@@ -203,15 +199,11 @@ def _sum_along(grey: Array, warped: Array, padded: Array, along: Array) -> None:
         squares[i] = warped[i] * warped[i]
         products[i] = grey[i] * warped[i]
     for m in range(3):
-        along[m] = 0
-        for offset in range(2 * RADIUS + 1):
-            _add(along[m], padded[m, offset : offset + width])
-
-
-@helper
-def _add(total: Array, values: Array) -> None:
-    for i in range(total.shape[0]):
-        total[i] += values[i]
+        for i in range(width):
+            total = padded[m, i]
+            for offset in range(1, 2 * RADIUS + 1):
+                total += padded[m, i + offset]
+            along[m, row + RADIUS, i] = total
 
 
 @helper
@@ -244,14 +236,20 @@ def _warp_row(other: Array, p: Array, d: Array, places: Array, ways: Array, warp
 
 
 @helper
-def _keep_best(own: Array, sums: Array, warped: Array, best: Array, second: Array) -> None:
+def _keep_best(own: Array, along: Array, row: int, warped: Array, best: Array, second: Array) -> None:
     """Zero-mean normalised cross-correlation of a row's windows; what is flat correlates with nothing."""
     flat, none = np.float32(1e-5), np.float32(0)  # added to variances, of grey values in [0, 1]
     for x in range(best.shape[0]):
-        mean = sums[0, x] * own[2, x]
-        spread = sums[1, x] * own[2, x] - mean * mean
+        total, squares, products = along[0, row, x], along[1, row, x], along[2, row, x]
+        for r in range(row + 1, row + 2 * RADIUS + 1):
+            total += along[0, r, x]
+            squares += along[1, r, x]
+            products += along[2, r, x]
+        share = own[3, row, x]
+        mean = total * share
+        spread = squares * share - mean * mean
         spread = (spread if spread > none else none) + flat
-        score = (sums[2, x] * own[2, x] - own[0, x] * mean) / np.sqrt((own[1, x] + flat) * spread)
+        score = (products * share - own[1, row, x] * mean) / np.sqrt((own[2, row, x] + flat) * spread)
         score = score if warped[x] >= none else np.float32(-1)
         worse = score if score < best[x] else best[x]
         best[x] = score if score > best[x] else best[x]
