@@ -1,5 +1,6 @@
 """The window. This alone and the panels use hello_imgui and glfw; the rest is in actions."""
 
+import math
 import os
 import signal
 import sys
@@ -49,7 +50,10 @@ def probe_gl() -> tuple[int, int]:
             raise BackendError(f"the display cannot be reached; {hint}")
         for major, minor in GL_VERSIONS:
             glfw.window_hint(glfw.VISIBLE, False)
-            _gl_hints(major, minor)
+            glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
+            glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
+            glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
+            glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
             window = glfw.create_window(16, 16, "probe", None, None)
             glfw.default_window_hints()
             if window:
@@ -58,19 +62,12 @@ def probe_gl() -> tuple[int, int]:
     raise BackendError(f"the display offers no OpenGL 3.3; update the graphics driver, or {hint}")
 
 
-def _fitting_scale() -> float:
-    """Size of letters for the first screen: at a height of 1080 window units that of the design."""
+def _fitting_scale(window_height: float) -> float:
+    """Size of letters for the first screen and the window, by their heights in window units."""
     monitor = glfw.get_primary_monitor()
     mode = glfw.get_video_mode(monitor) if monitor else None
     height = mode.size.height / max(glfw.get_monitor_content_scale(monitor)[1], 1.0) if mode else 0.0
-    return min(max(round(4 * height / 1080) / 4, 1.0), SCALES[1])
-
-
-def _gl_hints(major: int, minor: int) -> None:
-    glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
-    glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
-    glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
-    glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
+    return min(max(round(4 * min(height / 1080, window_height / 600)) / 4, 1.0), SCALES[1])
 
 
 # Preferences and the layout of the panels outlive the window.
@@ -86,11 +83,12 @@ class Workspace:
         self._kept: Preferences | None = None  # as they lie on disk; None: they are not kept there
         self._styled: Preferences | None = None  # as the window looks
 
-    def load(self, params: hello_imgui.RunnerParams, restore_size: bool) -> None:
+    def load(self, params: hello_imgui.RunnerParams, size: tuple[int, int] | None) -> None:
         """Take the preferences that are there; where the folder makes no sense say so, and keep nothing."""
         params.ini_disable = True
         params.app_window_params.restore_previous_geometry = False
-        self._state.preferences = replace(self._state.preferences, ui_scale=_fitting_scale())
+        scale = _fitting_scale(size[1] if size else math.inf)
+        self._state.preferences = replace(self._state.preferences, ui_scale=scale)
         if self._folder is None:
             return
         try:
@@ -105,7 +103,7 @@ class Workspace:
         params.ini_disable = False
         params.ini_folder_type = hello_imgui.IniFolderType.absolute_path
         params.ini_filename = str(self._folder / projects.LAYOUT_NAME)
-        params.app_window_params.restore_previous_geometry = restore_size
+        params.app_window_params.restore_previous_geometry = size is None
 
     def style(self) -> None:
         """Make the window look as the preferences say."""
@@ -197,7 +195,7 @@ class Window:
         params = hello_imgui.RunnerParams()
         window = params.app_window_params
         window.window_title = TITLE
-        self._workspace.load(params, restore_size=self._size is None)
+        self._workspace.load(params, self._size)
         scale = self.viewer.state.preferences.ui_scale
         width, height = DEFAULT_SIZE
         window.window_geometry.size = self._size or (round(scale * width), round(scale * height))

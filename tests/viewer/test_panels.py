@@ -56,9 +56,7 @@ def test_every_key_is_bound_to_one_command():
         understood = chord(key)
         assert (understood.key is None) == bool(understood.character)
         assert understood.is_plain == (not key.startswith("Ctrl") and key not in ("F1", "Esc")), key
-    assert chord("Ctrl+Shift+P").ctrl
-    assert chord("Ctrl+Shift+P").shift
-    assert (chord("Alt+H").alt, chord("H").alt) == (True, False)
+    assert (chord("Ctrl+Shift+P").ctrl, chord("Ctrl+Shift+P").shift, chord("H").alt) == (True, True, False)
     assert chord("Shift+F").is_plain  # a capital letter is typed
 
 
@@ -317,24 +315,23 @@ PICTURE = (400.0, 300.0)
 
 
 def test_labels_that_meet_lie_one_above_the_other():
-    for wanted, heights in (((45, 50, 60), [45, 25, 5]), ((0, 3, 6), [0, 3, 6])):  # without room they stay
+    for wanted, heights in (
+        ((45, 50, 60), [45, 25, 5]),
+        ((0, 3, 6), [0, 20, 40]),
+    ):  # else below
         labels = placed([PlacedText(0, y, 50, 20) for y in wanted], PICTURE)
         assert [label.y for label in labels] == heights
-
-
-def random_labels(seed: int, count: int) -> list[PlacedText]:
-    rng = np.random.default_rng(seed)
-    return [
-        PlacedText(*map(float, rng.uniform((-20, -20), (420, 320))), float(rng.uniform(20, 90)), 18.0)
-        for _ in range(count)
-    ]
+    panel, label = PlacedText(0, 10, 200, 150), PlacedText(20, 40, 50, 20)
+    assert placed([label], PICTURE, [panel]) == [replace(label, y=160)]
+    assert placed([label], PICTURE, [replace(panel, height=280)]) == [label]  # without room it stays
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_labels_in_the_open_do_not_cover_each_other(seed):
-    labels = [replace(label, y=label.y + 500) for label in random_labels(seed, 25)]
-    found = placed(labels, (PICTURE[0], 900.0))
-    assert not any(a.covers(b) for a, b in combinations(found, 2))
+def test_labels_in_the_open_do_not_cover_each_other_or_a_panel(seed):
+    wanted = np.random.default_rng(seed).uniform((-20, 480, 20), (420, 820, 90), (25, 3)).tolist()
+    panel = PlacedText(0.0, 500.0, 200.0, 150.0)
+    found = placed([PlacedText(x, y, width, 18.0) for x, y, width in wanted], (PICTURE[0], 900.0), [panel])
+    assert not any(a.covers(b) for a, b in combinations((panel, *found), 2))
     assert all(0 <= label.x <= PICTURE[0] - label.width for label in found)
 
 

@@ -26,20 +26,23 @@ class PlacedText:
         return not (beside or self.y + self.height <= other.y or other.y + other.height <= self.y)
 
 
-def placed(labels: Sequence[PlacedText], size: tuple[float, float]) -> list[PlacedText]:
-    """Return the labels, none over another, in an image of `size` (width, height).
+def placed(
+    labels: Sequence[PlacedText], size: tuple[float, float], taken: Sequence[PlacedText] = ()
+) -> list[PlacedText]:
+    """Return the labels, none over another or over what is `taken`, in an image of `size` (width, height).
 
-    Each one goes straight up until it is free of those before it; where there is no room it stays. So it
-    moves with its thing, and jumps only where it meets another or parts from it.
+    Each one goes straight up until it is free of those before it, else straight down, and where there is no
+    room it stays. So it moves with its thing, and jumps only where it meets another or parts from it.
     """
-    found: list[PlacedText] = []
+    found = [*taken]
     for label in labels:
-        x = max(min(label.x, size[0] - label.width), 0.0)
-        free = inside = replace(label, x=x, y=max(min(label.y, size[1] - label.height), 0.0))
-        while free.y >= 0 and (met := next((other for other in found if free.covers(other)), None)):
-            free = replace(free, y=met.y - free.height)
-        found.append(free if free.y >= 0 else inside)
-    return found
+        x, last = max(min(label.x, size[0] - label.width), 0.0), size[1] - label.height
+        inside = replace(label, x=x, y=max(min(label.y, last), 0.0))
+        beside = (y for one in found for y in (one.y - label.height, one.y + one.height) if 0 <= y <= last)
+        ways = sorted((inside.y, *beside), key=lambda y: (y > inside.y, abs(y - inside.y)))
+        free = (replace(inside, y=y) for y in ways)
+        found.append(next((way for way in free if not any(map(way.covers, found))), inside))
+    return found[len(taken) :]
 
 
 # Lines: where they are in the world, and where on screen.

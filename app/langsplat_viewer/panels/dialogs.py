@@ -59,6 +59,7 @@ class StartPage:
             return
         if not self._cards:
             self._look_up(viewer)
+            imgui.set_next_window_focus()  # for Tab, arrows and Enter
         gap, card = imgui.get_style().item_spacing.x, hello_imgui.em_size(CARD_EM)
         columns = min(max(int((MOST_WIDE * area.width + gap) / (card + gap)), 1), MOST_COLUMNS)
         width = columns * (card + gap) - gap

@@ -57,19 +57,22 @@ def _recent(viewer: Viewer) -> None:
 
 GROUPS = [group for menu in MENUS if (group := [command for command in BY_MENU[menu] if command.icon])]
 SIDE_EM, GAP_EM, EDGE_EM = 1.8, 0.4, 0.3  # of a button, between menus, within the strip
-LEAST = 0.8  # of a button's side; a lower strip is scrolled by the wheel
+LEAST = 0.8  # of a button's side; a strip that is lower has more columns
 
 
 def draw_toolbar(viewer: Viewer, area: ui.Area) -> float:
-    """Draw a column of buttons over the scene's left edge; return how far it reaches into the scene."""
+    """Draw the buttons over the scene's left edge; return how far they reach into the scene."""
     if viewer.state.scene is None or not viewer.state.show_panel or viewer.state.show_start:
         return 0.0
     side, gap, edge = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GAP_EM, EDGE_EM))
-    margin, gaps, count = 2 * gap, (len(GROUPS) - 1) * gap, sum(map(len, GROUPS))
-    room = area.height - 2 * margin
-    side = max(min(side, (room - gaps - 2 * edge) / count), LEAST * side)
+    margin, rest = 2 * gap, (len(GROUPS) - 1) * gap + 2 * edge
+    room, most = area.height - 2 * margin, max(map(len, GROUPS))
+    rows = [sum(-(-len(group) // columns) for group in GROUPS) for columns in range(1, most + 1)]
+    columns = next((c for c, high in enumerate(rows, 1) if LEAST * side * high + rest <= room), most)
+    count = rows[columns - 1]
+    side = max(min(side, (room - rest) / count), LEAST * side)
     at = ImVec2(area.left + margin, area.top + margin)
-    wide, high = side + 2 * edge, count * side + gaps + 2 * edge
+    wide, high = columns * side + 2 * edge, count * side + rest
     imgui.set_next_window_size(ImVec2(wide, min(high, room)))
     with ui.floating("toolbar", at, flags=ui.OVER | ui.FIXED, padding_em=EDGE_EM):
         none = ImVec2(0, 0)
@@ -77,7 +80,9 @@ def draw_toolbar(viewer: Viewer, area: ui.Area) -> float:
             for group in GROUPS:
                 if group is not GROUPS[0]:
                     imgui.dummy(ImVec2(side, gap))
-                for command in group:
+                for place, command in enumerate(group):
+                    if place % columns:
+                        imgui.same_line()
                     _tool_button(viewer, command, side)
     return margin + wide
 
@@ -88,8 +93,7 @@ def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
         clicked = imgui.button(button_label(command), ImVec2(side, side))
     if clicked:
         command.act(viewer)
-    keys = f" ({command.keys[0]})" if command.keys else ""
-    ui.tip(command.does[0].upper() + command.does[1:] + keys)
+    ui.tip(with_key(command.does[0].upper() + command.does[1:], command.act))
 
 
 def button_label(command: Command) -> str:

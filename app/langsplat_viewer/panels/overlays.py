@@ -26,7 +26,7 @@ from langsplat_viewer.session import Note, Point, Ruler
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
 
-TOOLS_EM = 3.8  # of the left edge that the tools take
+TOOLS_EM = 5.2  # of the left edge that two columns of tools take
 GRIP = 12.0  # width of what can be taken hold of, window units
 WHITE, SHADE, SHADE_EM = 0xFFFFFFFF, 0xA0000000, 0.2  # margin of a shade around its text
 UNMOVED = ui.OVER | ui.FIXED | imgui.WindowFlags_.no_background | imgui.WindowFlags_.no_nav
@@ -290,7 +290,7 @@ def _things(viewer: Viewer, pen: Pen) -> None:
 
 
 def _names(named: list[Named], area: ui.Area) -> None:
-    """Write the phrases above the highest corners of their boxes, with a line to those that made room."""
+    """Write texts above their corners and beside what floats there, with a line to those that made room."""
     line, edge, paint = (
         imgui.get_text_line_height(),
         hello_imgui.em_size(SHADE_EM),
@@ -300,9 +300,13 @@ def _names(named: list[Named], area: ui.Area) -> None:
     for name in named:
         (x, y), size = name.corner - (area.left, area.top), imgui.calc_text_size(name.text)
         wanted.append(PlacedText(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
-    found = placed(wanted, (area.width, area.height))
+    taken = [
+        PlacedText(low.x - area.left, low.y - area.top, high.x - low.x, high.y - low.y)
+        for low, high in ui.lying_over("Search", "search button", "toolbar", "relevancy")
+    ]
+    found = placed(wanted, (area.width, area.height), taken)
     for name, alone, label in zip(named, wanted, found, strict=True):
-        if label.y < alone.y - label.height / 2:
+        if abs(label.y - alone.y) > label.height / 2:
             end = ImVec2(area.left + label.x, area.top + label.y + label.height / 2)
             paint.add_line(ImVec2(*name.corner), end, imgui.get_color_u32(name.colour), 1.5)
     for name, label in zip(named, found, strict=True):

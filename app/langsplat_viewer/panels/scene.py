@@ -89,9 +89,8 @@ def draw_display(viewer: Viewer) -> None:
     if any(pane.row.uses_map for pane in viewer.state.panes()):
         names = list(COLOUR_MAPS)
         ui.leave_room("Colour map", WIDTH_EM)
-        changed, chosen = imgui.combo("Colour map", names.index(picture.colour_map), list(names))
-        if changed:
-            picture = replace(picture, colour_map=names[chosen])
+        _, chosen = imgui.combo("Colour map", names.index(picture.colour_map), list(names))
+        picture = replace(picture, colour_map=names[chosen])
     ui.row("Backdrop")
     flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.uint8 | imgui.ColorEditFlags_.no_label
     changed, colour = imgui.color_edit3("Backdrop", list(picture.background), flags)

@@ -234,18 +234,14 @@ def _uncover(viewer: Viewer, answer: QueryAnswer) -> None:
     settings.put(state, uncovered=answer.things)
     corners = np.concatenate([thing.oriented.corners for thing in answer.things])
     pixels, depths = state.view.camera(*area.size).project(corners)
-    docks = hello_imgui.get_runner_params().docking_params.dockable_windows
-    for window in map(imgui.internal.find_window_by_name, (TITLE, *(dock.label for dock in docks))):
-        node = None if window is None else window.dock_node
-        if window is None or not window.active or (node is not None and not node.is_floating_node()):
-            continue  # beside the scene
-        low = window.pos - ImVec2(area.left, area.top)
-        high, gap = low + window.size, hello_imgui.em_size(1)
+    pixels, gap = pixels + (area.left, area.top), hello_imgui.em_size(1)
+    for low, high in ui.lying_over(TITLE):
         under = ((pixels >= tuple(low)) & (pixels <= tuple(high))).all(1) & (depths > 0)
         if under.mean() < 0.5:  # of the corners of boxes
             continue
         if is_new and not imgui.is_any_mouse_down():
-            viewpoint.move_aside(viewer, corners, (low.x - gap) / area.width, (high.x + gap) / area.width)
+            ends = (area.fraction(low.x - gap, 0)[0], area.fraction(high.x + gap, 0)[0])
+            viewpoint.move_aside(viewer, corners, *ends)
         else:
             ui.small_wrapped("It lies below a panel: Focus goes there", "weak")
 

@@ -16,7 +16,7 @@ from langsplat_core.scene.transform import Similarity, moving, scaling, similari
 from langsplat_viewer import marks
 from langsplat_viewer.actions import editing, settings
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
-from langsplat_viewer.panels import theme, ui
+from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import say
 from langsplat_viewer.session import Point
 from langsplat_viewer.state import Gizmo
@@ -55,14 +55,10 @@ def counts(marks: Marks) -> str:
 
 def _tools(viewer: Viewer) -> None:
     tools = viewer.state.tools
-    for place, tool in enumerate(TOOLS):
-        active = tools.tool == tool
-        if place:
-            ui.beside(tool)
-        with theme.styled(button="pressed" if active else "button"):
-            clicked = imgui.button(f"{tool.capitalize()}##tool")
-        if clicked:
-            editing.use_tool(viewer, None if active else tool)
+    names: dict[Tool | None, str] = {None: "No tool", **{one: f"{one.capitalize()}##tool" for one in TOOLS}}
+    tool = ui.choice(names, tools.tool)
+    if tool != tools.tool:
+        editing.use_tool(viewer, tool)
     mode = ui.choice({mode: mode.capitalize() for mode in MODES}, tools.mode)
     _, only = imgui.checkbox("Only what is visible", tools.only_visible)
     editing.set_tools(viewer, mode=mode, only_visible=only)

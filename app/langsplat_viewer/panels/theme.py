@@ -114,15 +114,11 @@ def apply(preferences: Preferences) -> None:
     style.font_scale_main = scale
 
 
-def shown() -> Theme:
-    """Return the theme that imgui draws in."""
-    ground = imgui.get_style().color_(imgui.Col_.window_bg)
-    return DARK if ground.x + ground.y + ground.z < 1.5 else LIGHT
-
-
 def colour(name: str) -> ImVec4:
-    """Return a colour of the theme that is shown, by its name there."""
-    return ImVec4(*rgba(getattr(shown(), name)))
+    """Return a colour of the theme that imgui draws in, by its name there."""
+    ground = imgui.get_style().color_(imgui.Col_.window_bg)
+    shown = DARK if ground.x + ground.y + ground.z < 1.5 else LIGHT
+    return ImVec4(*rgba(getattr(shown, name)))
 
 
 @contextmanager

@@ -75,6 +75,15 @@ def scene_area() -> Area:
     return Area(node.pos.x, node.pos.y, max(node.size.x, 1.0), max(node.size.y, 1.0))
 
 
+def lying_over(*names: str) -> Iterator[tuple[ImVec2, ImVec2]]:
+    """Yield the corners of the windows with these names, and of undocked panels, that are over the scene."""
+    docks = hello_imgui.get_runner_params().docking_params.dockable_windows
+    for window in map(imgui.internal.find_window_by_name, (*names, *(dock.label for dock in docks))):
+        node = None if window is None else window.dock_node
+        if window is not None and window.active and (node is None or node.is_floating_node()):
+            yield window.pos, window.pos + window.size
+
+
 MOST_OVER = 0.94  # of the window that something which lies over it may take
 
 
@@ -205,13 +214,10 @@ def draw_fields(holder: Any, panel: str) -> dict[str, Any]:
             imgui.text(title)
             imgui.set_next_item_width(-1)
             value = imgui.input_text_with_hint(f"##{title}", meta.description or "", value)[1]
-        elif kind is float:
+        elif kind in (float, int):
             low, high = float(meta.ge or 0), float(meta.le or 1)
-            value = slider(title, value, (low, high), logarithmic=low > 0)
-        elif kind is int:
-            leave_room(title, 11.0)
-            limits, flags = (int(meta.ge or 0), int(meta.le or 1)), imgui.SliderFlags_.always_clamp
-            value = imgui.slider_int(title, value, *limits, "%d", flags)[1]
+            text = "%.2f" if kind is float else "%.0f"
+            value = kind(slider(title, value, (low, high), text, logarithmic=low > 0))
         else:
             choices = list(get_args(kind))
             leave_room(title, 11.0)

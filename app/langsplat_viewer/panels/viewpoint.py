@@ -120,8 +120,7 @@ def _keyframes(viewer: Viewer) -> None:
     flags = imgui.WindowFlags_.horizontal_scrollbar
     if imgui.begin_child("keyframes", ImVec2(0, 0), 0, flags):
         if not keyframes:
-            empty = "Add the current view; the path goes smoothly from one keyframe to the next"
-            ui.small_wrapped(empty)
+            ui.small_wrapped("Add the current view; the path goes smoothly from one keyframe to the next")
         images = viewpoint.thumbnails(viewer)
         drawn = viewer.state.record.thumbnails[0]
         for number, key in enumerate(keyframes):
