@@ -278,7 +278,7 @@ def _adjacency(labels: Array, colours: Array, count: int) -> list[dict[int, tupl
 # It knows nothing of objects. What it calls whole is what one paint or one material covers; SAM does better
 # wherever its weights can be had.
 
-VERSION = 1
+VERSION = 2
 WORK_SIDE = 400  # px, longer side at which regions are found; contrasts below are per pixel of it
 CHROMA_FALL = 0.045
 MERGE_COSTS = (6.0, 11.0, 19.0)  # colour difference plus contrast; chosen on photographs and renderings
@@ -315,7 +315,8 @@ def nested_partitions(image: Array) -> Array:
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
     # A weight that removes carpet and keeps edges.
-    lab = 100 * denoise_tv_chambolle(rgb2lab(small) / 100, 0.12, max_num_iter=60, channel_axis=-1)
+    lab = rgb2lab(small).astype(np.float32) / 100
+    lab = 100 * denoise_tv_chambolle(lab, 0.12, max_num_iter=60, channel_axis=-1)
     superpixels = slic(
         lab * np.array([0.6, 1, 1]),
         n_segments=min(700, lab.shape[0] * lab.shape[1]),
