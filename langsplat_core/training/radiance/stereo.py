@@ -277,9 +277,10 @@ def _confirmed(one: DepthMap, others: Sequence[DepthMap]) -> Array:
     points, _ = replace(one, depth=depth).points()
     kept = np.zeros(len(points), bool)
     for other in others:
-        there, pixels, depths = _in_view(other.camera, points)
+        unsure = np.flatnonzero(~kept)
+        there, pixels, depths = _in_view(other.camera, points[unsure])
         agree = np.abs(depths / other.depth[pixels] - 1) < 0.015
-        kept[there] |= agree & (other.score[pixels] > 0.5)
+        kept[unsure[there]] = agree & (other.score[pixels] > 0.5)
     depth[np.isfinite(depth)] = np.where(kept, depth[np.isfinite(depth)], np.nan)
     return depth
 
