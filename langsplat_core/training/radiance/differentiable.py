@@ -209,9 +209,8 @@ def evaluate_views(
 
 def _psnr_exposed(image: Tensor, target: Tensor, counted: Tensor) -> float | None:
     """PSNR of an image whose halves' exposures fit one another's best; None where a half is masked."""
-    left, right = counted.clone(), counted.clone()
-    left[:, image.shape[1] // 2 :] = False
-    right[:, : image.shape[1] // 2] = False
+    left = counted & (torch.arange(image.shape[1], device=counted.device) < image.shape[1] // 2)
+    right = counted & ~left
     if not (left.any() and right.any()):
         return None
     exposed = [

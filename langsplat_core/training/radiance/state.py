@@ -169,11 +169,9 @@ def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | Non
 
 def clean_gradients(state: TrainingState) -> None:
     """Zero gradient entries that are NaN or infinite: one bad pixel must not end a training."""
-    gradients = [value.grad for value in state.values.values() if value.grad is not None]
-    if not gradients or bool(torch.isfinite(torch.stack([gradient.sum() for gradient in gradients]).sum())):
-        return  # a finite sum has finite terms; an overflowing sum is looked at entry by entry
-    for gradient in gradients:
-        gradient[~torch.isfinite(gradient)] = 0
+    for value in state.values.values():
+        if value.grad is not None:
+            value.grad.nan_to_num_(0.0, 0.0, 0.0)
 
 
 def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:

@@ -16,7 +16,7 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Progress, WorkCancelledError
 from langsplat_core.raster.render import render
-from langsplat_core.scene import Gaussians, Scene, look_at
+from langsplat_core.scene import Scene, look_at
 from langsplat_core.training.radiance.differentiable import CpuRenderer, evaluate_views, renderer_for
 from langsplat_core.training.radiance.state import PARAMETERS, initial_gaussians, start
 from langsplat_core.training.radiance.stereo import STAGE as DEPTHS
@@ -210,16 +210,6 @@ def test_few_views_alone_use_depths(few_views: int) -> None:
 # Budgets that few photographs support, and scores.
 
 
-def noise(side: int = 24, views: int = 8) -> Capture:
-    """Cameras on an arc; their images are noise, which nothing but learning by heart explains."""
-    rng = np.random.default_rng(0)
-    eyes = [np.array([4 * np.sin(a), 0.5, -4 * np.cos(a)]) for a in np.linspace(0, 1, views)]
-    cameras = [look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0]), (side, side), 40.0) for eye in eyes]
-    images = [rng.integers(0, 255, (side, side, 3), dtype=np.uint8) for _ in eyes]
-    points = rng.normal(size=(100, 3)) * 0.3
-    return Capture(tuple(cameras), tuple(images), points, np.full(points.shape, 128, np.uint8))
-
-
 def test_presets_are_capped_with_few_views_only() -> None:
     quick, good = (with_preset(TrainConfig(), preset).radiance for preset in ("quick", "good"))
     full, uncapped = RadianceConfig(), RadianceConfig(capped_views=0)
@@ -234,17 +224,13 @@ def test_presets_are_capped_with_few_views_only() -> None:
     assert supported(small, 24) == replace(small, ensemble=2)
 
 
-def some_gaussians(scale: float) -> Gaussians:
-    rng = np.random.default_rng(1)
-    arrays = rng.normal(0, 0.4, (60, 3)), rng.normal(scale, 0.5, (60, 3)), rng.normal(size=(60, 4))
-    return Gaussians(*arrays, np.full(60, 2.0), rng.normal(0, 0.5, (60, 1, 3)))
-
-
 def test_small_scores_compare_shrunk_images() -> None:
     """As if both had been shrunk beforehand; what a mask leaves out of a small pixel leaves out the pixel."""
-    scene, mask = some_gaussians(-2.0), np.ones((640, 640), bool)
+    scene, mask = truth(), np.ones((640, 640), bool)
     mask[:, 301:] = False
-    photographs = replace(noise(640), masks=(None, mask, *[None] * 6))
+    cameras = tuple(camera.resized(640, 640) for camera in capture().cameras[:2])
+    noise = np.random.default_rng(0).integers(0, 255, (2, 640, 640, 3), dtype=np.uint8)
+    photographs = replace(capture(), cameras=cameras, images=tuple(noise), masks=(None, mask))
     scores = evaluate_views(scene, photographs, [0, 1], "cpu", photographs.shrunk([0, 1], 320))
     for index, (score, columns) in enumerate(zip(scores, (320, 150), strict=True)):
         drawn = render(Scene(scene), photographs.cameras[index]).colours.clip(0, 1)
