@@ -133,10 +133,9 @@ def _jacobian(x: float, y: float, z: float, camera: KernelCamera) -> tuple[float
     """Non-zero entries (0,0), (0,2), (1,1), (1,2) of d(pixel)/d(camera point), taken at the clamped point."""
     if camera.orthographic:
         return camera.fx, 0.0, camera.fy, 0.0
-    near = 1 / z  # divisions are what projecting takes longest for: one of each divisor
-    tx = min(max(x * near, -camera.left), camera.right)
-    ty = min(max(y * near, -camera.top), camera.bottom)
-    return camera.fx * near, -camera.fx * tx * near, camera.fy * near, -camera.fy * ty * near
+    tx = min(max(x / z, -camera.left), camera.right)
+    ty = min(max(y / z, -camera.top), camera.bottom)
+    return camera.fx / z, -camera.fx * tx / z, camera.fy / z, -camera.fy * ty / z
 
 
 @helper
@@ -215,13 +214,14 @@ def _is_valid(rows: Rows, i: int) -> bool:
 
 
 @helper
-def _is_outside(u: float, v: float, scale: float, size: float, camera: KernelCamera) -> bool:
+def _is_outside(x: float, y: float, over: float, size: float, camera: KernelCamera) -> bool:
     """Return True only for footprints that cannot meet a pixel centre, whatever their shape.
 
-    These are most of those that do not. scale: 1 / depth, or 1 without perspective.
+    These are most of those that do not. over: depth, or 1 without perspective.
     """
-    wide = camera.reach_x * size * scale + camera.margin
-    high = camera.reach_y * size * scale + camera.margin
+    u, v = camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy
+    wide = camera.reach_x * size / over + camera.margin
+    high = camera.reach_y * size / over + camera.margin
     return (u + wide < 0) | (u - wide > camera.width) | (v + high < 0) | (v - high > camera.height)
 
 
@@ -270,9 +270,8 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
         x, y, z = camera_point(rows.means[i], camera)
         if not (camera.near < z <= camera.far):
             continue
-        scale = 1.0 if camera.orthographic else 1 / z
-        u, v = camera.fx * x * scale + camera.cx, camera.fy * y * scale + camera.cy
-        if _is_outside(u, v, scale, rows.sizes[i], camera):
+        over = 1.0 if camera.orthographic else z
+        if _is_outside(x, y, over, rows.sizes[i], camera):
             continue
         opacity = opacity_of(rows.opacity_logits[i])
         if not opacity >= camera.alpha_min:
@@ -285,6 +284,7 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
                 continue
         log2_opacity = np.log2(opacity)
         reach = 2 * LN2 * max(log2_opacity - log2_least, 0.0)  # squared
+        u, v = camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy
         wide, high = np.sqrt(reach * xx), np.sqrt(reach * yy)
         right, bottom = camera.width - 0.5, camera.height - 0.5  # the last pixel's centre
         if u + wide < 0.5 or u - wide > right or v + high < 0.5 or v - high > bottom:
@@ -293,10 +293,9 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
         out.depths[i] = z
         g = out.geometry[i]
         g[MEAN_X], g[MEAN_Y] = u, v
-        narrow = 1 / yy
         g[FACTOR_A] = np.sqrt(HALF_LOG2_E * yy / det)
-        g[FACTOR_K] = xy * narrow
-        g[FACTOR_C] = np.sqrt(HALF_LOG2_E * narrow)
+        g[FACTOR_K] = xy / yy
+        g[FACTOR_C] = np.sqrt(HALF_LOG2_E / yy)
         g[LOG2_OPACITY] = log2_opacity
         g[HALF_WIDTH], g[HALF_HEIGHT] = wide, high
 

@@ -138,8 +138,9 @@ def _span(centre: float, low: float, high: float, size: int) -> tuple[int, int]:
 @helper
 def _ellipse(g: Array) -> Ellipse:
     a, c, k = g[cp.FACTOR_A], g[cp.FACTOR_C], g[cp.FACTOR_K]
-    wide, share = g[cp.HALF_WIDTH], a / (a * a * k * k + c * c)
-    return g[cp.MEAN_X], g[cp.MEAN_Y], wide, k * g[cp.HALF_HEIGHT], a * k * share, c * share
+    across = a * a * k * k + c * c
+    wide = g[cp.HALF_WIDTH]
+    return g[cp.MEAN_X], g[cp.MEAN_Y], wide, k * g[cp.HALF_HEIGHT], a * a * k / across, a * c / across
 
 
 @helper
