@@ -57,7 +57,7 @@ from langsplat_core.semantics.encoders import PhraseEncoder
 from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary
 
 # In an order in which each imports only those before it, so that their code can stand in one script.
-MODULES = ("words", "rule", "encoder", "camera", "space", "language", "data", "draw", "page")
+MODULES = ("words", "rule", "encoder", "camera", "space", "language", "data", "draw", "headset", "page")
 BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, without its imports and exports
 WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL")
 WORD_TABLES = ("SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")

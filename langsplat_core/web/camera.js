@@ -263,4 +263,4 @@ class Controls {
 }
 // [/page]
 
-export { Controls, add, axes, cornersOf, inner, project, unit };
+export { Controls, add, axes, cornersOf, cross, inner, project, unit };

@@ -270,19 +270,21 @@ class Painter {
     this.onorder?.();
   }
 
-  // Draw into the canvas, which gets the camera's size. appearance: { display, map, ranges, dim }.
-  paint(camera, appearance) {
+  // Draw into the canvas, which gets the camera's size, or into a part of a framebuffer: { framebuffer, x, y, width,
+  // height }. appearance: { display, map, ranges, dim }.
+  paint(camera, appearance, target = null) {
+    const { width, height } = camera;
+    if (!target && (this.canvas.width !== width || this.canvas.height !== height)) {
+      Object.assign(this.canvas, { width, height });
+    }
     this.resize(camera);
     this.project(camera);
     this.splat(camera);
-    this.compose(camera, appearance);
+    this.compose(target ?? { framebuffer: null, width, height }, appearance);
   }
 
   resize({ width, height }) {
     const { gl } = this;
-    if (this.canvas.width !== width || this.canvas.height !== height) {
-      Object.assign(this.canvas, { width, height });
-    }
     if (this.image?.width !== width || this.image?.height !== height) {
       if (this.image) {
         this.image.textures.forEach((texture) => gl.deleteTexture(texture));
@@ -347,7 +349,7 @@ class Painter {
   }
 
   // Turn blended values into the display that is seen.
-  compose({ width, height }, appearance) {
+  compose(target, appearance) {
     const { gl, meta } = this;
     const { picture } = meta;
     this.use("compose", {
@@ -370,14 +372,14 @@ class Painter {
     });
     const textures = [...this.image.textures, this.colourMaps, this.colourMaps]; // nothing is selected
     this.bound(...textures.map((texture) => [gl.TEXTURE_2D, texture]));
-    this.pass({ framebuffer: null, width, height }, null);
+    this.pass(target, null);
   }
 
   // One triangle over all of a target, or the sorted quads blended over one another.
   pass(target, quads) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
-    gl.viewport(0, 0, target.width, target.height);
+    gl.viewport(target.x ?? 0, target.y ?? 0, target.width, target.height);
     gl.bindVertexArray(quads);
     if (!quads) {
       return gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -4,6 +4,7 @@ import { readPage } from "./data.js";
 import { Language, PhraseError } from "./language.js";
 import { Controls, cornersOf, project } from "./camera.js";
 import { Painter } from "./draw.js";
+import { Headset } from "./headset.js";
 import { wholeOf } from "./space.js";
 
 // [page]
@@ -48,6 +49,7 @@ class Page {
       () => this.free(),
       () => this.moved(),
     );
+    this.headset = new Headset(this);
     byId("panel").hidden = false;
     this.fill();
     this.listenToSearch();
@@ -88,7 +90,7 @@ class Page {
       about = `${asked} Answers: ${language.basis}.`;
     }
     byId("about").textContent = `${gaussians}. ${about} Made with the LangSplat viewer.`;
-    for (const id of ["search", "examples", "levels", "displays", "verdict", "labels"]) {
+    for (const id of ["search", "examples", "levels", "displays", "labels"]) {
       byId(id).hidden = !language;
     }
     const examples = language?.examples ?? [];
@@ -154,6 +156,10 @@ class Page {
     byId("spin").addEventListener("click", () => {
       byId("spin").ariaPressed = String(this.controls.spin());
     });
+    const offer = (offered) => (byId("headset").hidden = !offered);
+    navigator.xr?.isSessionSupported("immersive-vr").then(offer, () => {}); // rejected in a frame without the right
+    const refused = (problem) => this.update(Object.assign(this, { problem }));
+    byId("headset").addEventListener("click", () => this.headset.toggle().catch(refused));
     let { matches: light } = matchMedia("(prefers-color-scheme: light)");
     byId("theme").addEventListener("click", () => {
       light = !light;
@@ -443,7 +449,7 @@ class Page {
   }
 
   redraw() {
-    if (this.asked || !this.controls.view) {
+    if (this.asked || !this.controls.view || this.headset.session) {
       return;
     }
     this.asked = requestAnimationFrame(() => {

@@ -572,6 +572,101 @@ def test_page_hides_boxes_with_their_answer(browser: Any, thin: Path) -> None:
             assert marks.is_visible() == visible, phrase
 
 
+# A headset as a browser offers it: `read` draws two eyes, W x H each, side by side.
+W, H = 160, 120
+FAKE_HEADSET = """(() => {
+  const [W, H] = [160, 120];
+  const device = globalThis.device = Object.assign(new EventTarget(), {
+    updateRenderState({ baseLayer }) { device.layer = baseLayer; },
+    requestReferenceSpace: async () => ({}),
+    requestAnimationFrame(draw) { device.waiting = draw; },
+    end: async () => device.dispatchEvent(new Event("end")),
+    async read(now, matrix, eyes, ...sticks) {
+      const { gl, framebuffer } = device.layer;
+      device.inputSources = sticks.map(([handedness, ...axes]) => ({ handedness, gamepad: { axes } }));
+      const views = eyes.map(([matrix, projectionMatrix], eye) =>
+        ({ transform: { matrix }, projectionMatrix, eye }));
+      for (const again of [0, 1]) {
+        device.waiting(now, { getViewerPose: () => matrix && { transform: { matrix }, views } });
+        await (await langsplat).page.painter.last; // the order of the Gaussians
+      }
+      const bytes = new Uint8Array(8 * W * H);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+      gl.readPixels(0, 0, 2 * W, H, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+      return Array.from(bytes);
+    },
+  });
+  globalThis.XRWebGLLayer = class {
+    constructor(session, gl) {
+      this.framebuffer = gl.createFramebuffer(this.gl = gl);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+      gl.bindRenderbuffer(gl.RENDERBUFFER, gl.createRenderbuffer());
+      gl.renderbufferStorage(gl.RENDERBUFFER, gl.RGBA8, 2 * W, H);
+      const colours = gl.getParameter(gl.RENDERBUFFER_BINDING);
+      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, colours);
+    }
+    getViewport({ eye }) { return { x: eye * W, y: 0, width: W, height: H }; }
+  };
+  WebGL2RenderingContext.prototype.makeXRCompatible = async () => {};
+  const isSessionSupported = async (mode) => mode === "immersive-vr";
+  const requestSession = async () => { if (device.refuses) throw Error(device.refuses); return device; };
+  Object.defineProperty(navigator, "xr", { value: { isSessionSupported, requestSession } });
+})();"""
+REDRAWS = "async () => { const { page } = await langsplat; page.redraw(); return Boolean(page.asked); }"
+
+
+def rigid(turn: Any = ((1, 0, 0), (0, 1, 0), (0, 0, 1)), by: Any = (0, 0, 0)) -> Array:
+    return np.vstack([np.column_stack([turn, by]), np.eye(4)[3]])
+
+
+@pytest.mark.parametrize("metres", [None, 1.25])
+def test_headset_sees_the_scene_with_both_eyes(browser, demo, gl, measured, tmp_path, metres):
+    """By a fake device: refused, then before and after its sticks were pushed, then left."""
+    scene = replace(demo.take(np.arange(0, len(demo.gaussians), 16)), metres_per_unit=metres)
+    head = rigid([[0.8, 0, 0.6], [0.168, 0.96, -0.224], [-0.576, 0.28, 0.768]], (0.3, 0.1, 0.2))
+    eyes, cameras = [], []
+    for side, left, right in ((-0.032, 1.1, 0.8), (0.032, 0.8, 1.1)):  # tangents of what is seen
+        width, height, up, down = left + right, 1.9, 0.9, 1.0
+        slopes = [(right - left) / width, (up - down) / height]
+        eye = head @ rigid(by=(side, 0, 0))
+        lens = [2 / width, 0, 0, 0, 0, 2 / height, 0, 0, *slopes, -1, -1, 0, 0, -0.2, 0]
+        eyes.append([eye.T.ravel().tolist(), lens])
+        cameras.append((eye, (W / width, H / height, W * left / width, H * up / height)))
+    with open_tab(browser, exported(tmp_path, scene), FAKE_HEADSET) as tab:
+
+        def seen(now: float, *sticks: Any, tracked: bool = True) -> Array:
+            given = [now, head.T.ravel().tolist() if tracked else None, eyes, *sticks]
+            return np.reshape(tab.run("(given) => device.read(...given)", given), (H, 2 * W, 4))[::-1, :, :3]
+
+        def compare_eyes(image: Array, to_scene: Array) -> None:
+            for own, (eye, lens) in zip(np.split(image, 2, axis=1), cameras, strict=True):
+                rotation = np.diag([1, -1, -1]) @ unit((to_scene @ eye)[:3, :3].T)
+                camera = Camera(W, H, *lens, rigid(rotation, -rotation @ (to_scene @ eye)[:3, 3]))
+                compare(measured, "headset", own, drawn(gl, scene, camera))
+
+        tab.run("() => { device.refuses = 'no rights'; }")
+        tab.page.click("#headset")
+        tab.page.locator("#verdict", has_text="no rights").wait_for()
+        tab.run("() => { device.refuses = ''; }")
+        tab.page.click("#headset")
+        tab.page.wait_for_function("() => device.waiting")
+        seen(0, tracked=False)
+        first, up = scene.cameras[0], scene.up()
+        right = unit(np.cross(first.rotation[2], up))
+        scale = metres or 1.5 / tab.run("async () => (await langsplat).page.controls.distance")
+        to_scene = rigid(np.column_stack([right, up, np.cross(right, up)]) / scale, first.position)
+        compare_eyes(seen(100), to_scene)
+        seen(200, ["left", 0, 0, 0, -1])
+        turned = rigid([[3**0.5 / 2, 0, -0.5], [0, 1, 0], [0.5, 0, 3**0.5 / 2]])
+        middle = rigid(by=head[:3, 3])
+        to_scene = to_scene @ rigid(by=-0.15 * head[:3, 2]) @ middle @ turned @ np.linalg.inv(middle)
+        compare_eyes(seen(300, ["right", 0, 0, 1, 0]), to_scene)
+        assert not tab.run(REDRAWS)
+        tab.page.click("#headset")
+        assert tab.run(REDRAWS)
+        assert tab.faults == []
+
+
 # An image in a PDF: its sides on the page.
 PLACED = rb"(?<![\d.])(\d\d+[\d.]*) 0 0 -([\d.]+) [\d.]+ [\d.]+ cm\n(?:.*\n){,3}/X\d+ Do"
 

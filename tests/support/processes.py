@@ -240,10 +240,11 @@ def open_browser() -> Iterator[Any]:
 
 
 @contextmanager
-def open_tab(browser: Any, path: Path, **settings: Any) -> Iterator[Tab]:
-    """A file open in a profile of its own; settings: of playwright's `new_context`."""
+def open_tab(browser: Any, path: Path, before: str = "", **settings: Any) -> Iterator[Tab]:
+    """A file open in a profile of its own, after a script; settings: of playwright's `new_context`."""
     context = browser.new_context(offline=True, **{"viewport": {"width": 480, "height": 360}} | settings)
     try:
+        context.add_init_script(before)
         tab = Tab(context.new_page())
         tab.open(path)
         yield tab
