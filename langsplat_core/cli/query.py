@@ -29,7 +29,7 @@ from langsplat_core.query.instances import Instance
 from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.selection import of_rows, shares_in_masks
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.protocol import CHANNELS_AT_ONCE
+from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.language import split_phrases
@@ -204,7 +204,7 @@ class QueryScene:
         drawn = camera if self.camera is not None or len(texts) <= CHANNELS_AT_ONCE else None
         if camera is not drawn:
             log.info("pixels of more than %d phrases are found with --camera INDEX", CHANNELS_AT_ONCE)
-        pixels = _Pixels(engine, drawn, self.mode)
+        view = None if drawn is None else view_of(scene, drawn)
         asked: dict[str, tuple[dict[str, Any], list[str]]] = {}  # phrase -> answer, lines of its things
         # One after the other: an answer has a number for every Gaussian and level.
         for text in dict.fromkeys(texts):
@@ -212,7 +212,7 @@ class QueryScene:
             heard = compose.with_masks(engine, result, outlined[text][0]) if outlined else None
             result = result if heard is None else heard.answer
             answer = _answer(result, camera) | {"reading": None if tree is None else unparse(tree)}
-            pixels.add(result, answer)
+            answer |= {} if view is None else _pixel(view, engine, result, self.mode)
             things = engine.instances(result, self.instances) if result.found else ()
             counts = result.found or (isinstance(tree, Counted) and result.verdict == "weak match")
             number = compose.count_things(engine, result) if counts else compose.Number(0, 0, 0)
@@ -224,7 +224,6 @@ class QueryScene:
                 counted = f"outlined in {outlined[text][1]} of {len(scene.cameras)} photographs"
                 answer["photographs_with_masks"] = outlined[text][1]
                 asked[text][1].insert(0, _found_by(heard, answer, things, counted))
-        pixels.fill()
         if explain is not None:
             explain.write()
         if self.json:
@@ -375,7 +374,7 @@ def _engine(scene: Scene, load: LoadEncoder, encoder: str, taught: Path | None) 
 
 
 def _answer(result: QueryResult, camera: Camera | None) -> dict[str, Any]:
-    """One phrase's answer, ready for JSON; where there are cameras `_Pixels` fills its pixel fields."""
+    """One phrase's answer, ready for JSON; its pixel as where no camera sees it."""
     return {
         "phrase": result.phrase,
         "found": result.found,
@@ -394,41 +393,16 @@ def _answer(result: QueryResult, camera: Camera | None) -> dict[str, Any]:
     }
 
 
-class _Pixels:
-    """Pixels of answers as a camera sees them, found for several together; without one none are."""
-
-    def __init__(self, engine: QueryEngine, camera: Camera | None, mode: str) -> None:
-        self._engine, self._paper = engine, mode == "paper"
-        self._view = None if camera is None else view_of(engine.scene, camera)
-        # 128 MB of numbers, twice
-        self._most = max(min(CHANNELS_AT_ONCE, 2**25 // max(len(engine.scene.gaussians), 1)), 1)
-        self._waiting: list[tuple[dict[str, Any], Array]] = []
-
-    def add(self, result: QueryResult, answer: dict[str, Any]) -> None:
-        """Take an answer, whose pixel fields are filled sooner or later."""
-        if self._view is not None and self._paper:
-            phrase, gate = self._engine.text_vectors([result.phrase]), PictureConfig().alpha_gate
-            image = decoded_relevancy(self._view, self._engine.field, result.level, phrase, gate)
-            _fill(answer, peak_pixel(image[..., 0], PAPER_FILTER))
-        elif self._view is not None:
-            self._waiting.append((answer, result.even))
-            if len(self._waiting) == self._most:
-                self.fill()
-
-    def fill(self) -> None:
-        """Fill the pixel fields of all that was added."""
-        if self._view is None or not self._waiting:
-            return
-        answers, values = zip(*self._waiting, strict=True)
-        images = splatted_relevancy(self._view, np.stack(values, 1), PictureConfig().alpha_gate)
-        for answer, image in zip(answers, np.moveaxis(images, -1, 0), strict=True):
-            _fill(answer, peak_pixel(image, PAPER_FILTER))
-        self._waiting.clear()
-
-
-def _fill(answer: dict[str, Any], peak: tuple[int, int, float]) -> None:
-    column, row, score = peak
-    answer |= {"pixel": [column, row], "pixel_score": score}
+def _pixel(view: View, engine: QueryEngine, result: QueryResult, mode: str) -> dict[str, Any]:
+    """Return the pixel of an answer in a view, and its score there, ready for JSON."""
+    gate = PictureConfig().alpha_gate
+    if mode == "paper":
+        phrase = engine.text_vectors([result.phrase])
+        image = decoded_relevancy(view, engine.field, result.level, phrase, gate)
+    else:
+        image = splatted_relevancy(view, result.even[:, None], gate)
+    column, row, score = peak_pixel(image[..., 0], PAPER_FILTER)
+    return {"pixel": [column, row], "pixel_score": score}
 
 
 def _lines(answer: dict[str, Any], unit: Unit) -> list[str]:

@@ -6,7 +6,7 @@ Both by structure from motion in a process of its own (`reconstruction`), kept i
 import hashlib
 import logging
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,7 +61,10 @@ def load_photos(
     matches = workspaces.read_matches(
         workspace, files, {image.name for image in model.images} if model else ()
     )
-    lost = _left_out(matches, labels.values())
+    lost: dict[str, list[str]] = {}  # by the reason
+    for row, name in enumerate(labels.values()):
+        if row not in matches.located:
+            lost.setdefault(matches.why(row), []).append(name)
     found = len(matches.located)
     if model is None or (found < max(MIN_PHOTOS, FEWEST * len(files)) and not config.allow_few_cameras):
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
@@ -96,15 +99,6 @@ def _content(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return ""
-
-
-def _left_out(matches: workspaces.Matches, names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the names of photographs without a camera by the reason."""
-    groups: dict[str, list[str]] = {}
-    for row, name in enumerate(names):
-        if row not in matches.located:
-            groups.setdefault(matches.why(row), []).append(name)
-    return groups
 
 
 def _listed(lost: dict[str, list[str]], limit: int) -> str:

@@ -235,19 +235,16 @@ class PlyFile:
                 raise malformed(self.path, f"has a line of {LINE_LIMIT} bytes or more")
             yield line
 
-    def _exactly(self, size: int) -> bytes:
-        data = self._file.read(size)
-        if len(data) < size:
-            raise malformed(self.path, f"truncated: {size - len(data)} bytes are missing")
-        return data
-
     def _chunks(self, element: PlyElement) -> Iterator[tuple[int, Array]]:
         """Yield (index of the first row, structured rows) of an element without lists, from its first on."""
         dtype = element.row(self._order)
         for start in range(0, element.count, CHUNK_ROWS):
             count = min(CHUNK_ROWS, element.count - start)
             if self._order:
-                yield start, np.frombuffer(self._exactly(count * dtype.itemsize), dtype)
+                data = self._file.read(count * dtype.itemsize)
+                if (missing := count * dtype.itemsize - len(data)) > 0:
+                    raise malformed(self.path, f"truncated: {missing} bytes are missing")
+                yield start, np.frombuffer(data, dtype)
             else:
                 yield start, self._ascii_rows(element, start, count)
 

@@ -79,17 +79,9 @@ class PageReport:
     why_not: str = ""  # reason why nothing can be searched, "" where it can
 
 
-def write_page(
-    path: Path,
-    scene: Scene,
-    engine: QueryEngine | None,
-    title: str,
-    progress: Progress = silent,
-    first: Sequence[Camera] = (),
-    notes: Sequence[tuple[str, Sequence[float]]] = (),
-) -> PageReport:
-    """Write the page of `make_page` as a file."""
-    text, report = make_page(scene, engine, title, progress, first, notes)
+def write_page(path: Path, page: tuple[str, PageReport]) -> PageReport:
+    """Write what `make_page` returned as a file."""
+    text, report = page
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return report
@@ -130,7 +122,7 @@ def make_page(
         raise InputError(f"{scene.path}: no Gaussian of this scene can be drawn; there is nothing to export")
     centre, radius = scene.bounds()
     progress("packing the Gaussians", 0.1)
-    tensors = pack_gaussians(gaussians.take(rows), centre)
+    tensors, quad = pack_gaussians(gaussians.take(rows), centre), shader("fullscreen.vert", WEB)
     meta: dict[str, Any] = {
         "title": title,
         "address": urlencode({"phrase": phrase, "show": "relevancy"}) if phrase else "",
@@ -158,7 +150,11 @@ def make_page(
             "maps": list(COLOUR_MAPS),
         },
         "query_colours": QUERY_COLOURS.tolist(),
-        "shaders": page_shaders(),
+        "shaders": {  # vertex and fragment shader of each pass
+            "project": [quad, shader("project.frag", WEB)],
+            "splat": splat_shaders(2, False, WEB),
+            "compose": [quad, shader("compose.frag", WEB, "langsplat_core.display", **shader_defines())],
+        },
     }
     tensors["colour_maps"] = np.stack(list(COLOUR_MAPS.values()))
     why_not, language = no_field(scene) if engine is None else unsearchable(engine), dict[str, Any]()
@@ -169,7 +165,10 @@ def make_page(
     progress("compressing", 0.8)
     plain = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     packed = zlib.compress(save(plain, {"page": json.dumps(meta, allow_nan=False)}))
-    text = page_text(title, packed, _still(scene, seen_from[0]))
+    image, still = render(scene, seen_from[0].within(STILL)), BytesIO()  # is seen until the scene is drawn
+    pixels = compose(Channels(image.colours, image.alpha, None), PictureConfig())
+    Image.fromarray(pixels).save(still, "JPEG", quality=85)
+    text = page_text(title, packed, still.getvalue())
     free = "encoder" in language
     return text, PageReport(len(rows), len(language.get("phrases", ())), free, len(text.encode()), why_not)
 
@@ -230,16 +229,6 @@ def views(scene: Scene, first: Sequence[Camera] = ()) -> tuple[Camera, ...]:
     others = (camera for camera in scene.cameras[:: step or 1] if camera not in first)
     kept = tuple(camera for camera in (*first, *others) if not camera.orthographic)
     return kept or (scene.framing_camera((1280, 800)),)
-
-
-def page_shaders() -> dict[str, list[str]]:
-    """Vertex and fragment shader of each pass, for WebGL 2."""
-    quad = shader("fullscreen.vert", WEB)
-    return {
-        "project": [quad, shader("project.frag", WEB)],
-        "splat": list(splat_shaders(2, False, WEB)),
-        "compose": [quad, shader("compose.frag", WEB, "langsplat_core.display", **shader_defines())],
-    }
 
 
 # The language field.
@@ -374,14 +363,6 @@ def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any
 
 
 # The file.
-
-
-def _still(scene: Scene, camera: Camera) -> bytes:
-    """Return a JPEG of a view, which is seen until the scene is drawn, and where it cannot be."""
-    image, jpeg = render(scene, camera.within(STILL)), BytesIO()
-    pixels = compose(Channels(image.colours, image.alpha, None), PictureConfig())
-    Image.fromarray(pixels).save(jpeg, "JPEG", quality=85)
-    return jpeg.getvalue()
 
 
 def page_text(title: str, data: bytes, still: bytes) -> str:

@@ -237,7 +237,8 @@ class Spread:
 
     def __call__(self) -> Array:
         """Return (N,) float32."""
-        return self.regions.spread(self.level, self.values, self.own.of_level(self.level))
+        own = np.asarray(self.own.values[self.own.features[self.level]])
+        return self.regions.spread(self.level, self.values, own)
 
 
 def place_of(points: Array) -> tuple[Array, Array]:

@@ -239,13 +239,8 @@ class QueryEngine:
         return kept_calibration(self.field.encoder_id, self.field.canonical)
 
     @cached_property
-    def compared(self) -> LanguageField:
-        """The field as phrases are compared with it, see `through_cells`."""
-        return self.field if self.exact else through_cells(self.field)
-
-    @cached_property
     def _lookup(self) -> Lookup:
-        return Lookup(self.compared, self.scale)
+        return Lookup(self.field if self.exact else through_cells(self.field), self.scale)
 
     @cached_property
     def _mixtures(self) -> csr_matrix:

@@ -39,10 +39,6 @@ class Relevancy:
         shared_workers().run(_fetch, found.size, self.values, *flat)
         return found
 
-    def of_level(self, level: int) -> Array:
-        """Return (N,) float32 at a level."""
-        return np.asarray(self.values[self.features[level]])
-
 
 class Lookup:
     """Part of the relevancies in a scene that does not depend on the phrase."""

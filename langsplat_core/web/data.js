@@ -55,12 +55,7 @@ async function readPage(text, unpacked) {
 }
 
 const CHUNK = 256; // Gaussians that share the range of a column
-// The first column of each property.
-const MEAN = 0;
-const SCALE = 3;
-const QUATERNION = 6;
-const OPACITY = 10;
-const SH = 11;
+const [MEAN, SCALE, QUATERNION, OPACITY, SH] = [0, 3, 6, 10, 11]; // the first column of each property
 
 // The Gaussians as textures take them: `means` (M, 3), relative to the page's origin; `geometry`, three layers
 // of RGBA floats (mean and opacity, scales, unit quaternion) and `sh`, the coefficients four to a texel.

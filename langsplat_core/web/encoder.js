@@ -37,11 +37,8 @@ class ClipText {
     let states = this.embedded(ids);
     for (let number = 0; number < config.num_hidden_layers; ++number) {
       const layer = (name) => `text_model.encoder.layers.${number}.${name}`;
-      const attended = this.attention(
-        layer("self_attn."),
-        this.normed(layer("layer_norm1"), states),
-        ids.length,
-      );
+      const seen = this.normed(layer("layer_norm1"), states);
+      const attended = this.attention(layer("self_attn."), seen, ids.length);
       states = states.map((value, i) => value + attended[i]);
       const inner = this.linear(layer("mlp.fc1"), this.normed(layer("layer_norm2"), states), width);
       const outer = this.linear(layer("mlp.fc2"), inner.map(quickGelu), config.intermediate_size);

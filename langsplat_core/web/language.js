@@ -8,17 +8,16 @@ import {
   fitOf,
   heatRange,
   leastFit,
-  levelRange,
   regionRelevancies,
+  regionsAt,
   sigmoid,
+  strongest,
   verdict,
 } from "./rule.js";
 import { Space, wholeOf } from "./space.js";
 import { namedBy, nearest, parse, phraseKey, splitPhrases, thingAndPart, tidy } from "./words.js";
 
 // [page]
-const LISTS = ["articles", "stop_words", "adjectives", "parts", "also_nouns", "always_plural"];
-const TABLES = ["superlatives", "plurals", "endings"];
 const GRID = { neighbours: 16, most: 64, side: 5 }; // as of query/answers.py, smoothed
 
 // Means of values (K) around points (3 K), smoothed on a grid that grows with them.
@@ -76,10 +75,9 @@ class Language {
     this.taught = new Map(meta.taught.map((word, row) => [phraseKey(word.name), { ...word, row }]));
     const { prepositions, articles } = meta.grammar;
     const longest = Object.keys(prepositions).sort((a, b) => b.length - a.length);
+    const table = (words) => (Array.isArray(words) ? new Set(words) : new Map(Object.entries(words)));
     this.lists = {
-      ...meta.grammar,
-      ...Object.fromEntries(LISTS.map((name) => [name, new Set(meta.grammar[name])])),
-      ...Object.fromEntries(TABLES.map((name) => [name, new Map(Object.entries(meta.grammar[name]))])),
+      ...Object.fromEntries(Object.entries(meta.grammar).map(([name, words]) => [name, table(words)])),
       leading: new RegExp(`^(?:(?:${articles.join("|")}) )+`, "i"),
       related: new RegExp(`^(.+?) (${longest.join("|")}) (.+)$`, "i"),
     };
@@ -143,7 +141,7 @@ class Language {
     const { rule, space } = this.meta;
     const least = leastFit(rule, Math.max(...inside.map((region) => regionFits[region])), rule.wide);
     const sizes = {};
-    for (let [region, last] = levelRange(this.regions, level); region < last; ++region) {
+    for (const region of regionsAt(this.regions, level)) {
       const whole = wholeOf(this.regions, region);
       sizes[whole] = (sizes[whole] ?? 0) + (regionFits[region] >= least ? this.regions.sizes[region] : 0);
     }
@@ -180,7 +178,7 @@ class Language {
     const inside = answer.inside.filter((region) => wholes.includes(wholeOf(this.regions, region)));
     const within = new Set(inside);
     const regionFits = answer.regionFits.map((fit, region) => (within.has(region) ? fit : rule.nothing));
-    const best = inside.reduce((a, b) => (a < 0 || regionFits[b] > regionFits[a] ? b : a), -1);
+    const best = strongest(inside, regionFits);
     const verdict = combined(rule, answer.verdict, needed.verdict, best < 0);
     return this.answer(answer.phrase, { ...answer, inside, best, regionFits, verdict }, answer.codes);
   }
@@ -268,23 +266,21 @@ class Language {
     const every = row(this.tensors.taught_fits);
     const margins = row(this.tensors.taught_above);
     const solid = this.meta.levels.map((_, at) => {
-      const [first, last] = levelRange(this.regions, at);
-      const least = Math.min(rule.smallest, Math.max(0, ...sizes.subarray(first, last)));
-      const numbers = Array.from({ length: last - first }, (_, i) => first + i);
+      const numbers = regionsAt(this.regions, at);
+      const least = Math.min(rule.smallest, Math.max(0, ...numbers.map((region) => sizes[region])));
       return numbers.filter((region) => sizes[region] >= least);
     });
     const chosen = level < 0 ? word.level : level;
     const regions = solid[chosen];
     const least = Math.min(0, Math.max(...regions.map((region) => every[region])));
     const margin = Math.max(rule.least_likeness, ...regions.map((region) => margins[region]));
-    const better = (best, region) => (best < 0 || every[region] > every[best] ? region : best);
     const decision = {
       level: chosen,
       scores: solid.map((some) => Math.max(0, ...some.map((region) => sigmoid(every[region])))),
       fits: solid.map((some) => Math.max(rule.least_likeness, ...some.map((region) => every[region]))),
       regionFits: every,
       inside: regions.filter((region) => every[region] >= least),
-      best: regions.reduce(better, -1),
+      best: strongest(regions, every),
       verdict: verdict(rule, margin >= 0, "example", margin),
     };
     return this.answer(word.name, decision, null);
@@ -295,15 +291,12 @@ class Language {
     const { places, boxes } = this.tensors;
     const { best } = decision;
     const peak = decision.scores[decision.level];
-    const { values, members } = this.spread({ ...decision, codes }, decision.level);
+    const { values, members } = this.spread({ ...decision, codes });
     const rows = Uint32Array.from(members.keys()).filter((row) => members[row]);
-    const points = Float32Array.from({ length: 3 * rows.length }, (_, i) => {
-      return this.places[4 * rows[Math.trunc(i / 3)] + (i % 3)];
-    });
-    const smooth = smoothed(
-      points,
-      Float32Array.from(rows, (row) => values[row]),
-    );
+    const part = (_, i) => this.places[4 * rows[Math.trunc(i / 3)] + (i % 3)];
+    const points = Float32Array.from({ length: 3 * rows.length }, part);
+    const own = Float32Array.from(rows, (row) => values[row]);
+    const smooth = smoothed(points, own);
     const hottest = smooth.reduce((most, value) => Math.max(most, value), 0);
     return {
       ...decision,
@@ -318,37 +311,24 @@ class Language {
     };
   }
 
-  // The region of a Gaussian at a level, numbered from the first subpart; -1 for none.
-  regionOf(gaussian, level) {
-    const own = this.tensors.regions[level * this.gaussians + gaussian];
-    return own < 0 ? -1 : levelRange(this.regions, level)[0] + own;
-  }
-
-  // The relevancy of every Gaussian at a level, and whether it is a member of the answer.
-  spread(answer, level) {
-    const { regions: regionOf, codes } = this.tensors;
-    const values = new Float32Array(this.gaussians);
-    const members = new Uint8Array(this.gaussians);
-    const inside = new Set(answer.inside);
-    const [first] = levelRange(this.regions, level);
-    const [firstOfAnswer] = levelRange(this.regions, answer.level);
-    for (let i = 0; i < this.gaussians; ++i) {
-      const own = regionOf[answer.level * this.gaussians + i];
-      const region = regionOf[level * this.gaussians + i];
-      members[i] = own >= 0 && inside.has(firstOfAnswer + own) ? 1 : 0;
-      if (answer.codes) {
-        values[i] = answer.codes[codes[level * this.gaussians + i]];
-      } else {
-        values[i] = region >= 0 ? sigmoid(answer.regionFits[first + region]) : 0;
-      }
-    }
-    return { values, members };
+  // The relevancy of every Gaussian at the level of an answer, its region there (-1: none), and whether it is a
+  // member.
+  spread({ level, inside, codes, regionFits }) {
+    const [first] = regionsAt(this.regions, level);
+    const row = (tensor) => tensor.subarray(level * this.gaussians, (level + 1) * this.gaussians);
+    const owners = Int32Array.from(row(this.tensors.regions), (own) => (own < 0 ? -1 : first + own));
+    const fit = (region) => (region < 0 ? 0 : sigmoid(regionFits[region]));
+    const values = codes
+      ? Float32Array.from(row(this.tensors.codes), (code) => codes[code])
+      : Float32Array.from(owners, fit);
+    const among = new Set(inside);
+    return { values, owners, members: Uint8Array.from(owners, (region) => +among.has(region)) };
   }
 
   // Values of the Gaussians as display/displays.py has them (heats): of an answer from `base` to 1 by what heat is
   // of, and 0 for all others; "everywhere" minus the relevancy of each.
   heats(answer, of, base) {
-    const { values } = this.spread(answer, answer.level);
+    const { values, owners } = this.spread(answer);
     if (of === "everywhere") {
       return values.map((value) => -value);
     }
@@ -356,7 +336,7 @@ class Language {
     const even = of === "node" ? regionRelevancies(this.meta.rule, answer.regionFits) : null;
     const heats = new Float32Array(this.gaussians);
     answer.rows.forEach((row, i) => {
-      const node = even ? even[this.regionOf(row, answer.level)] : values[row];
+      const node = even ? even[owners[row]] : values[row];
       const value = of === "smooth" ? answer.smooth[i] : node;
       heats[row] = base + (1 - base) * Math.min(Math.max((value - low) / (high - low), 0), 1);
     });

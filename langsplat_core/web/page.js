@@ -342,7 +342,7 @@ class Page {
       this.painter.show(this.language.latents(this.level === "auto" ? 2 : levels.indexOf(this.level)));
     } else if (this.display !== "rgb") {
       const heats = (answer) => this.language.heats(answer, byId("heat").value, this.meta.picture.heat_base);
-      const members = (answer) => this.language.spread(answer, answer.level).members;
+      const members = (answer) => this.language.spread(answer).members;
       this.painter.show(hot.map(this.display === "segmentation" ? members : heats));
     }
     this.redraw();

@@ -35,35 +35,31 @@ function regionRelevancies(rule, fits) {
   return fits.map((fit) => (fit > rule.nothing ? sigmoid(fit) : 0));
 }
 
-// Numbers [first, last) of the regions of a level.
-function levelRange({ counts }, level) {
+// Numbers of the regions of a level, in their order.
+function regionsAt({ counts }, level) {
   const first = counts.slice(0, level).reduce((sum, count) => sum + count, 0);
-  return [first, first + counts[level]];
+  return Array.from({ length: counts[level] }, (_, i) => first + i);
+}
+
+// The one of some regions that has the largest value, of equal ones the first; -1 of none.
+function strongest(some, values) {
+  return some.reduce((best, region) => (best < 0 || values[region] > values[best] ? region : best), -1);
 }
 
 // The best relevancy of a level; of crumbs only where it has no more.
 function bestRelevancy(rule, regions, relevancies, level) {
-  const [first, last] = levelRange(regions, level);
-  let solid = -Infinity;
-  let any = 0;
-  for (let region = first; region < last; ++region) {
-    any = Math.max(any, relevancies[region]);
-    if (regions.sizes[region] >= rule.smallest) {
-      solid = Math.max(solid, relevancies[region]);
-    }
-  }
-  return Math.max(solid > -Infinity ? solid : any, 0);
+  const every = regionsAt(regions, level);
+  const solid = every.filter((region) => regions.sizes[region] >= rule.smallest);
+  return Math.max(0, relevancies[strongest(solid.length ? solid : every, relevancies)] ?? 0);
 }
 
 // Where parts of a thing may be: in and below the wholes that fit it nearly as well as the best one does.
 function onThings(rule, regions, thing) {
-  const [first, last] = levelRange(regions, regions.counts.length - 1);
-  const best = fitOf(
-    rule,
-    bestRelevancy(rule, regions, regionRelevancies(rule, thing), regions.counts.length - 1),
-  );
-  const least = leastFit(rule, best, rule.around);
-  const on = Array.from(thing, (fit, region) => region >= first && region < last && fit >= least);
+  const level = regions.counts.length - 1;
+  const best = bestRelevancy(rule, regions, regionRelevancies(rule, thing), level);
+  const least = leastFit(rule, fitOf(rule, best), rule.around);
+  const [first] = regionsAt(regions, level);
+  const on = Array.from(thing, (fit, region) => region >= first && fit >= least);
   for (let region = first - 1; region >= 0; --region) {
     on[region] = regions.parents[region] >= 0 && on[regions.parents[region]];
   }
@@ -156,25 +152,15 @@ function decide(rule, regions, own, named, level, evidence, thing = null, part =
   }
   const chosen = level < 0 ? given.lastIndexOf(Math.max(...given)) : level; // of equal levels the coarsest
   const least = leastFit(rule, bests[chosen]);
-  const [first, last] = levelRange(regions, chosen);
-  const inside = [];
-  let best = -1;
-  for (let region = first; region < last; ++region) {
-    if (every[region] >= least) {
-      inside.push(region);
-    }
-    const solid = relevancies[region] > 0 && relevancies[region] <= scores[chosen];
-    if (solid && (best < 0 || relevancies[region] > relevancies[best])) {
-      best = region;
-    }
-  }
+  const numbers = regionsAt(regions, chosen);
+  const solid = numbers.filter((region) => relevancies[region] > 0 && relevancies[region] <= scores[chosen]);
   return {
     level: chosen,
     scores,
     fits,
     regionFits: every,
-    inside,
-    best,
+    inside: numbers.filter((region) => every[region] >= least),
+    best: strongest(solid, relevancies),
     verdict: judge(rule, fits, named, level, evidence, commonFit(rule, regions, anywhere)),
   };
 }
@@ -189,4 +175,15 @@ function heatRange(rule, peak, found, best) {
 }
 // [/page]
 
-export { combined, decide, fitOf, heatRange, leastFit, levelRange, regionRelevancies, sigmoid, verdict };
+export {
+  combined,
+  decide,
+  fitOf,
+  heatRange,
+  leastFit,
+  regionRelevancies,
+  regionsAt,
+  sigmoid,
+  strongest,
+  verdict,
+};

@@ -30,12 +30,8 @@ class Space {
 
   // A body's centre as a camera has it: right, down, ahead.
   seen({ centre }, camera) {
-    const place = [0, 1, 2].map((axis) =>
-      inner(
-        [0, 3, 6].map((row) => this.frame[row + axis]),
-        centre,
-      ),
-    );
+    const column = (axis) => [0, 3, 6].map((row) => this.frame[row + axis]);
+    const place = [0, 1, 2].map((axis) => inner(column(axis), centre));
     return axes(camera).map((axis) => inner(axis, add(place, camera.position, -1)));
   }
 

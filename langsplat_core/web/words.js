@@ -122,7 +122,7 @@ function parse(text, lists) {
     const far = what.kind === "near" && ["nearest", "farthest"].includes(kind);
     return far ? { ...what, kind } : { kind, what, anchor: null };
   }
-  const count = lists.numbers.indexOf(first.toLowerCase()) + 1 || (/^\d{1,3}$/.test(first) ? +first : 0);
+  const count = [...lists.numbers].indexOf(first.toLowerCase()) + 1 || (/^\d{1,3}$/.test(first) ? +first : 0);
   if (count && names(rest.join(" "), lists)) {
     const what = parse(rest.join(" "), lists);
     return { kind: "counted", count, what: count === 1 ? what : oneOf(what, lists) };
@@ -132,7 +132,7 @@ function parse(text, lists) {
     return { kind: `${side.toLowerCase()}most`, what: parse(those, lists), anchor: null };
   }
   const [, before, preposition, after] = bare.match(lists.related) ?? [];
-  const relation = lists.prepositions[preposition?.toLowerCase()];
+  const relation = lists.prepositions.get(preposition?.toLowerCase());
   if (relation === "of" && namedBy(before, lists) === "part") {
     return { kind: "inside", what: { text: before }, anchor: parse(after, lists) };
   }

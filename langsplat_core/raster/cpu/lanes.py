@@ -41,15 +41,11 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, numba_type, FLOATS)
 
 
-def _constant(value: float) -> ir.Constant:
-    return ir.Constant(FLOATS, [float(value)] * LANES)
-
-
 def _kept(builder: Any, value: float) -> Any:
     """Return a constant that loops keep in a register; LLVM would fetch it from memory at every use."""
     kind = ir.FunctionType(FLOATS, [FLOATS])
     fence = builder.module.declare_intrinsic(f"llvm.arithmetic.fence.v{LANES}f32", (), kind)
-    return builder.call(fence, [_constant(value)])
+    return builder.call(fence, [ir.Constant(FLOATS, [float(value)] * LANES)])
 
 
 def as_lanes(builder: Any, value: Any, kind: Any = FLOATS) -> Any:
