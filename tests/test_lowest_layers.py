@@ -21,10 +21,9 @@ from langsplat_core.arrays import psnr
 from langsplat_core.cli.app import command_names, parse
 from langsplat_core.cli.train import Train
 from langsplat_core.compiled import Workers, is_compiled
-from langsplat_core.config import PAPER, CodecConfig, TrainConfig, check_settings, numeric_settings
+from langsplat_core.config import PAPER, check_settings, numeric_settings
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Progress, Report, TerminalProgress, TimeLeft
 from langsplat_core.scene import Scene
 from tests.support.processes import files_of_at_most, python, refusal
@@ -438,14 +437,6 @@ def test_the_command_line_names_the_option_as_typed(line, named, tmp_path, capsy
     error = refusal(capsys, "train", tmp_path, "--out", tmp_path / "s.ply", *line.split())
     assert error.lower().startswith(f"langsplat: {named}")
     assert list(tmp_path.iterdir()) == []  # nothing was begun
-
-
-def test_python_callers_are_refused_alike(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^--codec\.batch "):
-        train_scene(
-            tmp_path / "absent", tmp_path / "s.ply", TrainConfig(codec=CodecConfig("autoencoder", batch=1))
-        )
-    assert list(tmp_path.iterdir()) == []
 
 
 # How the options of `langsplat train` come together.

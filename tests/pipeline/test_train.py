@@ -200,6 +200,8 @@ def test_unusable_arguments_are_refused_before_work(room, tmp_path):
         train_scene(room, tmp_path / "scene.ply", absent)
     with pytest.raises(InputError):
         train_scene(tmp_path / "missing", tmp_path / "scene.ply", tiny_settings(room))
+    with pytest.raises(InputError, match=r"^--codec\.batch "):
+        train_scene(room, tmp_path / "scene.ply", TrainConfig(codec=CodecConfig("autoencoder", batch=1)))
     assert not list(tmp_path.glob("**/*.ply"))
 
 

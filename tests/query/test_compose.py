@@ -69,15 +69,12 @@ def test_grammar_reads_phrases_as_trees(text):
     assert grammar.parse(text) == READ[text]
 
 
-@pytest.mark.parametrize("text", ["", " \n\t", "'?!'", "the", "of the", "and", "\u200b", "\x00"])
+EXCLUDED = ("not cup", "not", "without the mug", ", not red", "except the mug")
+
+
+@pytest.mark.parametrize("text", ["", " \n\t", "'?!'", "the", "of the", "and", "\u200b", "\x00", *EXCLUDED])
 def test_phrase_that_names_nothing_is_refused(text):
-    with pytest.raises(InputError):
-        grammar.parse(text)
-
-
-@pytest.mark.parametrize("text", ["not cup", "not", "without the mug", ", not red", "except the mug"])
-def test_exclusion_alone_is_refused(text):
-    with pytest.raises(InputError, match="what not to look for"):
+    with pytest.raises(InputError, match="what not to look for" if text in EXCLUDED else None):
         grammar.parse(text)
 
 

@@ -387,6 +387,7 @@ def test_every_lookup_finds_the_relevancy_of_its_latents(kind, temperature, exac
     want = [plain_relevancy(v, phrase, scale) if k else 0 for v, k in zip(vectors, known, strict=True)]
     assert np.abs(got.ravel() - want).max() < 1e-5
     assert (got[1, 5:20] == 0).all()
+    assert not through_cells(replace(field, confidence=0 * field.confidence)).known.any()
 
 
 def test_codeword_zero_is_a_feature():
@@ -466,18 +467,6 @@ def test_cells_converge_to_exact_decoding():
         errors[most] = np.abs(latent_relevancy(codec, centres, phrases, canonical)[cells] - exact)
     assert errors[3200].mean() < 6e-3
     assert errors[3200].mean() < errors[200].mean() / 3  # of first order in the side of a cell
-
-
-def test_field_through_cells_keeps_unknown_gaussians():
-    field = random_field(300, "autoencoder")
-    field.confidence[1, 5:20] = 0
-    field.latents[2, 30:40] = 0
-    read = through_cells(field)
-    np.testing.assert_array_equal(read.known, field.known)
-    vectors, want = (each.codec.decode(each.latents[0][each.known[0]]) for each in (read, field))
-    np.testing.assert_allclose(vectors, want, atol=1e-5)
-    nothing = replace(field, confidence=0 * field.confidence)
-    assert not through_cells(nothing).known.any()
 
 
 def test_by_peaks_one_gaussian_scores_no_whole():

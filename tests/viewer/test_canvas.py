@@ -30,7 +30,6 @@ from langsplat_viewer.canvas import (
 from langsplat_viewer.rendering.renderer import ArrayRenderer, renderer_for
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
-from tests.support.fakes import blob_scene
 from tests.support.windowless import CHANGES, FakeRenderer, go, on_screen, put_marks, rest
 
 
@@ -203,19 +202,6 @@ def test_merged_gaussians_are_drawn_while_a_large_scene_moves(merging, shown):
     turn(shown)
     canvas.update(shown.state, now + 2.0)
     assert sizes(renderer) == [(100, 60)]
-
-
-def test_canvas_lets_go_of_a_scene_that_was_left(merging, shown):
-    canvas, renderer = merging
-    shown.state.scene = blob_scene()
-    left = weakref.ref(shown.state.scene)
-    now = moved_until_merged(canvas, renderer, shown)
-    shown.state.scene = blob_scene()
-    for _ in range(2):
-        canvas.update(shown.state, now := now + 1.0)
-    renderer.drawn.clear()
-    gc.collect()
-    assert left() is None
 
 
 # Another thread rasterizes the full image of a slow scene.
