@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.distance import pdist, squareform
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import photos
 from langsplat_core.datasets import workspace as workspaces
-from langsplat_core.datasets.capture import Capture, develop, random_points
+from langsplat_core.datasets.capture import Capture, develop, on_ground, random_points
 from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
 from langsplat_core.errors import FormatError, InputError, printable_line, report_loss, shortened
 from langsplat_core.io.files import atomic_path
@@ -131,7 +132,8 @@ def match_photos(workspace: Path, files: dict[str, Path], progress: Progress, si
     groups = _small_copies(workspace / "images", files, side, progress)
     names = sorted(name for group in groups for name in group.names)
     extract_features(workspace, groups, progress)
-    match_features(workspace, pairs_by_name(names), progress)
+    places = np.array([photos.exif_facts(files[name]).place for name in names])
+    match_features(workspace, pairs_to_match(names, places), progress)
     return len(names)
 
 
@@ -188,24 +190,27 @@ def _write_mask(images: Path, name: str, mask: Image.Image) -> None:
         mask.save(temporary)
 
 
-def pairs_by_name(names: Sequence[str]) -> list[workspaces.Pair]:
+def pairs_to_match(names: Sequence[str], places: Array) -> list[workspaces.Pair]:
     """Return every pair of up to 80 photographs; of more, all would cost too much.
 
-    Then each is paired with its next 10 neighbours in name order and with those at distances 16, 32, 64 ...,
-    which closes loops.
+    Then each is paired with its next 10 neighbours in name order, with those at distances 16, 32, 64 ...,
+    which closes loops, and with the `NEIGHBOURS` nearest by `places` (K, 2), degrees, NaN where unknown.
     """
-    count = len(names)
-    steps = [*range(1, 11), *(1 << k for k in range(4, count.bit_length()))]
-    if count <= 80:
-        steps = list(range(1, count))
-    return [(names[i], names[i + step]) for i in range(count) for step in steps if i + step < count]
+    count, named = len(names), np.flatnonzero(np.isfinite(places).all(1))
+    apart = [*range(1, 11), *(1 << k for k in range(4, count.bit_length()))]
+    steps = range(1, count) if count <= 80 else apart
+    pairs = {(i, i + step) for i in range(count) for step in steps if i + step < count}
+    if count > 80 and len(named):
+        near = nearest_pairs(squareform(pdist(on_ground(places[named]))))
+        pairs |= {(int(named[i]), int(named[j])) for i, j in near}
+    return [(names[i], names[j]) for i, j in sorted(pairs)]
 
 
 # Points for datasets that bring cameras but no points: triangulated, or at the worst random.
 
 MIN_POINTS = 100
 RANDOM_POINTS = 20_000
-NEIGHBOURS = 12  # views that each view is matched with
+NEIGHBOURS = 12  # nearest views that each view is matched with
 MAX_ANGLE = 75.0  # degrees between the axes of views that are matched
 
 
@@ -294,8 +299,12 @@ def neighbouring_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     axes = np.array([camera.rotation[2] for camera in cameras])
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     distance[axes @ axes.T < np.cos(np.radians(MAX_ANGLE))] = np.inf
+    return sorted(nearest_pairs(distance))
+
+
+def nearest_pairs(distance: Array) -> set[tuple[int, int]]:
+    """Return pairs (i < j) of each with its `NEIGHBOURS` nearest, by (K, K) distances; infinite: no pair."""
     np.fill_diagonal(distance, np.inf)
-    nearest = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBOURS].tolist()
-    return sorted(
-        {(min(i, j), max(i, j)) for i, row in enumerate(nearest) for j in row if np.isfinite(distance[i, j])}
-    )
+    nearest = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBOURS]
+    rows, at = np.nonzero(np.isfinite(np.take_along_axis(distance, nearest, 1)))
+    return {(min(pair), max(pair)) for pair in zip(rows.tolist(), nearest[rows, at].tolist(), strict=True)}

@@ -21,7 +21,7 @@ from langsplat_core.datasets import load_capture, reconstruction, sfm
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.photos import ExifFacts, find_photos
-from langsplat_core.datasets.sfm import add_points, neighbouring_pairs, pairs_by_name
+from langsplat_core.datasets.sfm import add_points, neighbouring_pairs, pairs_to_match
 from langsplat_core.datasets.workspace import ROOM, Matches, read_matches
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
@@ -227,10 +227,15 @@ def test_featureless_views_start_from_random_points(tmp_path: Path, caplog: pyte
 
 
 def test_pairs_are_all_of_few_and_linked_ones_of_many() -> None:
-    few = pairs_by_name([str(i) for i in range(5)])
+    unknown = np.full((400, 2), np.nan)
+    few = pairs_to_match([str(i) for i in range(5)], unknown[:5])
     assert len(few) == len(set(few)) == 10
-    many = pairs_by_name([f"{i:04d}" for i in range(400)])
+    many = pairs_to_match(names := [f"{i:04d}" for i in range(400)], unknown)
     assert len(many) == len(set(many)) < 400 * 20
+    along = np.minimum(np.arange(300), 299.5 - np.arange(300))  # 11 m a step, and back the same way
+    placed = set(pairs_to_match(names, np.vstack([np.c_[52 + 1e-4 * along, 0 * along], unknown[300:]])))
+    assert {("0000", "0299"), ("0007", "0290")} <= placed - set(many) < placed
+    assert not placed & {("0000", "0150"), ("0050", "0350")}
     linked = {(int(a), int(b)) for a, b in many}
     assert all((i, i + 1) in linked for i in range(399))
     assert (0, 256) in linked
