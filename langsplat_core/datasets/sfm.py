@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from scipy.spatial.distance import pdist, squareform
+from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
@@ -197,12 +197,13 @@ def pairs_to_match(names: Sequence[str], places: Array) -> list[workspaces.Pair]
     which closes loops, and with the `NEIGHBOURS` nearest by `places` (K, 2), degrees, NaN where unknown.
     """
     count, named = len(names), np.flatnonzero(np.isfinite(places).all(1))
-    apart = [*range(1, 11), *(1 << k for k in range(4, count.bit_length()))]
-    steps = range(1, count) if count <= 80 else apart
+    steps = [*range(1, 11), *(1 << k for k in range(4, 32))] if count > 80 else range(1, count)
     pairs = {(i, i + step) for i in range(count) for step in steps if i + step < count}
-    if count > 80 and len(named):
-        near = nearest_pairs(squareform(pdist(on_ground(places[named]))))
-        pairs |= {(int(named[i]), int(named[j])) for i, j in near}
+    if count > 80 and len(named) > 1:
+        at = on_ground(places[named])
+        rows = cKDTree(at).query(at, min(len(named), NEIGHBOURS + 1))[1]
+        near = zip(np.repeat(named, rows.shape[1]).tolist(), named[rows].ravel().tolist(), strict=True)
+        pairs |= {(min(ends), max(ends)) for ends in near if ends[0] != ends[1]}
     return [(names[i], names[j]) for i, j in sorted(pairs)]
 
 
@@ -299,12 +300,8 @@ def neighbouring_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     axes = np.array([camera.rotation[2] for camera in cameras])
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     distance[axes @ axes.T < np.cos(np.radians(MAX_ANGLE))] = np.inf
-    return sorted(nearest_pairs(distance))
-
-
-def nearest_pairs(distance: Array) -> set[tuple[int, int]]:
-    """Return pairs (i < j) of each with its `NEIGHBOURS` nearest, by (K, K) distances; infinite: no pair."""
     np.fill_diagonal(distance, np.inf)
-    nearest = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBOURS]
-    rows, at = np.nonzero(np.isfinite(np.take_along_axis(distance, nearest, 1)))
-    return {(min(pair), max(pair)) for pair in zip(rows.tolist(), nearest[rows, at].tolist(), strict=True)}
+    nearest = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBOURS].tolist()
+    return sorted(
+        {(min(i, j), max(i, j)) for i, row in enumerate(nearest) for j in row if np.isfinite(distance[i, j])}
+    )

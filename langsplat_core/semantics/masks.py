@@ -315,8 +315,7 @@ def nested_partitions(image: Array) -> Array:
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
     # A weight that removes carpet and keeps edges.
-    lab = rgb2lab(small).astype(np.float32) / 100
-    lab = 100 * denoise_tv_chambolle(lab, 0.12, max_num_iter=60, channel_axis=-1)
+    lab = 100 * denoise_tv_chambolle(np.float32(rgb2lab(small) / 100), 0.12, max_num_iter=60, channel_axis=-1)
     superpixels = slic(
         lab * np.array([0.6, 1, 1]),
         n_segments=min(700, lab.shape[0] * lab.shape[1]),
