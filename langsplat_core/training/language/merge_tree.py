@@ -355,9 +355,10 @@ def draw_patches(
     rows, columns = np.indices(most.shape) // CELL
     for some in np.split(np.arange(len(owners)), np.arange(32, len(owners), 32)):
         image, alpha = view.splat((channels[:, None] == some).astype(np.float32))
-        best = image.max(-1)
+        top = image.argmax(-1)
+        best = np.take_along_axis(image, top[..., None], -1)[..., 0]
         more = (best > most) & (alpha > SOLID)
-        drawn[more] = owners[some[image.argmax(-1)[more]], rows[more], columns[more]]
+        drawn[more] = owners[some[top[more]], rows[more], columns[more]]
         most = np.where(more, best, most)
     return drawn
 
@@ -376,19 +377,18 @@ def _boxes(footprints: Footprints, camera: Camera, patches: Array, count: int) -
 def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
     """Return (P,) channel of each patch or -1, the largest box first, and (C, rows, columns) owners."""
     channel_of = np.full(len(boxes), -1)
-    owners: list[Array] = []
     rows, columns = (int(boxes[:, side].max(initial=0)) for side in (3, 2))
+    owners = np.full((32, rows, columns), -1, np.int32)
     areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     seen = np.flatnonzero(shown & (boxes[:, :2] < boxes[:, 2:]).all(1))
     for patch in seen[np.argsort(-areas[seen], kind="stable")]:
         left, top, right, bottom = boxes[patch]
-        place = np.s_[top:bottom, left:right]
-        free = (number for number, owner in enumerate(owners) if owner[place].max() < 0)
-        channel_of[patch] = channel = next(free, len(owners))
-        if channel == len(owners):
-            owners.append(np.full((rows, columns), -1, np.int32))
-        owners[channel][place] = patch
-    return channel_of, np.array(owners, np.int32).reshape(len(owners), rows, columns)
+        taken = (owners[:, top:bottom, left:right] >= 0).any((1, 2))
+        if taken.all():
+            taken, owners = np.append(taken, False), np.concatenate([owners, np.full_like(owners[:32], -1)])
+        channel_of[patch] = channel = taken.argmin()
+        owners[channel, top:bottom, left:right] = patch
+    return channel_of, owners[: channel_of.max(initial=-1) + 1]
 
 
 def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> tuple[Array, Array]:
