@@ -714,7 +714,7 @@ def use_the_toolbar(s: Any) -> None:
     """Every icon does what its command does, however low the strip is."""
     s.open_panel("Timeline")
     labels = {row.does: button_label(row).replace("/", "\\/") for row in COMMANDS if row.icon}
-    icons = {does: f"//toolbar/{label}" for does, label in labels.items()}
+    icons = {does: f"//Tools/{label}" for does, label in labels.items()}
     for does, icon in icons.items():
         info = s.ctx.item_info(icon)
         assert info.window.inner_rect.max.y >= info.rect_full.max.y, does  # is not cut off

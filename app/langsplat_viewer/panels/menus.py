@@ -74,7 +74,7 @@ def draw_toolbar(viewer: Viewer, area: ui.Area) -> float:
     at = ImVec2(area.left + margin, area.top + margin)
     wide, high = columns * side + 2 * edge, count * side + rest
     imgui.set_next_window_size(ImVec2(wide, min(high, room)))
-    with ui.floating("toolbar", at, flags=ui.OVER | ui.FIXED, padding_em=EDGE_EM):
+    with ui.floating("Tools", at, flags=ui.OVER | ui.FIXED, padding_em=EDGE_EM):
         none = ImVec2(0, 0)
         with theme.styled(item_spacing=none, frame_padding=none, frame_border_size=0.0):
             for group in GROUPS:

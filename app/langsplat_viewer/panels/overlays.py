@@ -302,7 +302,7 @@ def _names(named: list[Named], area: ui.Area) -> None:
         wanted.append(PlacedText(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
     taken = [
         PlacedText(low.x - area.left, low.y - area.top, high.x - low.x, high.y - low.y)
-        for low, high in ui.lying_over("Search", "search button", "toolbar", "relevancy")
+        for low, high in ui.lying_over("Search", "search button", "Tools", "relevancy")
     ]
     found = placed(wanted, (area.width, area.height), taken)
     for name, alone, label in zip(named, wanted, found, strict=True):
