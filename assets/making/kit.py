@@ -497,7 +497,7 @@ class Kit:
         return Material(colour_word(colour) or "", colour, darker(colour, 4), "plaster", 0.0)
 
     def metal(self) -> Material:
-        """Grey metal."""
+        """Return grey metal."""
         return self.steel("gray")
 
 

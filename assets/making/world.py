@@ -214,7 +214,7 @@ def label_region(level: int, thing: Thing, piece: Piece) -> RegionLabel:
 
 
 def _surface(mesh: TriMesh) -> float:
-    """Square metres."""
+    """Return the area of a mesh, square metres."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 

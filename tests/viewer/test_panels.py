@@ -315,10 +315,7 @@ PICTURE = (400.0, 300.0)
 
 
 def test_labels_that_meet_lie_one_above_the_other():
-    for wanted, heights in (
-        ((45, 50, 60), [45, 25, 5]),
-        ((0, 3, 6), [0, 20, 40]),
-    ):  # else below
+    for wanted, heights in (((45, 50, 60), [45, 25, 5]), ((0, 3, 6), [0, 20, 40])):  # else below
         labels = placed([PlacedText(0, y, 50, 20) for y in wanted], PICTURE)
         assert [label.y for label in labels] == heights
     panel, label = PlacedText(0, 10, 200, 150), PlacedText(20, 40, 50, 20)

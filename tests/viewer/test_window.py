@@ -1,5 +1,6 @@
 """The program: pictures without a window, refusals as one line, and the window on a virtual display."""
 
+import json
 import os
 import shutil
 import signal
@@ -360,3 +361,13 @@ def test_absent_backend_is_refused_before_a_window(display, tmp_path, blobs):
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "cuda" in done.stderr.lower()
+
+
+@pytest.mark.long
+def test_images_are_coarse_while_moving_only(display, tmp_path):
+    options = ["--scene", str(DEMO), "--count", "0", "--seconds", "2", "--size", "860", "620", "--slow"]
+    seen = json.loads(run(display, tmp_path, *options))
+    assert len(seen["sharp_after"]) == 3
+    if seen["backend"] == "cpu":
+        assert all(width < 250 for width, _ in seen["sizes"])  # a quarter of what the panels leave
+        assert seen["merged"] == [True] * 3
