@@ -256,6 +256,15 @@ class Session:
             phrase, slot=slot, shown_since=1 + max((q.shown_since for q in shown), default=0)
         )
 
+    def without(self, phrases: Collection[str]) -> "Session":
+        """Return the session without some queries; for the chosen one the latest is chosen, and shown."""
+        left = tuple(query for query in self.queries if query.phrase not in phrases)
+        session = replace(self, queries=left)
+        if self.chosen not in phrases:
+            return session
+        session = replace(session, chosen=left[-1].phrase if left else "")
+        return session if session.in_order_of_showing() else session.showing(session.chosen)
+
     def answering(self, phrase: str, painted: bool, beside: Collection[str]) -> "Session":
         """Return the session with a display of answers, and a query shown where something is painted.
 

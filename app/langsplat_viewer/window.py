@@ -205,7 +205,6 @@ class Window:
         panels.default_imgui_window_type = hello_imgui.DefaultImGuiWindowType.provide_full_screen_dock_space
         panels.show_menu_bar, panels.show_menu_app, panels.show_menu_view = True, False, False
         panels.remember_theme = False  # it is one of the preferences
-        panels.show_status_fps = panels.remember_status_bar_settings = False
         params.docking_params = layout.params(self.viewer, window.window_geometry.size[0])
         gl = params.renderer_backend_options.open_gl_options
         gl.major_version, gl.minor_version = major, minor
@@ -218,7 +217,6 @@ class Window:
         params.callbacks.load_additional_fonts = ui.load_fonts
         params.callbacks.setup_imgui_style = self._workspace.style
         params.callbacks.show_menus = lambda: menus.draw_menus(self.viewer, layout.draw_titles)
-        params.callbacks.show_status = lambda: menus.draw_status(self.viewer)
         params.callbacks.post_init = self._start
         params.callbacks.pre_new_frame = self.keyboard.feed
         params.callbacks.show_gui = self._gui

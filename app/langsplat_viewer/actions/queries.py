@@ -150,11 +150,11 @@ def focus_search(viewer: Viewer) -> None:
 
     The letters that follow are no commands then, until a click or Esc.
     """
-    open_panel(viewer, "Search")
-    if viewer.searchable() is not None:
-        viewer.state.focus_input = viewer.state.awaits_keyboard = True
-    else:
-        viewer.state.letters_muted = True
+    state, can_search = viewer.state, viewer.searchable() is not None
+    if state.scene is not None:
+        open_panel(viewer, "Search")
+    state.focus_input = state.awaits_keyboard = can_search
+    state.letters_muted = not can_search
 
 
 # Names that are taught.
@@ -203,10 +203,8 @@ def show(viewer: Viewer, phrase: str, shown: bool = True) -> None:
 
 def remove(viewer: Viewer, phrase: str) -> None:
     """Take a query off the list; where it was chosen, the latest one is."""
-    session = viewer.state.session
-    left = tuple(query for query in session.queries if query.phrase != phrase)
-    latest = left[-1].phrase if left else ""
-    viewer.change(queries=left, chosen=latest if session.chosen == phrase else session.chosen)
+    left = viewer.state.session.without({phrase})
+    viewer.change(queries=left.queries, chosen=left.chosen)
     forget_unlisted(viewer)
 
 

@@ -236,8 +236,8 @@ def escape(viewer: Viewer) -> None:
         toggle_measuring(viewer)
     failed = {query.phrase for query in state.session.queries if state.answer(query).problem}
     if failed:
-        left = tuple(query for query in state.session.queries if query.phrase not in failed)
-        viewer.change(queries=left, chosen=left[-1].phrase if left else "")
+        left = state.session.without(failed)
+        viewer.change(queries=left.queries, chosen=left.chosen)
     if not lay_over:
         state.tools = replace(tools, stroke=None, tool=tools.tool if tools.stroke else None)
 

@@ -184,7 +184,8 @@ class Docks:
         for window in docking.dockable_windows:
             window.is_visible = shown and window.label in (INSPECTOR, *windows)
         self._shown = [window.label for window in docking.dockable_windows if window.is_visible]
-        params.imgui_window_params.show_status_bar = shown
+        foot = ImVec2(0, menus.STATUS_EM if shown else 0)  # room for the status line
+        params.imgui_window_params.full_screen_window_margin_bottom_right = foot
         if wanted and shown:  # in front of those that it shares its place with
             docked = wanted in self._shown
             is_section = not docked and any(p.title == wanted and p.dock for p in all_panels())
@@ -221,6 +222,7 @@ def draw_over(
     """Draw what lies over the scene: search, legends, tools, questions, dialogs, help and palette."""
     area = ui.scene_area()
     start.draw(viewer, area)
+    menus.draw_status(viewer)
     free = _float_search(viewer, area, menus.draw_toolbar(viewer, area))
     state, said = viewer.state, viewer.state.nothing  # in place of an image
     if state.scene is None and not state.show_start:

@@ -103,12 +103,17 @@ def button_label(command: Command) -> str:
 
 # The status line.
 
-BAR_EM, FOOT = 18.0, ("Timeline", "Messages")
+STATUS_EM, BAR_EM, FOOT = 2.2, 18.0, ("Timeline", "Messages")
 DRAWN_BY = {"cpu": "the processor", "opengl": "OpenGL", "cuda": "CUDA", "": "nothing yet"}
 
 
 def draw_status(viewer: Viewer) -> None:
     """Draw what is under way with its Cancel, the figures, and what is opened at the foot."""
+    if not viewer.state.show_panel or viewer.state.show_start:
+        return
+    flags = imgui.WindowFlags_.no_scrollbar | imgui.WindowFlags_.no_saved_settings
+    window, high = imgui.get_main_viewport(), hello_imgui.em_size(STATUS_EM)
+    imgui.internal.begin_viewport_side_bar("Status line", window, imgui.Dir.down, high, flags)
     imgui.push_style_var(imgui.StyleVar_.frame_padding, hello_imgui.em_to_vec2(0.6, 0.1))
     imgui.set_cursor_pos_y((imgui.get_window_height() - imgui.get_frame_height()) / 2)
     right = imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x
@@ -134,6 +139,7 @@ def draw_status(viewer: Viewer) -> None:
             settings.turn_panel(viewer, title, is_open=not is_open)
         imgui.same_line()
     imgui.pop_style_var()
+    imgui.end()
 
 
 def _figures(viewer: Viewer) -> Iterator[tuple[str, str]]:

@@ -72,16 +72,11 @@ def parts_of(area: ui.Area, split: Split) -> list[ui.Area]:
 
 def text_on_shade(text: str, x: float, y: float, area: ui.Area) -> None:
     """Write text on a shade, nowhere outside the area."""
-    paint, size, edge = (
-        imgui.get_background_draw_list(),
-        imgui.calc_text_size(text),
-        hello_imgui.em_size(SHADE_EM),
-    )
+    paint, corner = imgui.get_background_draw_list(), ImVec2(x, y)
+    edge = hello_imgui.em_to_vec2(SHADE_EM, SHADE_EM)
     paint.push_clip_rect(*area.corners)
-    paint.add_rect_filled(
-        ImVec2(x - edge, y - edge), ImVec2(x + size.x + edge, y + size.y + edge), SHADE, 3.0
-    )
-    paint.add_text(ImVec2(x, y), WHITE, text)
+    paint.add_rect_filled(corner - edge, corner + imgui.calc_text_size(text) + edge, SHADE, 3.0)
+    paint.add_text(corner, WHITE, text)
     paint.pop_clip_rect()
 
 
@@ -201,14 +196,10 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
     if state.view.orthographic:
         span = overlays.measured(state.view.span_in(*state.size), metres)
         foot.append(f"orthographic, {span} across the shorter side")
-    line = imgui.get_text_line_height()
-    for number, text in enumerate(foot, 1):
-        text_on_shade(
-            text,
-            area.left + hello_imgui.em_size(TOOLS_EM),
-            area.top + area.height - 1.6 * number * line,
-            area,
-        )
+    left, y = area.left + hello_imgui.em_size(TOOLS_EM), area.top + area.height
+    for text in foot:
+        y -= 1.6 * imgui.get_text_line_height()
+        text_on_shade(text, left, y, area)
     if not imgui.get_io().want_capture_mouse:
         _take_click(viewer, area)
 
@@ -291,12 +282,7 @@ def _things(viewer: Viewer, pen: Pen) -> None:
 
 def _names(named: list[Named], area: ui.Area) -> None:
     """Write texts above their corners and beside what floats there, with a line to those that made room."""
-    line, edge, paint = (
-        imgui.get_text_line_height(),
-        hello_imgui.em_size(SHADE_EM),
-        imgui.get_background_draw_list(),
-    )
-    wanted = []
+    line, edge, wanted = imgui.get_text_line_height(), hello_imgui.em_size(SHADE_EM), []
     for name in named:
         (x, y), size = name.corner - (area.left, area.top), imgui.calc_text_size(name.text)
         wanted.append(PlacedText(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
@@ -308,7 +294,8 @@ def _names(named: list[Named], area: ui.Area) -> None:
     for name, alone, label in zip(named, wanted, found, strict=True):
         if abs(label.y - alone.y) > label.height / 2:
             end = ImVec2(area.left + label.x, area.top + label.y + label.height / 2)
-            paint.add_line(ImVec2(*name.corner), end, imgui.get_color_u32(name.colour), 1.5)
+            colour = imgui.get_color_u32(name.colour)
+            imgui.get_background_draw_list().add_line(ImVec2(*name.corner), end, colour, 1.5)
     for name, label in zip(named, found, strict=True):
         text_on_shade(name.text, area.left + label.x + edge, area.top + label.y + edge, area)
 
