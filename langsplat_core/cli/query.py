@@ -381,7 +381,7 @@ def _answer(result: QueryResult, camera: Camera | None) -> dict[str, Any]:
         "verdict": result.verdict,
         "said": result.said,
         "probability": result.probability,
-        "by_chance": result.by_chance,
+        "by_chance": result.judgement.by_chance,
         "score": result.peak,
         "level": LEVELS[result.level],
         "scores": dict(zip(LEVELS, result.scores, strict=True)),

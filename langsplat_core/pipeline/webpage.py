@@ -59,7 +59,7 @@ from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary
 # In an order in which each imports only those before it, so that their code can stand in one script.
 MODULES = ("words", "rule", "encoder", "camera", "space", "language", "data", "draw", "headset", "page")
 BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, without its imports and exports
-WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL")
+WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL", "MEASURES")
 WORD_TABLES = ("SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")
 STILL = 1280  # pixels of the longer side of the picture in the page
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
@@ -254,6 +254,7 @@ def language_tables(
         **_region_tables(engine, codes),
     }
     bars = [asdict(bar) for bar in engine.bars or ()]
+    found = {name: [None if np.isinf(x) else x for x in pair] for name, pair in RULE.found.items()}
     progress("choosing phrases", 0.3)
     suggested = suggest(engine)
     numbers: dict[str, Any] = {
@@ -263,7 +264,7 @@ def language_tables(
         "guess": engine.basis.short if engine.basis.guesses else "",
         "bars": bars,
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
-        "rule": RULE.as_json() | {"least_likeness": taught.LEAST},
+        "rule": asdict(RULE) | {"found": found, "least_likeness": taught.LEAST},
         "grammar": {
             **{name.lower(): sorted(getattr(grammar, name)) for name in WORD_LISTS},
             "prepositions": {" ".join(words): kind for words, kind in grammar.PREPOSITIONS.items()},

@@ -226,21 +226,6 @@ def build_regions(tree: Tree, weights: Array) -> Regions:
     return Regions(tuple(nodes), np.stack(everywhere), weights, tuple(sizes), tuple(totals), table)
 
 
-@dataclass(frozen=True, eq=False)
-class Spread:
-    """Relevancy at a level, the same all over a region, made of all N Gaussians when called."""
-
-    regions: Regions
-    level: int
-    values: Array  # (R,) float32 of the level's regions
-    own: Relevancy  # of what is in none of them
-
-    def __call__(self) -> Array:
-        """Return (N,) float32."""
-        own = np.asarray(self.own.values[self.own.features[self.level]])
-        return self.regions.spread(self.level, self.values, own)
-
-
 def place_of(points: Array) -> tuple[Array, Array]:
     """Return place (3,), at what is nearest to the middle, and box (2, 3) of (K, 3) points, K >= 1."""
     points = points.astype(np.float64)
@@ -277,14 +262,14 @@ def by_regions(
     phrase: str, relevancy: Relevancy, decision: Decision, means: Array, regions: Regions
 ) -> QueryResult:
     """Return the answer by the rule. means: (N, 3) of the Gaussians."""
-    chosen = decision.level
+    chosen, values = decision.level, relevancy.values
     place, box = regions.place(means, chosen, decision.best)
     return QueryResult(
         phrase=phrase,
         level=chosen,
         scores=decision.scores,
         relevancy=relevancy,
-        even=Spread(regions, chosen, decision.relevancies, relevancy),
+        even=lambda: regions.spread(chosen, decision.relevancies, values[relevancy.features[chosen]]),
         peak=decision.scores[chosen],
         fits=decision.fits,
         judgement=decision.verdict,

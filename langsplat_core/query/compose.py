@@ -34,7 +34,7 @@ from langsplat_core.query.grammar import (
     parse,
     unparse,
 )
-from langsplat_core.query.relations import Body, body, most, separate, stands, upright, viewpoint
+from langsplat_core.query.relations import Body, body, ranked, separate, stands, upright, viewpoint
 from langsplat_core.query.rule import RULE, Verdict, combined
 from langsplat_core.scene import LEVELS, Camera
 from langsplat_core.scene.language import phrase_key, tidy
@@ -139,8 +139,8 @@ class _Asking:
         self._frame = upright(engine.scene.up())
         self._viewpoint = None if camera is None else viewpoint(camera, self._frame)
 
-    def answer(self, tree: Phrase, level: LevelChoice = "auto") -> QueryResult:
-        """Return the answer to a tree; without a place, which only the last answer needs."""
+    def answer(self, tree: Phrase, level: LevelChoice = "auto", count: int = 1) -> QueryResult:
+        """Return the answer to a tree, of a superlative the `count` that are most so; without a place."""
         match tree:
             case Atom(text):
                 return self._thing(text, level)
@@ -157,11 +157,11 @@ class _Asking:
             case Inside(part, whole):
                 return self._inside(part, whole, level)
             case Counted(count, what):
-                every = self.answer(what, level)
+                every = self.answer(what, level, count)
                 enough = every.found and count_things(self.engine, every).most >= count
                 return replace(every, judgement=replace(every.judgement, found=enough))
             case Relation() | Superlative():
-                return self._chosen(tree, level)
+                return self._chosen(tree, level, count)
 
     def _ask(self, text: str, level: LevelChoice) -> QueryResult:
         key = (phrase_key(text), level)
@@ -190,13 +190,13 @@ class _Asking:
         found = engine.run_inside(names, on, level, calibration)
         return restricted(found, found.members, thing)
 
-    def _chosen(self, tree: Relation | Superlative, level: LevelChoice) -> QueryResult:
+    def _chosen(self, tree: Relation | Superlative, level: LevelChoice, count: int) -> QueryResult:
         what = self.answer(tree.what, level)
         anchor = None if tree.anchor is None else self.answer(tree.anchor)
         things, anchors = self._bodies(what), [] if anchor is None else self._bodies(anchor)
         if isinstance(tree, Superlative):
             every, others = [thing for _, thing in things], [other for _, other in anchors]
-            right = {most(tree.kind, every, others, self._viewpoint)} if every else set()
+            right = {*ranked(tree.kind, every, others, self._viewpoint)[:count]}
         else:
             right = {
                 row

@@ -240,7 +240,7 @@ def children(tree: Phrase) -> tuple[Phrase, ...]:
 #     exclusion   = ", not" | "but not" | "and not" | "not" | "without" | "except" | "other than"
 #     alternatives = all { ("or" | ",") all }
 #     all         = clause { ("and" | "&" | "as well as") clause }
-#     clause      = [ superlative | number ] related [ "on the left" | "on the right" ]
+#     clause      = [ superlative ] [ number ] [ superlative ] related [ "on the left" | "on the right" ]
 #     superlative = "biggest" | "smallest" | "nearest" | "farthest" | "highest" | "lowest" | "leftmost" | ...
 #     number      = "one" | "two" | ... | "twelve" | digits
 #     related     = thing { preposition related }      the first preposition relates all that follows it
@@ -274,7 +274,8 @@ _SIDES: dict[str, Side] = {
     "above": "above", "over": "above", "below": "below", "under": "below", "underneath": "below",
     "beneath": "below", "behind": "behind", "in back of": "behind", "in front of": "in front of",
 }  # fmt: skip
-NUMBERS = ["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+_COUNTED = ["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+NUMBERS = {str(number): number for number in range(1, 1000)} | dict(zip(_COUNTED, range(1, 13), strict=True))
 PREPOSITIONS: dict[tuple[str, ...], Side | Literal["nearest", "farthest", "of"]] = {
     ("of",): "of",
     **{(word, to): kind for word, kind in _DISTANCES.items() for to in ("to", "from")},
@@ -282,13 +283,7 @@ PREPOSITIONS: dict[tuple[str, ...], Side | Literal["nearest", "farthest", "of"]]
 }
 _EMPTY = STOP_WORDS | ADJECTIVES
 _LONGEST = max(map(len, PREPOSITIONS))
-_EXCLUSIONS = tuple(
-    tuple(text.split())
-    for text in (
-        *(", but not", ", and not", ", not", ", without", ", except"),
-        *("but not", "and not", "other than", "not", "without", "except"),
-    )
-)
+_EXCLUSIONS = [["but", "not"], ["and", "not"], ["other", "than"], ["not"], ["without"], ["except"]]
 
 
 def parse(text: str, names: Collection[str] = ()) -> Phrase:
@@ -354,8 +349,9 @@ def _of_it(unwanted: Phrase, wanted: Phrase) -> Phrase:
 
 def _exclusion_at(tokens: list[str], at: int) -> int:
     """Return number of tokens of the exclusion that begins at token `at`; 0 for none."""
-    ahead = tuple(token.lower() for token in tokens[at : at + 3])
-    return next((len(words) for words in _EXCLUSIONS if ahead[: len(words)] == words), 0)
+    comma = int(tokens[at] == ",")
+    ahead = [token.lower() for token in tokens[at + comma : at + comma + 2]]
+    return next((comma + len(words) for words in _EXCLUSIONS if ahead[: len(words)] == words), 0)
 
 
 def _alternatives(tokens: list[str]) -> Phrase:
@@ -393,6 +389,8 @@ def _names(tokens: list[str]) -> bool:
 def _clause(tokens: list[str]) -> Phrase:
     tokens = _without_articles(tokens)
     low = [token.lower() for token in tokens]
+    if low[0] in SUPERLATIVES and not NUMBERS.keys().isdisjoint(low[1:2]):  # "biggest two mugs"
+        tokens, low = ([words[1], words[0], *words[2:]] for words in (tokens, low))
     kind = SUPERLATIVES.get(low[0])
     if kind and _names(tokens[1:]):
         what = _related(tokens[1:])
@@ -402,8 +400,7 @@ def _clause(tokens: list[str]) -> Phrase:
         if kind in ("nearest", "farthest") and at and _names(tokens[1:at]) and _names(tokens[at + 1 :]):
             return Superlative(kind, _related(tokens[1:at]), _related(tokens[at + 1 :]))
         return Superlative(kind, what)
-    digits = low[0] if re.fullmatch("[0-9]{1,3}", low[0]) else "0"
-    count = NUMBERS.index(low[0]) + 1 if low[0] in NUMBERS else int(digits)
+    count = NUMBERS.get(low[0], 0)
     if count and _names(tokens[1:]):
         what = _clause(tokens[1:])
         return Counted(count, what if count == 1 else _one_of(what))
@@ -432,7 +429,8 @@ def _related(tokens: list[str]) -> Phrase:
             kind = PREPOSITIONS.get(tuple(token.lower() for token in tokens[at : at + length]))
             before, after = tokens[:at], tokens[at + length :]
             named = _names(before) or (kind == "of" and is_part(before[-1]))
-            if kind and named and _names(after) and not (kind == "of" and _holds(before)):
+            holds = not MEASURES.isdisjoint(forms(before[-1])) and only(_EMPTY, before[:-1])  # "cup of tea"
+            if kind and named and _names(after) and not (kind == "of" and holds):
                 what, anchor = _thing(before), _clause(after)
                 if kind == "of":
                     return Inside(what, anchor)
@@ -440,11 +438,6 @@ def _related(tokens: list[str]) -> Phrase:
                     return Superlative(kind, what, anchor)
                 return Relation(kind, what, anchor)
     return _thing(tokens)
-
-
-def _holds(tokens: list[str]) -> bool:
-    """Return whether a noun, with words that describe it, holds or counts what follows "of"."""
-    return not MEASURES.isdisjoint(forms(tokens[-1])) and only(_EMPTY, tokens[:-1])
 
 
 def _thing(tokens: list[str]) -> Phrase:

@@ -170,10 +170,8 @@ def _spots(describer: Describer, rows: Array) -> tuple[Spot, ...]:
     for own in parts:
         if len(own) < LEAST_COUNT or areas[own].sum() < LEAST_SPOT * areas[parts[0]].sum():
             continue
-        weights, positions = (
-            np.maximum(areas[own], 1e-300),
-            engine.scene.gaussians.means[own].astype(np.float64),
-        )
+        weights = np.maximum(areas[own], 1e-300)
+        positions = engine.scene.gaussians.means[own].astype(np.float64)
         centre, share = weights @ positions / weights.sum(), float(weights.sum()) / float(areas.sum())
         found.append(Spot(centre, axis_aligned_box(positions), own, share))
     return tuple(found)
@@ -262,9 +260,8 @@ def export_labels(describer: Describer, path: Path) -> Path:
     upper corner, between 2 % and 98 % of the Gaussians) and votes.
     """
     scene, members = describer.engine.scene, describer.engine.tree.gaussians()
-    labels = {
-        name: np.full(len(scene.gaussians), NO_NODE, np.int32) for name in ("instance", "part", "class")
-    }
+    none = np.full(len(scene.gaussians), NO_NODE, np.int32)
+    labels = {name: none.copy() for name in ("instance", "part", "class")}
     classes: list[str] = []
     nodes: list[dict[str, Any]] = []
 

@@ -150,10 +150,11 @@ def _above(what: Body, anchor: Body) -> bool:
     return bool(overlap and what.centre[2] > anchor.high[2] and what.low[2] > anchor.centre[2])
 
 
-def most(kind: Extreme, things: list[Body], anchors: list[Body], seen_by: Array | None) -> int:
-    """Return number of the one of `things` that is most so, as nearest to `anchors`, else the viewpoint."""
-    sign = -1 if kind in ("smallest", "nearest", "lowest", "leftmost") else 1
-    return int(np.nanargmax([sign * _measure(kind, thing, anchors, seen_by) for thing in things]))
+def ranked(kind: Extreme, things: list[Body], anchors: list[Body], seen_by: Array | None) -> list[int]:
+    """Return numbers of `things`, what is most so first, as nearest to `anchors`, else the viewpoint."""
+    sign = 1 if kind in ("smallest", "nearest", "lowest", "leftmost") else -1
+    measured = [sign * _measure(kind, thing, anchors, seen_by) for thing in things]
+    return [int(number) for number in np.argsort(measured, kind="stable")]
 
 
 def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Array | None) -> float:

@@ -8,8 +8,8 @@ The numbers were chosen on rooms 201 to 203, with the bundled encoder and CLIP's
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -50,11 +50,6 @@ class Rule:
     by_chance: tuple[float, float] = (0.05, 2.0)
     weak_probability: float = 0.5  # from which what is not found is a weak match,
     weak_excess: float = -0.5  # likewise in spreads, where there is no probability
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the table for JSON, which has no infinity: None stands for it."""
-        found = {name: [None if np.isinf(x) else x for x in pair] for name, pair in self.found.items()}
-        return asdict(self) | {"advantage": dict(self.advantage), "found": found}
 
     def least_fit(self, best: float, share: float = 1.0) -> float:
         """Return the fit from which a region belongs to an answer; `share`: of the way that it reaches."""
@@ -273,15 +268,10 @@ class Judged:
         """The verdict with the percentage behind it, such as "found, 83 %" or "found, by chance 2 %"."""
         if self.probability is not None:
             return f"{self.verdict}, {100 * self.probability:.0f} %"
-        if self.by_chance is None:
+        if (by_chance := self.judgement.by_chance) is None:
             return self.verdict
-        share = 100 * max(self.by_chance, 0.001)  # never none
+        share = 100 * max(by_chance, 0.001)  # never none
         return f"{self.verdict}, by chance {share:.{0 if share >= 1 else 1}f} %"
-
-    @property
-    def by_chance(self) -> float | None:
-        """The share of phrases for nothing here that fit as well, see `Verdict.by_chance`."""
-        return self.judgement.by_chance
 
 
 def combined(verdicts: Sequence[Verdict], all_needed: bool) -> Verdict:

@@ -74,12 +74,11 @@ class Language {
     this.keys = new Map(meta.keys.map((key, row) => [key, row]));
     this.taught = new Map(meta.taught.map((word, row) => [phraseKey(word.name), { ...word, row }]));
     const { prepositions, articles } = meta.grammar;
-    const longest = Object.keys(prepositions).sort((a, b) => b.length - a.length);
     const table = (words) => (Array.isArray(words) ? new Set(words) : new Map(Object.entries(words)));
     this.lists = {
       ...Object.fromEntries(Object.entries(meta.grammar).map(([name, words]) => [name, table(words)])),
       leading: new RegExp(`^(?:(?:${articles.join("|")}) )+`, "i"),
-      related: new RegExp(`^(.+?) (${longest.join("|")}) (.+)$`, "i"),
+      longest: Math.max(...Object.keys(prepositions).map((words) => words.split(" ").length)),
     };
     if (meta.encoder) {
       this.encoder = new ClipText(meta.encoder, (name) => this.tensors[`encoder.${name}`], this.dim);
@@ -106,17 +105,17 @@ class Language {
 
   // The answer to a tree of phrases (words.js, parse): of what is asked for, the regions in whose wholes the
   // relation holds.
-  follow({ text, kind, what, anchor, count }, levelName, camera) {
+  follow({ text, kind, what, anchor, count }, levelName, camera, most = 1) {
     if (!kind) {
       return this.ask(text, levelName);
     }
     const other = anchor && this.thing(anchor, "auto", camera);
     const others = other ? this.wholesOf(other) : [];
     if (kind === "inside") {
-      const part = this.part(what.text, anchor, others, levelName);
-      return this.restricted(part, this.wholesOf(part), other);
+      const part = what.text ? this.part(what.text, anchor, others, levelName) : this.follow(what, levelName);
+      return this.restricted(part, what.text ? this.wholesOf(part) : others, other);
     }
-    const asked = this.thing(what, levelName, camera);
+    const asked = this.thing(what, levelName, camera, count);
     if (kind === "counted") {
       const { found, reached, margin, probability } = asked.verdict;
       const enough = found && this.count(asked) >= count;
@@ -128,7 +127,7 @@ class Language {
       const left = things.filter((thing) => !others.includes(thing));
       return other.verdict.found ? this.restricted(asked, left, asked) : asked;
     }
-    return this.restricted(asked, this.space.chosen(kind, things, others, camera), other ?? asked);
+    return this.restricted(asked, this.space.chosen(kind, things, others, camera, most), other ?? asked);
   }
 
   // The wholes that the regions of an answer are parts of, or are.
@@ -166,9 +165,9 @@ class Language {
   }
 
   // As `follow`, but a thing is looked for among wholes, unless it fits none.
-  thing(tree, levelName, camera) {
+  thing(tree, levelName, camera, most = 1) {
     const free = levelName === "auto" && !tree.kind && namedBy(tree.text, this.lists) === "thing";
-    const whole = this.follow(tree, free ? "whole" : levelName, camera);
+    const whole = this.follow(tree, free ? "whole" : levelName, camera, most);
     return free && whole.peak < this.meta.rule.floor ? this.follow(tree, levelName, camera) : whole;
   }
 

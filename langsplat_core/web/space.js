@@ -63,8 +63,8 @@ class Space {
     return ways[kind]?.() ?? this.pairs.has(`${kind} ${thing} ${other}`);
   }
 
-  // Those of some wholes that stand so to one of the others; of a superlative the one that is most so.
-  chosen(kind, things, others, camera) {
+  // Those of some wholes that stand so to one of the others; of a superlative the `count` that are most so.
+  chosen(kind, things, others, camera, count) {
     const gap = (a, b) =>
       Math.hypot(...a.low.map((low, k) => Math.max(0, low - b.high[k], b.low[k] - a.high[k])));
     const away = (body) =>
@@ -86,11 +86,11 @@ class Space {
         others.some((other) => other !== thing && this.stands(kind, thing, other, camera)),
       );
     }
-    const measured = things.map((thing) => {
-      const value = sign * most(this.body(thing));
-      return Number.isNaN(value) ? -Infinity : value;
-    });
-    return things.filter((_, i) => measured[i] === Math.max(...measured)).slice(0, 1);
+    const value = (thing) => {
+      const measured = sign * most(this.body(thing));
+      return Number.isNaN(measured) ? -Infinity : measured;
+    };
+    return things.toSorted((a, b) => value(b) - value(a)).slice(0, count);
   }
 }
 // [/page]

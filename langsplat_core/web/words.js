@@ -57,12 +57,16 @@ function phraseKey(text) {
     .toLowerCase();
 }
 
+// A word in lower case and what it may be the plural of.
+function forms(word) {
+  const low = word.toLowerCase();
+  return [low, low.replace(/s$/, ""), low.replace(/es$/, "")];
+}
+
 // What a phrase names: "thing", "part" or "part of a thing". lists: of Sets of words, by name.
 function namedBy(phrase, { parts, adjectives, articles }) {
   const words = phrase.toLowerCase().split(" ");
-  const noun = words.pop();
-  const forms = [noun, noun.replace(/s$/, ""), noun.replace(/es$/, "")];
-  if (!forms.some((form) => parts.has(form))) {
+  if (!forms(words.pop()).some((form) => parts.has(form))) {
     return "thing";
   }
   return words.every((word) => adjectives.has(word) || articles.has(word)) ? "part" : "part of a thing";
@@ -74,24 +78,67 @@ function thingAndPart(phrase, lists) {
   return [words.slice(0, -1).join(" "), words[words.length - 1]];
 }
 
-const SEPARATE = /[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)/iu;
 const JOIN = /\s(?:and|or|&|as well as)\s(?!not\b)/iu;
-const EXCLUDE = /^(.+?),?\s(?:(?:but|and)\s)?(?:not|without|except|other than)\s(.+)$/iu;
+const EXCLUDE = /,?\s(?:(?:but|and)\s)?(?:not|without|except|other than)\s/iu;
+const SEPARATE = /[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)/iu;
 
 // Whether words name a thing: more than stop words and descriptions.
 function names(text, { stop_words: stops, adjectives, also_nouns: nouns }) {
-  const words = text.toLowerCase().split(" ");
-  return (
-    words.some((word) => !stops.has(word) && !adjectives.has(word)) || nouns.has(words[words.length - 1])
-  );
+  const words = text.toLowerCase().split(" ").filter(Boolean);
+  return words.some((word) => !stops.has(word) && !adjectives.has(word)) || nouns.has(words.at(-1));
 }
 
 // The phrases of a line; what "and" and "or" join are phrases of their own.
 function splitPhrases(line, lists) {
-  return line.split(SEPARATE).flatMap((part) => {
-    const phrases = tidy(part).split(JOIN);
-    return phrases.every((phrase) => names(phrase, lists)) ? phrases : [tidy(part)];
-  });
+  const parts = line.split(SEPARATE).map(tidy).filter(Boolean);
+  return (parts.length ? parts : [""]).flatMap((part) => named(part, JOIN, lists));
+}
+
+// A text between joints, or whole where one side would name nothing.
+function named(text, joint, lists) {
+  const sides = text.split(joint);
+  return sides.every((side) => names(side, lists)) ? sides : [text];
+}
+
+// What a phrase asks for: { text }, or { kind, what, anchor } of such, of a count { count, what }. The rules, in
+// their order and by their names, are those of query/grammar.py.
+function parse(text, lists) {
+  const sides = named(text, EXCLUDE, lists);
+  const isPart = (side, i) => i && namedBy(side, lists) !== "thing";
+  return (sides.some(isPart) ? [text] : sides)
+    .map((side) => clause(side, lists))
+    .reduce((what, anchor) => ({ kind: "without", what, anchor }));
+}
+
+function clause(text, lists) {
+  const bare = text.replace(lists.leading, "");
+  const [first, second, ...others] = bare.split(" ");
+  const [rest, more] = [[second, ...others], others].map((words) => words.join(" "));
+  const kind = lists.superlatives.get(first.toLowerCase());
+  if (kind && lists.numbers.has(second?.toLowerCase()) && names(more, lists)) {
+    return clause(`${second} ${first} ${more}`, lists);
+  }
+  if (kind && names(rest, lists)) {
+    const what = related(rest, lists);
+    const far = ["nearest", "farthest"].includes(kind);
+    const [, those, anchor] = (far && rest.match(/^(.+?) (?:to|from) (.+)$/i)) || [];
+    if (far && what.kind === "near") {
+      return { ...what, kind };
+    }
+    return those && names(those, lists) && names(anchor, lists)
+      ? { kind, what: related(those, lists), anchor: related(anchor, lists) }
+      : { kind, what };
+  }
+  const count = lists.numbers.get(first.toLowerCase());
+  if (count && names(rest, lists)) {
+    const what = clause(rest, lists);
+    return { kind: "counted", count, what: count === 1 ? what : oneOf(what, lists) };
+  }
+  const [, those, side] = bare.match(/^(.+) on the (left|right)$/i) ?? [];
+  if (those && names(those, lists)) {
+    return { kind: `${side.toLowerCase()}most`, what: related(those, lists) };
+  }
+  return related(bare, lists);
 }
 
 // A tree with what is asked for in the singular.
@@ -107,43 +154,30 @@ function oneOf(tree, lists) {
   return { text: [...words, plurals.get(low) ?? (always.has(low) ? noun : one)].join(" ") };
 }
 
-// What a phrase asks for: { text }, or { kind, what, anchor } of such, of a count { count, what }. A part of
-// query/grammar.py's rules: things that others stand to are one level deep.
-function parse(text, lists) {
+// The first preposition relates all that follows it.
+function related(text, lists) {
+  const words = text.split(" ");
+  for (let at = 1; at < words.length; ++at) {
+    for (let next = Math.min(at + lists.longest, words.length - 1); next > at; --next) {
+      const kind = lists.prepositions.get(words.slice(at, next).join(" ").toLowerCase());
+      const [before, after] = [words.slice(0, at), words.slice(next)].map((side) => side.join(" "));
+      const isOf = kind === "of";
+      const measures = isOf && forms(words[at - 1]).some((form) => lists.measures.has(form));
+      const holds = measures && !names(words.slice(0, at - 1).join(" "), lists);
+      const named = names(before, lists) || (isOf && namedBy(before, lists) !== "thing");
+      if (kind && named && names(after, lists) && !holds) {
+        return { kind: isOf ? "inside" : kind, what: thing(before, lists), anchor: clause(after, lists) };
+      }
+    }
+  }
+  return thing(text, lists);
+}
+
+function thing(text, lists) {
   const bare = text.replace(lists.leading, "");
-  const [, wanted, unwanted] = bare.match(EXCLUDE) ?? [];
-  if (wanted && names(wanted, lists) && names(unwanted, lists) && namedBy(unwanted, lists) !== "part") {
-    return { kind: "without", what: parse(wanted, lists), anchor: parse(unwanted, lists) };
-  }
-  const [first, ...rest] = bare.split(" ");
-  const kind = lists.superlatives.get(first.toLowerCase());
-  if (kind && names(rest.join(" "), lists)) {
-    const what = parse(rest.join(" "), lists);
-    const far = what.kind === "near" && ["nearest", "farthest"].includes(kind);
-    return far ? { ...what, kind } : { kind, what, anchor: null };
-  }
-  const count = [...lists.numbers].indexOf(first.toLowerCase()) + 1 || (/^\d{1,3}$/.test(first) ? +first : 0);
-  if (count && names(rest.join(" "), lists)) {
-    const what = parse(rest.join(" "), lists);
-    return { kind: "counted", count, what: count === 1 ? what : oneOf(what, lists) };
-  }
-  const [, those, side] = bare.match(/^(.+) on the (left|right)$/i) ?? [];
-  if (those && names(those, lists)) {
-    return { kind: `${side.toLowerCase()}most`, what: parse(those, lists), anchor: null };
-  }
-  const [, before, preposition, after] = bare.match(lists.related) ?? [];
-  const relation = lists.prepositions.get(preposition?.toLowerCase());
-  if (relation === "of" && namedBy(before, lists) === "part") {
-    return { kind: "inside", what: { text: before }, anchor: parse(after, lists) };
-  }
-  if (!relation && namedBy(bare, lists) === "part of a thing") {
-    const [thing, part] = thingAndPart(bare, lists);
-    return { kind: "inside", what: { text: part }, anchor: { text: thing.replace(/'s$|(?<=s)'$/, "") } };
-  }
-  if (!relation || relation === "of" || !names(before, lists) || !names(after, lists)) {
-    return { text: bare };
-  }
-  return { kind: relation, what: { text: before }, anchor: parse(after, lists) };
+  const [whole, part] = thingAndPart(bare, lists);
+  const anchor = { text: whole.replace(/'s$|(?<=s)'$/, "") };
+  return whole ? { kind: "inside", what: { text: part }, anchor } : { text: bare };
 }
 
 // Letters to insert, delete, replace or swap with the next, to make a word another.

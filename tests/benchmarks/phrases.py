@@ -23,7 +23,7 @@ from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Extreme, Side, atoms, parse
 from langsplat_core.query.inventory import InventoryEntry, scene_inventory
-from langsplat_core.query.relations import Body, body, most, stands, upright, viewpoint
+from langsplat_core.query.relations import Body, body, ranked, stands, upright, viewpoint
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera
 from tests.benchmarks.oracles import surface_points
@@ -163,7 +163,7 @@ def _extremes(things: Things, seen_by: Array) -> Iterator[Case]:
     for kind, word in product(get_args(Extreme), _kinds(things)):
         numbers = things.called(word)
         if len(numbers) >= FEWEST:
-            one = numbers[most(kind, [things.extents[number] for number in numbers], [], seen_by)]
+            one = numbers[ranked(kind, [things.extents[number] for number in numbers], [], seen_by)[0]]
             text = f"the {kind} {word}"
             yield Case(kind, text, f"{kind} {word}", (one,))
 

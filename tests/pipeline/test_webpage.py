@@ -47,7 +47,7 @@ MIXED = [f"{colour} {thing}" for colour in ("red", "blue", "yellow") for thing i
 OWNED = ["duck beak", "teapot lid", "laptop screen", "the Red Mug!", "  blue, gift ", "penguin’s beak"]
 PHRASES = [*NAMES, *MIXED, *OWNED, "rocket fins", "wooden table", "green car"]
 MARKUP = '<img src=x onerror="window.escaped=1"></script><script>window.escaped=2</script>'
-FIELDS = ("level", "scores", "fits", "peak", "probability", "by_chance", "found", "verdict", "place", "box")
+FIELDS = ("level", "scores", "fits", "peak", "probability", "found", "verdict", "place", "box")
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +192,7 @@ def same(found: dict[str, Any], expected: Any, members: int) -> None:
         else:
             np.testing.assert_allclose(found[name], np.ravel(value), atol=1e-3, rtol=0, err_msg=name)
     assert found["reached"] == expected.judgement.reached
+    assert found["by_chance"] == pytest.approx(expected.judgement.by_chance, abs=1e-3)
     np.testing.assert_allclose(found["margin"], expected.judgement.margin, atol=1e-2)
     np.testing.assert_allclose(found["heat"], expected.heat_range, atol=1e-3)
     assert abs(found["members"] - members) <= 1e-3 * members
@@ -213,12 +214,14 @@ def test_page_answers_100_phrases_as_python_does(tab: Tab, engine: QueryEngine, 
     assert verdicts == {"found", "weak match", "not here"}
 
 
-RELATED = """teddy bear on the table,penguin near the rocket,chair near the table,laptop below the table,
-rug under the table,laptop behind the teddy bear,rocket left of the teddy bear,candle right of the teddy bear,
-biggest toy,leftmost toy,nearest toy,highest painting,toy nearest to the laptop,toy without the penguin,
-duck beak,lid of the teapot,teapot's spout,handle of the teapot near the laptop,present on the floor,
-toy on the left,two presents,three mugs,one teapot,the two toys on the table,8 toys,9 toys,four wheels,
-three leaves,two legs of the chair,two toys not penguin,two scissors,two pictures on the wall"""
+RELATED = """teddy bear on the table,penguin near the rocket,laptop below the table,rug under the table,
+rocket left of the teddy bear,candle right of the teddy bear,biggest toy,nearest toy,highest painting,
+toy nearest to the laptop,toy without the penguin,duck beak,lid of the teapot,teapot's spout,
+handle of the teapot near the laptop,toy on the left,two presents,one teapot,the two toys on the table,9 toys,
+four wheels,three leaves,two legs of the chair,two toys not penguin,two pictures on the wall,
+nearest toy to the laptop,the closest toy from the sofa,biggest two toys,two biggest toys,9 biggest toys,
+two toys on the left,nearest two toys to the laptop,cup of tea,toy not penguin not teddy bear,
+picture of a boat on the wall,nearest toy near to the biggest toy"""
 
 
 def test_page_reads_phrases_with_structure_as_python_does(tab: Tab, engine: QueryEngine) -> None:

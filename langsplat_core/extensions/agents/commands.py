@@ -114,7 +114,7 @@ class Door:
         return {
             "verdict": answer.verdict,
             "probability": answer.probability,
-            "by_chance": answer.by_chance,
+            "by_chance": answer.judgement.by_chance,
             "read_as": composed.reading,
             "level": LEVELS[answer.level],
             "place": _places(answer.place, unit) if there else None,
