@@ -109,7 +109,7 @@ def _noted(ctx: Any, window: Window) -> None:
 
 
 def _beside(ctx: Any, window: Window) -> None:
-    """Return the scene with the paper's autoencoder of three numbers in place of its codebook."""
+    """Open the scene beside itself with the paper's autoencoder of three numbers in place of its codebook."""
     viewer, folder = window.viewer, Path(tempfile.mkdtemp())
     scene, path = viewer.state.scene, folder / "autoencoder.ply"
     assert scene is not None
@@ -199,7 +199,7 @@ def _film(ctx: Any, window: Window) -> None:
 
 
 def _trained(ctx: Any, window: Window) -> None:
-    """Return a room of a dozen photographs, in the midst of its training."""
+    """Train a room of a dozen photographs until it is half done."""
     viewer, folder = window.viewer, Path(tempfile.mkdtemp())
     room = ["dataset", "--seed", "3", "--views", "12", "--out", str(folder / "room")]
     subprocess.run([sys.executable, "-m", "assets.making", *room], check=True)
@@ -249,7 +249,7 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
 
 
 def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
-    """Return a screenshot of the window with the demo scene and answered queries."""
+    """Write a screenshot of the window with the demo scene and answered queries."""
     options = ViewerOptions(query=queries, display="relevancy", size="1280x800", camera=BESIDE_THE_SEARCH)
     window = Window(scene_path(None), options, services(""))
     window.idles, window.toasts.seconds = False, 0.0

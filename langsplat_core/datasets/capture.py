@@ -114,7 +114,7 @@ class Capture:
         return self._of(views)
 
     def read_at(self, indices: Sequence[int], longer_side: int) -> "Capture":
-        """Return the photographs at `indices` bit for bit as a dataset that is read at that size has them.
+        """Return photographs, bit for bit as a dataset that is read at that size has them.
 
         The points are those of all. Without files they are `shrunk`. InputError for a file that can no longer
         be read.

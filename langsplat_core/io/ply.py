@@ -564,6 +564,6 @@ def _codes(ply: PlyFile, element: PlyElement, names: Sequence[str], kind: str) -
 
 
 def _fractions(packed: Array, *bits: int) -> Array:
-    """Map (N,) uint32 of fields of so many bits, the first on top to (N, fields) fractions in [0, 1]."""
+    """Unpack (N,) uint32 into (N, fields) fractions in [0, 1]; bits of each field, the first on top."""
     most = 2 ** np.array(bits) - 1
     return (packed[:, None] >> 32 - np.cumsum(bits) & most) / most

@@ -100,7 +100,7 @@ def writable_suffixes() -> tuple[str, ...]:
 
 
 def format_of(path: Path) -> SceneFormat | None:
-    """Return the format that `path` is named as, or, for a folder, has the file of; None for no scene."""
+    """Return the format of `path` by its name or, of a folder, by the file in it; None for no scene."""
     folder = os.path.isdir(path)  # which a name too long is not
     for row in formats():
         if not folder and path.suffix.lower() == row.suffix:

@@ -355,7 +355,7 @@ def _rotations(packed: _Packed, tell: Tell) -> Array:
 
 
 def _rotation_codes(quats_wxyz: Array) -> Array:
-    """Map (N, 4) quaternions of any length to (N, 4) bytes of version 3."""
+    """Pack (N, 4) quaternions of any length into the (N, 4) bytes of version 3."""
     three, largest = without_largest(quats_wxyz[:, [1, 2, 3, 0]])
     codes = np.rint(np.abs(three) * np.sqrt(2) * 511).clip(0, 511).astype(np.uint32)
     codes |= (three < 0) * np.uint32(512)

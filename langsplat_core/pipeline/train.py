@@ -330,7 +330,7 @@ class Trained:
 
 
 def tasks_for(datasets: Sequence[Path], out: Path, config: TrainConfig, until: Until) -> list[Task]:
-    """Return a task for each capture, whose scene in the folder `out` has its name; InputError for twins."""
+    """Return a task for each capture; its scene in `out` is named as it is. InputError for two of a name."""
     check_output_folder(out)
     named: dict[str, Path] = {}
     for path in datasets:

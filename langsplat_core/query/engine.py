@@ -145,7 +145,7 @@ class QueryEngine:
         return answers
 
     def relevancy(self, vector: Array) -> Array:
-        """Map (D,) unit text vector to (3, N) float32 relevancy per level and Gaussian."""
+        """Return (3, N) float32 relevancy per level and Gaussian of a (D,) unit text vector."""
         return next(self._lookup.relevancies(vector[None]))()
 
     def _fits_of_names(self, phrases: Sequence[str]) -> dict[str, Array]:

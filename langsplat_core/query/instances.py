@@ -32,7 +32,7 @@ class OrientedBox:
 
 
 def axis_aligned_box(points: Array) -> Array:
-    """Map (M, 3), M >= 1 to (2, 3) float64 lower and upper corner between the `INNER` quantiles."""
+    """Return (2, 3) float64 corners of the box between the `INNER` quantiles of (M, 3) points, M >= 1."""
     return np.quantile(np.ascontiguousarray(points.T, np.float64), INNER, axis=1)
 
 

@@ -55,7 +55,7 @@ class Body:
 
 
 def upright(up: Array) -> Array:
-    """Map (3,) unit to (3, 3) rotation of world points into axes of which the last is up."""
+    """Return the (3, 3) rotation of world points into axes of which the last is `up`, (3,), a unit vector."""
     first = across(up)
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(up, first), up])
@@ -79,7 +79,7 @@ def _seen(what: Body, seen_by: Array) -> tuple[float, float]:
 
 
 def body(positions: Array, frame: Array) -> Body:
-    """Map (P, 3) world points of one thing, P >= 1 to its body in the axes of `frame`."""
+    """Return the body, in the axes of `frame`, of a thing's (P, 3) points in the world, P >= 1."""
     points = positions[:: max(1, -(-len(positions) // SAMPLE))] @ frame.T
     low, high = axis_aligned_box(points)
     return Body(points, low, high)

@@ -22,14 +22,14 @@ from langsplat_core.scene.surface import Surface
 
 
 def of_rows(rows: Array, count: int) -> Array:
-    """Map (K,) rows of `count` Gaussians to (count,) bool."""
+    """Return (count,) bool that is True in (K,) `rows`."""
     selected = np.zeros(count, bool)
     selected[rows] = True
     return selected
 
 
 def in_sphere(means: Array, centre: Array, radius: float) -> Array:
-    """Map (N, 3) to (N,) bool: finite, and at most `radius` from `centre` (3,), world units."""
+    """Return (N,) bool: points that are finite and at most `radius` from `centre` (3,), world units."""
     offsets = np.asarray(means, np.float64) - centre
     with np.errstate(invalid="ignore"):
         squares: Array = (offsets**2).sum(1)
@@ -37,7 +37,7 @@ def in_sphere(means: Array, centre: Array, radius: float) -> Array:
 
 
 def in_box(means: Array, low: Array, high: Array) -> Array:
-    """Map (N, 3) to (N,) bool: between two corners (3,) along the world's axes, faces included."""
+    """Return (N,) bool: points between two corners (3,) along the world's axes, faces included."""
     return np.all((means >= np.asarray(low)) & (means <= np.asarray(high)), axis=1)
 
 

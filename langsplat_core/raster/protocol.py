@@ -68,7 +68,7 @@ class LiftingView(View):
 
     @abstractmethod
     def gather(self, image: Array) -> Array:
-        """Map (H, W, C) image to (N, C) values ``W^T y``."""
+        """Return the (N, C) values ``W^T y`` of an (H, W, C) image."""
 
     def contributions(self) -> Array:
         """Return (N,) blending weight of each Gaussian summed over the image, in pixels: ``W^T 1``."""
@@ -125,7 +125,7 @@ def farthest(settings: RasterSettings) -> float:
 
 
 def mean_depth(sums: Array, weights: Array) -> Array:
-    """Map (H, W) blended depths and their weights to mean depth, 0 where nothing is drawn."""
+    """Return (H, W) mean depths from blended ones and their weights, 0 where nothing is drawn."""
     return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
 
 

@@ -27,7 +27,7 @@ from langsplat_core.scene.transform import sh_basis
 
 
 def colours(sh: Array, means: Array, camera_position: Array) -> Array:
-    """Map (N, K, 3) coefficients seen from `camera_position` to (N, 3) float64 display colours >= 0.
+    """Return (N, 3) float64 display colours >= 0 of (N, K, 3) coefficients seen from `camera_position`.
 
     Not clamped above: values over 1 are legal until the image is quantised. Invalid rows give 0.
     """

@@ -80,7 +80,7 @@ class Codec(ABC):
         """ValueError for (M, d) latents that no vector has."""
 
     def known(self, latents: Array) -> Array:
-        """Map (M, d) latents to (M,) bool, False for one without a meaning: a vector of zeros."""
+        """Return (M,) bool, False for latents without a meaning: vectors of zeros."""
         known: Array = np.linalg.norm(latents, axis=1) > SHORTEST
         return known
 
@@ -301,7 +301,7 @@ class CodebookCodec(Codec):
 
 
 def principal_colours(vectors: Array, weights: Array) -> Array:
-    """Map (K, c) vectors to (K, 3) float32 colours in [0, 1], near ones for near vectors.
+    """Return (K, 3) float32 colours in [0, 1] of (K, c) vectors, near ones for near vectors.
 
     Their first three principal axes, each between its 2 % and 98 % quantiles; an axis that is missing or flat
     is grey. weights: (K,) >= 0, how often each occurs; axes and quantiles are those of what occurs.

@@ -133,7 +133,7 @@ class Merged:
     weights: "sparse.csr_matrix"  # (M, N) float32: what each is made of; rows sum to 1
 
     def values(self, values: Array | None) -> Array | None:
-        """Map (N, C) values of the original Gaussians to (M, C) float32."""
+        """Return (M, C) float32 means of the original Gaussians' (N, C) values."""
         return None if values is None else self.weights @ np.asarray(values, np.float32)
 
 
@@ -160,7 +160,7 @@ def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
 
 
 def along_curve(points: Array) -> Array:
-    """Map (N, 3) to (N,) place on a Morton curve: near numbers are mostly near points."""
+    """Return the (N,) places of points on a Morton curve: near numbers are mostly near points."""
     if len(points) == 0:
         return np.zeros(0, np.uint64)
     # Neither a single floater nor a far background may use up the grid.
@@ -182,13 +182,13 @@ def _kept(gaussians: Gaussians, rows: Array) -> _Part:
 
 
 def _area(scales: Array) -> Array:
-    """Map (..., 3) to (...) what an ellipsoid covers, seen from everywhere, up to a constant."""
+    """Return what ellipsoids of (..., 3) scales cover, seen from everywhere, up to a constant."""
     a, b, c = np.moveaxis(scales, -1, 0)
     return np.asarray(a * b + b * c + c * a)
 
 
 def _merge(gaussians: Gaussians, rows: Array) -> Iterator[_Part]:
-    """Map (G, GROUP) rows to those that were merged, and those that were not."""
+    """Merge (G, GROUP) rows, each into one Gaussian; yield these, then those that stay as they are."""
     members = gaussians.take(rows.ravel())
     scales = np.exp(members.log_scales.astype(np.float64))
     axes = rotation_matrices(members.quats_wxyz.astype(np.float64)) * scales[:, None, :]
@@ -212,7 +212,7 @@ def _merge(gaussians: Gaussians, rows: Array) -> Iterator[_Part]:
 
 
 def _ellipsoids(covariances: Array) -> tuple[Array, Array, Array]:
-    """Map (G, 3, 3) to (G, 3) logarithms of the scales, (G, 4) quaternions wxyz, (G,) `_area`."""
+    """Return (G, 3) logarithms of scales, (G, 4) quaternions wxyz and (G,) `_area` of covariances."""
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, no reflection
     from scipy.spatial.transform import Rotation

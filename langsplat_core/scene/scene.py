@@ -254,7 +254,7 @@ def origin_of(points: Array) -> Array:
 
 
 def about_origin(points: Array) -> tuple[Array, Array]:
-    """Map (N, 3) positions in the world to (N, 3) positions about their origin, and that origin (3,)."""
+    """Return (N, 3) positions in the world about an origin near them, and that origin (3,)."""
     origin = origin_of(points)
     return (points - origin if origin.any() else points), origin
 

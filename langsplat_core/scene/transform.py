@@ -42,7 +42,7 @@ class Similarity:
         return bool((self.matrix == np.eye(4)).all())
 
     def points(self, points: Array) -> Array:
-        """Map (..., 3) points to (..., 3) float64 images of them."""
+        """Return where the map takes (..., 3) points, float64."""
         with np.errstate(invalid="ignore", over="ignore"):
             moved: Array = np.asarray(points, np.float64) @ (self.scale * self.rotation.T) + self.translation
         return moved
@@ -153,7 +153,7 @@ def turned_origin(rotation: Array, origin: Array) -> Array:
 
 
 def rotation_quaternion(rotation: Array) -> Array:
-    """Map (3, 3) to (4,) unit quaternion wxyz with w >= 0."""
+    """Return the (4,) unit quaternion wxyz, w >= 0, of a (3, 3) rotation."""
     from scipy.spatial.transform import Rotation  # here, since every program that opens a scene comes by
 
     quat: Array = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
@@ -219,7 +219,7 @@ C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901
 
 
 def sh_basis(directions: Array, count: int) -> Array:
-    """Map (N, 3) unit directions from the camera to the Gaussians to (N, count) basis values."""
+    """Return (N, count) basis values at unit directions from the camera to the Gaussians."""
     x, y, z = np.moveaxis(directions, -1, 0)
     values = [np.full_like(x, C0)]
     if count > 1:
@@ -261,7 +261,7 @@ def sh_rotations(rotation: Array, degree: int) -> list[Array]:
 
 
 def rotated_harmonics(sh: Array, rotation: Array) -> Array:
-    """Map (N, K, 3) coefficients to float32 coefficients of the same colours seen from rotated directions."""
+    """Return (N, K, 3) float32 coefficients of the same colours seen from rotated directions."""
     degree = math.isqrt(sh.shape[1]) - 1
     if degree == 0 or (rotation == np.eye(3)).all():
         return sh

@@ -219,7 +219,7 @@ class Encoder(PhraseEncoder):
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
     def _encode(self, images: Array, forward: Callable[[Array], Array] | None = None) -> Array:
-        """Map (B, H, W, 3) uint8 to unit vectors that `forward`, if not the tower itself, has for pixels."""
+        """Return unit vectors of (B, H, W, 3) uint8, by `forward` in place of the tower where it is given."""
         mean, std = self._images.statistics
         pixels = (images.astype(np.float32) / 255 - mean) / std
         return unit((forward or self._images.encode)(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))))

@@ -76,7 +76,7 @@ EIGHT = np.ones((3, 3), bool)  # diagonal neighbours are connected, as in SAM's 
 
 
 def mask_boxes(masks: Array) -> Array:
-    """Map (M, H, W) bool, none empty to (M, 4) int64 left, top, right, bottom; the last two exclusive."""
+    """Return (M, 4) int64 left, top, right, bottom of masks, none empty; the last two exclusive."""
     boxes = np.zeros((len(masks), 4), np.int64)
     for box, mask in zip(boxes, masks, strict=True):
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
@@ -132,7 +132,7 @@ def clean_regions(mask: Array, min_region: int) -> tuple[Array, bool]:
 
 
 def common_pixels(masks: Array) -> Array:
-    """Map (M, H, W) bool to (M, M) int64: pixels in both masks; areas on the diagonal."""
+    """Return (M, M) int64: pixels in both of two masks; areas on the diagonal."""
     flat = masks.reshape(len(masks), -1)
     total = np.zeros((len(masks), len(masks)), np.int64)
     for start in range(0, flat.shape[1], PIXELS_PER_PRODUCT):
@@ -336,7 +336,7 @@ def nested_partitions(image: Array) -> Array:
 
 
 def _paint(lab: Array) -> Array:
-    """Map (H, W, 3) CIELAB to (H, W, 3) colours of which shading changes only the first channel, lightness.
+    """Return (H, W, 3) colours, of CIELAB, of which shading changes only the first channel, lightness.
 
     In CIELAB both a, b and L + 16 are differences of cube roots, so all three scale alike with the light that
     falls on a surface: a / (L + 16) and b / (L + 16) hardly depend on it. Large chromas are compressed, since

@@ -52,7 +52,7 @@ class EncodedImage:
 
     @models.asking_errors("the segmenter")
     def masks_at(self, points: Array) -> tuple[Any, Any]:
-        """Map (P, 2) float32 x, y, px of the image to (P, 3) predicted IoU, (P, 3, h, w) small logits."""
+        """Return (P, 3) predicted IoU and (P, 3, h, w) small logits at (P, 2) float32 x, y, px."""
         import torch
 
         height, width = self.size or (self.side, self.side)
@@ -63,7 +63,7 @@ class EncodedImage:
         return (ious, logits) if self.ordered else by_area(ious, logits)
 
     def enlarge(self, logits: Any) -> Any:
-        """Map (B, h, w) low-resolution logits to (B, H, W) of the image."""
+        """Enlarge (B, h, w) logits to the (B, H, W) of the image."""
         from torch.nn.functional import interpolate
 
         square = logits[:, None].float()
@@ -88,7 +88,7 @@ class TextSegmenter(Protocol):
     """A model that outlines what a phrase names."""
 
     def segment(self, image: Array, phrases: Sequence[str]) -> Array:
-        """Map (H, W, 3) uint8 to (H, W, P) bool: pixels of all that each phrase names, seen in one pass."""
+        """Return (H, W, P) bool: pixels of all that each phrase names in (H, W, 3) uint8, in one pass."""
 
 
 def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:

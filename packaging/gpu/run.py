@@ -142,7 +142,7 @@ def main() -> int:
 
 
 def write(folder: Path, outcomes: list[Outcome], reports: dict[str, Path]) -> None:
-    """Return a page for every section that found something, and the summary."""
+    """Write a page for every section that found something, and the summary."""
     folder.mkdir(parents=True, exist_ok=True)
     environment = reports.get("environment")
     head = environment.read_text() if environment and environment.exists() else ""

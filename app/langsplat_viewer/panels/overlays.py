@@ -238,7 +238,7 @@ def _dot(place: Array, colour: Colour) -> None:
 
 
 def _cameras(viewer: Viewer, edges: Array, pen: Pen) -> None:
-    """Return (C, 8, 2, 3) edges of all but the one that the view looks through; a click stands there."""
+    """Draw cameras, (C, 8, 2, 3) edges, but the one that the view looks through; a click stands there."""
     state, mouse = viewer.state, imgui.get_io().mouse_pos
     assert state.scene is not None
     away = np.linalg.norm(edges[:, 0, 0] - pen.camera.position, axis=1) > pen.least

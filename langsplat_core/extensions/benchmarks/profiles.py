@@ -140,7 +140,7 @@ class Prediction:
 
 
 def read_maps(maps: Array, rule: MapRule) -> Prediction:
-    """Map (L, H, W) relevancy per level, L >= 1 to mask and place."""
+    """Choose a level of (L, H, W) relevancy maps, L >= 1, and read its mask and place."""
     maps = np.asarray(maps, np.float64)
     blended = [
         (1 - rule.raw_share) * mean_filtered(level, rule.window, rule.border) + rule.raw_share * level

@@ -332,7 +332,7 @@ class ReferenceWindow:
     band: Array  # (h, w) bool: pixels near a cut-off
 
     def splat(self, values: Array) -> Array:
-        """Map (N, C) to the window's (h, w, C) image, float64."""
+        """Blend (N, C) values into the window's (h, w, C) image, float64."""
         image: Array = self.weights @ values[self.rows].astype(np.float64)
         return image.reshape(*self.band.shape, -1)
 

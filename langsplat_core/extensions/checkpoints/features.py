@@ -379,7 +379,7 @@ def _row_of(means: Array, theirs: Array, count: int, carrier: Carrier) -> Array:
 
 
 def _ranked(places: Array) -> Array:
-    """Map (N,) whole numbers to (N,) numbers of them and of their rank among equals."""
+    """Return (N,) distinct numbers for whole ones: upper bits the number, lower its rank among equals."""
     order = np.argsort(places, kind="stable")
     ordered = places[order]
     rank = np.empty(len(places), np.int64)

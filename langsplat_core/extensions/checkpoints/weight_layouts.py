@@ -543,7 +543,7 @@ class Tipsv2Images(Images):
         self.patch, self._before = int(config.patch_size), 1 + int(config.num_register_tokens)
 
     def patches(self, pixels: Array) -> Array:
-        """Map (1, 3, H, W) float32, sides multiples of a patch's to (P, D) of its patches, row by row."""
+        """Cut (1, 3, H, W) float32, sides multiples of a patch's, into (P, D) patches row by row."""
         return self.infer(pixels, "last_hidden_state")[0, self._before :]
 
 

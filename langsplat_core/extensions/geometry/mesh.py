@@ -189,7 +189,7 @@ def _pieces(edges: Array, count: int) -> Array:
 
 
 def _distinct(rows: Array) -> tuple[Array, Array]:
-    """Map (N, k) integers >= 0 to one row of each kind, in rising order, and (N,) the kind of each row."""
+    """Return the distinct ones of (N, k) integers >= 0, in rising order, and (N,) which each row is."""
     kind = first = np.zeros(len(rows), np.int64)
     for column in rows.T:  # as single numbers: np.unique along an axis is twenty times slower
         keys = kind * (column.max(initial=0) + 1) + column

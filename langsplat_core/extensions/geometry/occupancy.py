@@ -51,7 +51,7 @@ class Occupancy:
         return np.asarray((self.hits > 0) | (self.passes > 0))
 
     def metres(self, points: Array) -> Array:
-        """Map (P, 3) points of the scene to (P, 3) in the axes of the map."""
+        """Return (P, 3) points of the scene in metres along the axes of the map."""
         return _moved(points, self.to_map)
 
 
@@ -65,7 +65,7 @@ class FloorMap:
     free: Array  # (X, Y) bool: seen there, and nothing stands
 
     def centres(self, cells: Array) -> Array:
-        """Map (P, 2) cells to (P, 2) their middles, metres."""
+        """Return the (P, 2) middles of cells, metres."""
         return np.asarray(self.origin + (cells + 0.5) * self.resolution)
 
 

@@ -88,7 +88,7 @@ class _Piece:
 
     @cached_property
     def box(self) -> Array:
-        """The (2, 3) corners."""
+        """Lower and upper corner (2, 3), world units."""
         return axis_aligned_box(self.points)
 
 

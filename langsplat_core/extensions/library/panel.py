@@ -124,7 +124,7 @@ def draw_library(viewer: Viewer) -> None:
 
 
 def _hit(viewer: Viewer, view: LibraryView, row: int, hit: Hit) -> None:
-    """Return a thumbnail, the scene's name and its verdict; a click anywhere opens the scene."""
+    """Show a thumbnail, the scene's name and its verdict; a click anywhere opens the scene."""
     height = hello_imgui.em_size(THUMBNAIL_EM)
     width, count = height * THUMBNAIL[0] / THUMBNAIL[1], len(view.hits)
     start = imgui.get_cursor_pos()

@@ -31,7 +31,7 @@ class Vocabulary:
     scale: Scale
 
     def relevancy(self, vectors: Array) -> Array:
-        """Map (M, D) unit vectors to (M, Q) in [0, 1]."""
+        """Return (M, Q) relevancy in [0, 1] of (M, D) unit vectors."""
         zero, rate = self.scale.of(vectors @ self.scale.texts.T)
         return relevancy_of(vectors @ self.phrases.T, zero[:, None], rate[:, None])
 
