@@ -180,8 +180,6 @@ def unsearchable(engine: QueryEngine) -> str:
             f"its language field is {engine.field.codec.kind!r}, not a codebook: train it with "
             "--codec.kind codebook to search it in a page"
         )
-    if engine.field.codec.size > np.iinfo(np.uint16).max:
-        return "its codebook has more than 65535 entries, which is beyond the numbers of a page"
     if engine.rule != "regions":
         return "a page answers by everyday phrases, and neither the scene nor an encoder here has them"
     return ""
