@@ -1,4 +1,4 @@
-"""The `langsplat` command, also as ``python -m langsplat_core`` for launchers such as torchrun."""
+"""The `langsplat` command, also as ``python -m langsplat_core``."""
 
 import os
 
