@@ -180,8 +180,8 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("save the project as ...", saving.save_as, ("Ctrl+Shift+S",)),
         Command("save a picture", saving.save_picture, ("P",), "Save picture", apart=True),
         Command("save the view", saving.save_view, (), "Save view"),
-        Command("save a picture of the film's size", saving.save_sized_picture, (), "Picture of this size"),
         Command("save a film of the path", saving.save_film, (), "Save film"),
+        Command("save a picture of the film's size", saving.save_sized_picture, (), "Picture of this size"),
         Command("save the camera path", saving.save_path, (), "Save path"),
         Command("quit", saving.quit_viewer, ("Ctrl+Q",), apart=True),
     ),
@@ -385,9 +385,8 @@ def matching(text: str, recent: Sequence[str] = ()) -> list[Command]:
         """Return how many words are none of its own; one more than there are where one is unknown."""
         own = command.does.lower()
         known = f"{own} {SYNONYMS.get(command.does, '')}"
-        return (
-            sum(word not in own for word in words) if all(word in known for word in words) else len(words) + 1
-        )
+        is_unknown = any(word not in known for word in words)
+        return len(words) + 1 if is_unknown else sum(word not in own for word in words)
 
     found = [command for command in commands if missed(command) <= len(words)]
     return sorted(found, key=missed)

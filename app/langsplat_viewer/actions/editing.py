@@ -359,18 +359,21 @@ def in_crop_box(viewer: Viewer) -> Array:
     """Return (N,) bool: Gaussians whose centres lie in the box of the panel."""
     form, scene = viewer.state.edit_form, viewer.state.scene
     corners = np.array([form.low, form.high])
-    return in_box(
-        np.zeros((0, 3)) if scene is None else scene.gaussians.means, corners.min(0), corners.max(0)
-    )
+    means = np.zeros((0, 3)) if scene is None else scene.gaussians.means
+    return in_box(means, corners.min(0), corners.max(0))
 
 
 def crop(viewer: Viewer) -> None:
-    """Delete what lies outside the box of the panel; refused where nothing lies inside."""
-    marks = viewer.state.marks
+    """Show the box of the panel, then delete what lies outside; refused where nothing lies inside."""
+    marks, form = viewer.state.marks, viewer.state.edit_form
     if not viewer.has_scene("crop it"):
         return
     inside = in_crop_box(viewer)
-    if (inside & marks.kept).any():
+    if (form.low, form.high) == (EditForm.low, EditForm.high):
+        set_gizmo(viewer, "box")
+        outside = np.count_nonzero(marks.kept & ~in_crop_box(viewer))
+        viewer.state.say(f"Crop again deletes the {outside:,} Gaussians outside the box")
+    elif (inside & marks.kept).any():
         mark(viewer, replace(marks, selected=marks.selected & inside, deleted=marks.deleted | ~inside))
     else:
         viewer.say_error("the box holds nothing: set its corners around something, or press Fit")

@@ -291,6 +291,7 @@ def turn_around(viewer: Viewer) -> None:
     if viewer.has_scene("turn around in it") and viewer.state.view is not None:
         set_path(viewer, flight.turntable(viewer.state.view, TURN_SECONDS).keyframes)
         viewer.state.record.at = 0.0
+        viewer.state.say(f"the path is one turn of {TURN_SECONDS:.0f} s: Shift+K plays it")
 
 
 def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:

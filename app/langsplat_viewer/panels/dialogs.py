@@ -294,9 +294,7 @@ def draw_export(viewer: Viewer) -> None:
 def _export(viewer: Viewer, form: ExportForm) -> None:
     titles = saving.exports()
     imgui.set_next_item_width(-1)
-    changed, chosen = imgui.combo(
-        "##what", titles.index(form.title), [title.capitalize() for title in titles]
-    )
+    changed, chosen = imgui.combo("##what", titles.index(form.title), [*map(str.capitalize, titles)])
     if changed:
         saving.ask_export(viewer, titles[chosen])
         return

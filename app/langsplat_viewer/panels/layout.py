@@ -122,11 +122,13 @@ def draw_inspector(viewer: Viewer) -> None:
             continue
         was_open = panel.title in are_open
         imgui.set_next_item_open(was_open)
-        if viewer.state.wanted_panel == panel.title:
-            settings.take(viewer.state, "wanted_panel")
-            imgui.set_scroll_here_y(0.0)
         with theme.styled(frame_border_size=0.0):
             is_open = imgui.collapsing_header(panel.title, imgui.TreeNodeFlags_.allow_overlap)
+            if viewer.state.wanted_panel == panel.title:
+                settings.take(viewer.state, "wanted_panel")
+                imgui.set_scroll_here_y(0.0)
+                window = imgui.internal.get_current_window()
+                imgui.internal.set_focus_id(imgui.get_item_id(), window)  # Tab goes on from it
             left = right - ui.button_width(TAKE_OUT)
             imgui.same_line(left)
             if left > ui.width_of(f"mmm {panel.title}") and imgui.small_button(f"{TAKE_OUT}##{panel.title}"):
@@ -208,7 +210,6 @@ def draw_titles(viewer: Viewer) -> None:
                 settings.turn_panel(viewer, panel.title, is_open=False)
             else:
                 settings.open_panel(viewer, panel.title)
-    imgui.separator()
 
 
 # What lies over the scene.

@@ -30,15 +30,14 @@ OF_SELECTED = (
 
 def draw(viewer: Viewer) -> None:
     """Draw the panel "Selection": counts, tools, the search, verbs, files."""
-    ui.small_wrapped(counts(viewer.state.marks))
-    disabled = () if viewer.state.marks.selected.any() else OF_SELECTED
+    marks, tools = viewer.state.marks, viewer.state.tools
+    ui.small_wrapped(counts(marks))
+    disabled = () if marks.selected.any() else OF_SELECTED
     _tools(viewer)
     _found(viewer)
     imgui.separator()
     ui.verbs(viewer, "All", "None", "Invert", "Grow", "Shrink", "More like it", disabled=disabled)
-    reach = ui.slider(
-        "Reach", viewer.state.tools.reach, REACHES, "%.3f of the scene", logarithmic=True, ems=12
-    )
+    reach = ui.slider("Reach", tools.reach, REACHES, "%.3f of the scene", logarithmic=True, ems=12)
     editing.set_tools(viewer, reach=reach)
     _name(viewer)
     imgui.separator()
@@ -80,10 +79,8 @@ def _found(viewer: Viewer) -> None:
     if result.verdict == "not here" or len(things) < 2:
         return
     for number, thing in enumerate(things, 1):
-        if ui.next_button(
-            f"{number}##thing",
-            f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}",
-        ):
+        share = f"{100 * thing.share:.0f} % of the answer"
+        if ui.next_button(f"{number}##thing", f"{thing.count:,} Gaussians, {share}, score {thing.score:.2f}"):
             editing.take(viewer, of_rows(thing.members, len(viewer.state.marks.selected)))
 
 
@@ -193,8 +190,7 @@ def draw_transform(viewer: Viewer) -> None:
     """Draw the panel "Transform": what is transformed, gizmo, numbers, box."""
     state = viewer.state
     chosen = np.count_nonzero(state.marks.selected)
-    what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
-    ui.small_wrapped(what)
+    ui.small_wrapped(f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras")
     kind = ui.choice(GIZMOS, state.edit_form.gizmo)
     if kind != state.edit_form.gizmo:
         editing.set_gizmo(viewer, kind)
