@@ -1,4 +1,4 @@
-"""The `langsplat` command, also as ``python -m langsplat_core``."""
+"""The `langsplat` command, also as ``python -m langsplat_core`` for launchers such as torchrun."""
 
 import os
 

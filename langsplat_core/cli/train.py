@@ -4,7 +4,7 @@ import contextlib
 import io
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -16,7 +16,7 @@ from langsplat_core.cli.run import one_line
 from langsplat_core.config import PAPER, TrainConfig, TrainPreset, TrainProfile, check_settings, with_preset
 from langsplat_core.errors import InputError, printable_line, shortened
 from langsplat_core.io.hostile import read_text
-from langsplat_core.progress import TerminalProgress
+from langsplat_core.progress import TerminalProgress, silent
 
 
 @dataclass(frozen=True)
@@ -59,18 +59,24 @@ class Train:
             return
         # They import torch: seconds that --help need not pay.
         from langsplat_core.pipeline.report import PAGE, work_folder
+        from langsplat_core.pipeline.stages import join_processes
         from langsplat_core.pipeline.train import train_scene
 
-        with TerminalProgress(self.progress == "lines") as progress:
+        processes = join_processes()
+        shown = TerminalProgress(self.progress == "lines") if processes.is_main else nullcontext(silent)
+        with shown as progress:
             report = train_scene(
                 self.dataset[0],
                 self.out,
                 self.config,
                 self.work,
                 progress,
+                processes=processes,
                 gaussians_from=self.gaussians,
                 until=self.until,
             )
+        if not processes.is_main:
+            return
         names = shortened(view.name for view in report.held_out_views)
         small = "" if report.psnr_small is None else f", {report.psnr_small:.2f} dB at 320 px"
         psnr = (

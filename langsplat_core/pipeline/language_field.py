@@ -1,10 +1,12 @@
 """From masks with vectors to a language field: mask weights, groups of masks, codec, latents, tree.
 
-Each is kept in the work folder, mask weights view by view, so that an interrupted run repeats little, and so
-that what is held in memory depends on a block of Gaussians and not on all of them times all photographs.
+Each is kept in the work folder. Mask weights are kept view by view and latents block by block, so that an
+interrupted run, or one that is shared by several processes, repeats little, and so that what is held in
+memory depends on a block of Gaussians and not on all of them times all photographs.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,6 +19,7 @@ from langsplat_core.config import LiftConfig, RasterSettings, TrainConfig
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import (
     Arrays,
+    ProcessGroup,
     digest_of,
     kept,
     open_array,
@@ -80,11 +83,12 @@ def language_field(
     config: TrainConfig,
     work: Path,
     progress: Progress,
+    processes: ProcessGroup | None = None,
 ) -> tuple[LanguageField, codec_fit.CodecReport]:
     """Return the field of the views' masks, and its codec's loss; InputError without any mask."""
     check_lift(config)
     check_masks(features for _, features in views)
-    stages = _Stages(gaussians, views, encoder, config, work, progress)
+    stages = _Stages(gaussians, views, encoder, config, work, progress, processes or ProcessGroup())
     codec, report = stages.codec()
     latents, confidence = stages.latents(codec)
     confidence = confidence.clip(max=MOST_CONFIDENCE).astype(np.float16).astype(np.float32)
@@ -124,6 +128,7 @@ class _Stages:
     config: TrainConfig
     work: Path
     progress: Progress
+    processes: ProcessGroup
 
     @property
     def by_weights(self) -> bool:
@@ -149,6 +154,12 @@ class _Stages:
         """Return the file of a stage."""
         return self.work / f"{stage_key(name, version, *self.inputs[1], *settings)}.npz"
 
+    def kept(self, path: Path, make: Callable[[], Arrays]) -> Arrays:
+        """Return what one process makes, from mask weights that are everyone's work."""
+        if self.by_weights and not path.exists():
+            _ = self.mask_weights
+        return self.processes.once(lambda: kept(path, make))
+
     @cached_property
     def mask_weights(self) -> tuple[MaskWeights, MaskGroups]:
         """The mask weights, in files that are read where they are needed, and the groups of masks."""
@@ -162,7 +173,7 @@ class _Stages:
             groups = lift.group_masks(vectors)
             return {"of_mask": np.concatenate(groups.of_mask), "vectors": groups.vectors}
 
-        made = kept(folder / "groups.npz", make)
+        made = self.processes.once(lambda: kept(folder / "groups.npz", make))
         edges = np.cumsum([len(view) for view in vectors])[:-1]
         return mask_weights, MaskGroups(tuple(np.split(made["of_mask"], edges)), made["vectors"])
 
@@ -176,11 +187,12 @@ class _Stages:
         return MaskWeights([open_array(path) for path in files], len(self.gaussians))
 
     def each(self, count: int, stage: str) -> Iterator[int]:
-        """Yield the numbers of `count` items, and report each."""
-        for index in range(count):
+        """Yield this process's share of `count` items, report each, and wait for all processes."""
+        for index in self.processes.share(range(count)):
             self.progress(stage, index / count)
             yield index
         self.progress(stage, 1.0)
+        self.processes.barrier()
 
     @cached_property
     def formation(self) -> RasterSettings:
@@ -206,7 +218,7 @@ class _Stages:
             return {"kind": np.array(codec.kind), "report": figures, **codec.tensors()}
 
         fitted_to = self.lift.mode if self.by_weights else "masks"
-        made = dict(kept(self.path("codec", 2, fitted_to, self.config.codec.own), make))
+        made = dict(self.kept(self.path("codec", 2, fitted_to, self.config.codec.own), make))
         kind, figures = str(made.pop("kind")), made.pop("report").tolist()
         return codec_from_tensors(kind, made), codec_fit.CodecReport(*figures)
 
@@ -221,11 +233,20 @@ class _Stages:
 
     def latents(self, codec: Codec) -> Latents:
         """Return the latents of every Gaussian at every level, and the confidence in them."""
+        done = self.path("latents", 2, self.lift, self.config.codec.own)
+        blocks = done.with_suffix("")
+        if self.by_weights and not done.exists():
+            self.lift_blocks(codec, blocks)
 
         def make() -> Arrays:
             scene, shared = (self.gaussians, self.views, codec), (self.formation, self.progress)
             if self.by_weights:
-                latents, confidence = self.lifted(codec)
+                shape = len(LEVELS), len(self.gaussians)
+                latents = np.zeros((*shape, codec.latent_dim), codec.dtype)
+                confidence = np.zeros(shape, np.float32)
+                for number, (first, last) in enumerate(self.mask_weights[0].blocks):
+                    part = read_arrays(blocks / f"{number:05d}.npz")
+                    latents[:, first:last], confidence[:, first:last] = part["latents"], part["confidence"]
             elif self.lift.mode == "one-pass":
                 latents, confidence = lift.lift_latents(self.rasterizer(), *scene, *shared)
             else:
@@ -234,21 +255,25 @@ class _Stages:
                 )
             return {"latents": latents, "confidence": confidence}
 
-        made = kept(self.path("latents", 2, self.lift, self.config.codec.own), make)
+        made = self.processes.once(lambda: kept(done, make))
+        if self.processes.is_main:
+            shutil.rmtree(blocks, ignore_errors=True)
         return made["latents"], made["confidence"]
 
-    def lifted(self, codec: Codec) -> Latents:
-        """Return the latents and the confidence in them by mask weights, of one block after the other."""
+    def lift_blocks(self, codec: Codec, folder: Path) -> None:
+        """Lift this process's share of the blocks of Gaussians, each into a file."""
         mask_weights, groups = self.mask_weights
-        shape = len(LEVELS), len(self.gaussians)
-        latents, confidence = np.zeros((*shape, codec.latent_dim), codec.dtype), np.zeros(shape, np.float32)
+
+        def lifted(number: int) -> Arrays:
+            weights = mask_weights.block(number, groups)
+            robust = self.lift.mode == "median"
+            vectors, confidence = lift.lift_weights(weights, groups.vectors, robust)
+            latents = codec.encode(vectors.reshape(-1, vectors.shape[2])).reshape(*vectors.shape[:2], -1)
+            latents = np.where(confidence[..., None] > 0, latents, 0).astype(latents.dtype)
+            return {"latents": latents, "confidence": confidence}
+
         for number in self.each(len(mask_weights.blocks), "averaging mask vectors"):
-            part = np.s_[:, slice(*mask_weights.blocks[number])]
-            weights, robust = mask_weights.block(number, groups), self.lift.mode == "median"
-            vectors, confidence[part] = lift.lift_weights(weights, groups.vectors, robust)
-            encoded = codec.encode(vectors.reshape(-1, vectors.shape[2])).reshape(*vectors.shape[:2], -1)
-            latents[part] = np.where(confidence[part][..., None] > 0, encoded, 0)
-        return latents, confidence
+            kept(folder / f"{number:05d}.npz", partial(lifted, number))
 
     def tree(self, field: LanguageField) -> Tree:
         """Return the scene's tree, without votes where latents are averaged, which needs no mask weights."""
@@ -263,7 +288,7 @@ class _Stages:
             tree = build_tree(*parts, np.stack(things))
             return vars(replace(tree, votes=lift.count_votes(tree, mask_weights, counts)))
 
-        return Tree(**kept(self.path("nodes", 4, self.lift, self.config.codec.own), make))
+        return Tree(**self.kept(self.path("nodes", 4, self.lift, self.config.codec.own), make))
 
 
 # Masks that all photographs agree on, in place of those that each photograph was given.
@@ -294,13 +319,14 @@ def agreed_features(
     config: TrainConfig,
     work: Path,
     progress: Progress,
+    processes: ProcessGroup | None = None,
 ) -> OnDemand[ImageFeatures]:
     """Describe masks by the consensus of all views' masks, whose vectors are not read.
 
     photographs: (H, W, 3) uint8 of each view, and its (H, W) bool mask of pixels that count (None: all do).
     What is finished is kept in `work`.
     """
-    stages = _Stages(gaussians, views, encoder, config, work, progress)
+    stages = _Stages(gaussians, views, encoder, config, work, progress, processes or ProcessGroup())
     rasterizer, formed = stages.rasterizer(), stages.formation
     facts = ((camera.position, len(seen.vectors), digest_of(seen)) for camera, seen in views)
     eyes, counts, digests = zip(*facts, strict=True)
@@ -312,7 +338,7 @@ def agreed_features(
         return vars(find_tree(gaussians, surface, mask_weights, counts, np.stack(eyes), progress))
 
     key = stage_key("tree", VERSION, *inputs)
-    tree = MergeTree(**kept(work / f"{key}.npz", make))
+    tree = MergeTree(**stages.processes.once(lambda: kept(work / f"{key}.npz", make)))
     drawn = [work / key / f"{index:05d}.npy" for index in range(len(views))]
     for index in stages.each(len(views), f"drawing {AGREED}"):
         if not drawn[index].exists():

@@ -7,6 +7,7 @@ its content is allowed by its hash. Names and other text of whatever origin are 
 import hashlib
 import html
 import io
+import json
 from base64 import b64encode
 from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -41,7 +42,7 @@ class TrainReport:
     gaussians: int
     psnr: float | None  # mean over held-out views, dB; None without held-out views
     warnings: tuple[str, ...]  # quality warnings, each with its remedy
-    seconds: dict[str, float]  # per stage, of interrupted runs too
+    seconds: dict[str, float]  # per stage, of all processes that worked on it, interrupted ones too
     masks: str = ""  # name of the mask source; "" without a language field, as what follows
     encoder: str = ""
     mask_count: int = 0
@@ -62,6 +63,13 @@ class TrainReport:
 def work_folder(out: Path) -> Path:
     """Return the default folder in which the training of a scene keeps its stages."""
     return out.with_name(f"{out.stem}.work")
+
+
+def read_report(work: Path) -> TrainReport:
+    """Read the report of the run which has just ended, in this process or another."""
+    stated = json.loads((work / REPORT).read_text(encoding="utf-8"))
+    scores = tuple(ViewScore(**score) for score in stated.get("held_out_views", ()))
+    return TrainReport(**stated | {"warnings": tuple(stated["warnings"]), "held_out_views": scores})
 
 
 def stated_figures(path: Path) -> dict[str, Any]:

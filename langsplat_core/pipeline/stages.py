@@ -1,4 +1,4 @@
-"""Results of stages, kept under a key of settings and inputs; the work folder's lock."""
+"""Results of stages, kept under a key of settings and inputs; the work folder's lock; groups of processes."""
 
 import contextlib
 import hashlib
@@ -8,11 +8,12 @@ import logging
 import os
 import socket
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -30,6 +31,8 @@ except ImportError:  # Windows; there two trainings in one folder are the user's
 
 log = logging.getLogger("langsplat")
 LOCK = "in-use.lock"  # in the work folder, where it stays: only the system's lock on it counts
+PATIENCE = timedelta(days=7)  # radiance training is one process's work, and the others wait for it
+T = TypeVar("T")
 Arrays = Mapping[str, Array]
 
 
@@ -165,3 +168,62 @@ def _locked(folder: Path) -> io.FileIO:
             if os.path.samestat(os.fstat(file.fileno()), os.stat(folder / LOCK)):
                 return file
         file.close()  # who held it has removed it meanwhile: this is a lock on nothing
+
+
+@dataclass(frozen=True)
+class ProcessGroup:
+    """This process among those that share a training; alone by default.
+
+    `torchrun --nproc-per-node 2 -m langsplat_core train DATASET --out scene.ply` starts two. Results go
+    through the work folder, item by item, so that a lost process costs only what it had not finished.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def is_main(self) -> bool:
+        """True for the process that does what cannot be shared, and that speaks."""
+        return self.rank == 0
+
+    def share(self, items: Sequence[T]) -> list[T]:
+        """Return the part of `items` that is this process's work."""
+        return list(items[self.rank :: self.size])
+
+    def barrier(self) -> None:
+        """Wait for all processes. Raises InputError where one of them has ended."""
+        if self.size < 2:
+            return
+        import torch.distributed
+
+        try:
+            torch.distributed.barrier()
+        except RuntimeError as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(
+                f"another process of this training ended ({reason[:80]}); give the same command again: what "
+                "is finished is kept"
+            ) from None
+
+    def once(self, make: Callable[[], T]) -> T:
+        """Return the result of `make`, which keeps it in a file: one process makes it, the others read it."""
+        if self.is_main:
+            result = make()
+            self.barrier()
+            return result
+        self.barrier()
+        return make()
+
+
+def join_processes() -> ProcessGroup:
+    """Join the processes that torchrun started; a group of one without it."""
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    if size < 2:
+        return ProcessGroup()
+    import torch.distributed
+
+    if not torch.distributed.is_initialized():
+        torch.distributed.init_process_group("gloo", timeout=PATIENCE)
+    if torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+    return ProcessGroup(torch.distributed.get_rank(), torch.distributed.get_world_size())

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -34,7 +34,7 @@ from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.pipeline import language_field
 from langsplat_core.pipeline import report as reports
-from langsplat_core.pipeline.stages import LOCK, digest_of, sole_use, stage_key
+from langsplat_core.pipeline.stages import LOCK, ProcessGroup, digest_of, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Gaussians, LanguageField, Scene
 from langsplat_core.scene.transform import place_scene
@@ -53,21 +53,23 @@ Until = Literal["gaussians", "language field"]  # what a training ends with
 log = logging.getLogger("langsplat")
 
 
-def train_scene(
+def train_scene(  # noqa: PLR0913  what the command has as options
     dataset: Path,
     out: Path,
     config: TrainConfig,
     work: Path | None = None,
     progress: Progress = silent,
     masks_of: Callable[[Capture], MaskSource] | None = None,
+    processes: ProcessGroup | None = None,
     gaussians_from: Path | None = None,
     until: Until = "language field",
 ) -> reports.TrainReport:
     """Train `out` (a .ply; sidecar and cameras beside it) from the photographs in `dataset`.
 
     `masks_of` makes another mask source than ``config.masks`` names, once the photographs are read.
-    `gaussians_from`: a scene in the photographs' world whose Gaussians are taken instead of training some.
-    `until` "gaussians": a scene without a language field, which a later call adds to it.
+    `processes`: the processes that share the work; all call this with the same arguments, and one writes the
+    scene. `gaussians_from`: a scene in the photographs' world whose Gaussians are taken instead of training
+    some. `until` "gaussians": a scene without a language field, which a later call adds to it.
     """
     check_settings(config)
     language_field.check_lift(config)
@@ -78,8 +80,9 @@ def train_scene(
     check_output_folder(work)
     # First: a scene that cannot be read should not cost an hour.
     given = None if gaussians_from is None else load_scene(gaussians_from)
-    with sole_use(work):
-        return _train(_Run(dataset, out, config, work, progress, until), masks_of, given)
+    processes = processes or ProcessGroup()
+    with sole_use(work) if processes.is_main else nullcontext():
+        return _train(_Run(dataset, out, config, work, progress, processes, until), masks_of, given)
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ class _Run:
     config: TrainConfig
     work: Path
     progress: Progress
+    processes: ProcessGroup
     until: Until
 
     @property
@@ -122,17 +126,19 @@ def _train(
     run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: Scene | None
 ) -> reports.TrainReport:
     """Train in a work folder that is this run's own; `given`: the scene whose Gaussians are taken."""
-    config, encoder, named_source = run.config, None, None
+    config, processes = run.config, run.processes
+    encoder, named_source = None, None
     with run.timed("photographs"):
         if run.until != "gaussians":  # first: absent weights should not cost an hour
             encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
             named_source = None if masks_of else load_mask_source(config.masks, config.clip.device)
-        capture = _photographs(run)
+        # One process solves for cameras, the others find them in the work folder.
+        capture = processes.once(lambda: _photographs(run))
         train, held_out = split_views(capture, config.dataset)
         cameras = tuple(capture.cameras[i] for i in train)
-        # For whoever looks at the Gaussians before their scene is written.
-        with atomic_path((run.work / reports.PREVIEW).with_suffix(CAMERAS)) as file:
-            write_cameras(file, cameras)
+        if processes.is_main:  # for whoever looks at the Gaussians before their scene is written
+            with atomic_path((run.work / reports.PREVIEW).with_suffix(CAMERAS)) as file:
+                write_cameras(file, cameras)
 
     if encoder is not None:
         mask_source = named_source or masks_of(capture)  # type: ignore[misc]  # one of them is there
@@ -149,7 +155,8 @@ def _train(
                     "--radiance.capped-views 0 spends all",
                     *(settings.ensemble, settings.steps, config.radiance.steps, len(train)),
                 )
-            gaussians = trained_gaussians(capture, train, settings, run.work, run.progress, held_out)
+            made = capture, train, settings, run.work, run.progress, held_out
+            gaussians = processes.once(lambda: trained_gaussians(*made))
         else:
             gaussians = place_scene(given, origin=capture.origin).gaussians
 
@@ -157,35 +164,37 @@ def _train(
     if encoder is not None:
         language, figures = _language(run, capture, train, gaussians, features, mask_source, encoder)
 
-    with run.timed("saving and held-out views"):
-        said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
-        metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
-        scene = Scene(gaussians, language, cameras, metres_per_unit=metres, origin=capture.origin)
-        save_scene(run.out, scene)
-        small = capture.read_at(held_out, QUICK_SIDE) if held_out else None
-        near = config.radiance.near or scene.near  # as whoever opens the scene has it
-        told: dict[str, Any] = {"near": near, "progress": run.progress}
-        scores = evaluate_views(gaussians, capture, held_out, small=small, **told) if held_out else []
-        trained = evaluate_views(gaussians, capture, reports.shown_views(train), **told)
-    rule = f"one in {config.dataset.test_every}, "
-    rule += "by name" if config.dataset.hold_out == "every" else "amid others"
-    report = reports.TrainReport(
-        views=len(cameras),
-        held_out=len(scores),
-        gaussians=len(gaussians),
-        psnr=_mean(score.psnr for score in scores),
-        psnr_small=_mean(score.psnr_small for score in scores),
-        warnings=reports.quality_warnings(capture, train, scores, trained),
-        seconds=run.seconds,
-        dataset=str(run.dataset.resolve()),
-        taken=capture.taken,
-        held_out_views=tuple(scores),
-        psnr_trained=_mean(score.psnr for score in trained),
-        held_out_rule="as the dataset says" if any(photo.held_out for photo in capture.photos) else rule,
-        **figures,
-    )
-    reports.write_reports(run.work, report, capture, gaussians, trained)
-    return report
+    if processes.is_main:
+        with run.timed("saving and held-out views"):
+            said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
+            metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
+            scene = Scene(gaussians, language, cameras, metres_per_unit=metres, origin=capture.origin)
+            save_scene(run.out, scene)
+            small = capture.read_at(held_out, QUICK_SIDE) if held_out else None
+            near = config.radiance.near or scene.near  # as whoever opens the scene has it
+            told: dict[str, Any] = {"near": near, "progress": run.progress}
+            scores = evaluate_views(gaussians, capture, held_out, small=small, **told) if held_out else []
+            trained = evaluate_views(gaussians, capture, reports.shown_views(train), **told)
+        rule = f"one in {config.dataset.test_every}, "
+        rule += "by name" if config.dataset.hold_out == "every" else "amid others"
+        report = reports.TrainReport(
+            views=len(cameras),
+            held_out=len(scores),
+            gaussians=len(gaussians),
+            psnr=_mean(score.psnr for score in scores),
+            psnr_small=_mean(score.psnr_small for score in scores),
+            warnings=reports.quality_warnings(capture, train, scores, trained),
+            seconds=run.seconds,
+            dataset=str(run.dataset.resolve()),
+            taken=capture.taken,
+            held_out_views=tuple(scores),
+            psnr_trained=_mean(score.psnr for score in trained),
+            held_out_rule="as the dataset says" if any(photo.held_out for photo in capture.photos) else rule,
+            **figures,
+        )
+        reports.write_reports(run.work, report, capture, gaussians, trained)
+    processes.barrier()
+    return reports.read_report(run.work)
 
 
 def _language(
@@ -198,7 +207,7 @@ def _language(
     encoder: Encoder,
 ) -> tuple[LanguageField, dict[str, Any]]:
     """Return the language field of the Gaussians, and the report's figures of it."""
-    config, shared = run.config, (run.work, run.progress)
+    config, shared = run.config, (run.work, run.progress, run.processes)
     cameras = tuple(capture.cameras[i] for i in train)
     if not source.agrees:
         with run.timed("masks that agree"):
@@ -252,10 +261,13 @@ def _described(
     if encoder.id == DEMO and not capture.drawn:
         log.warning("%s", DEMO_ELSEWHERE)
     store = FeatureStore(run.work / ("features" if source.agrees else "masks"))
-    names = [capture.cameras[i].name for i in train]
-    images, counted = [capture.images[i] for i in train], [capture.mask(i) for i in train]
+    mine = run.processes.share(train)
+    names = [capture.cameras[i].name for i in mine]
+    images, counted = [capture.images[i] for i in mine], [capture.mask(i) for i in mine]
     seen_by = encoder if source.agrees else None
-    return describe_capture(images, names, source, seen_by, store, run.progress, counted)
+    describe_capture(images, names, source, seen_by, store, run.progress, counted)
+    run.processes.barrier()
+    return store.of([capture.cameras[i].name for i in train])
 
 
 def trained_gaussians(

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from langsplat_core.pipeline.report import (
     TrainReport,
     camera_groups,
     quality_warnings,
-    stated_figures,
+    read_report,
     stated_warnings,
     work_folder,
     write_reports,
@@ -167,7 +167,7 @@ def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path)
     )
     others = [ViewScore(name, 30.0, 0.9, 0.9) for name in names if name not in names[2:4]]
     write_reports(tmp_path, warned, capture(names, matches=matches), gaussians(), others)
-    assert stated_figures(tmp_path / REPORT) == json.loads(json.dumps(asdict(warned)))
+    assert read_report(tmp_path) == warned
     page = Read(tmp_path / PAGE)
     assert not {"link", "iframe", "light"} & {tag for tag, _ in page.tags}
     assert page.of("script") == [{}]  # the page's own

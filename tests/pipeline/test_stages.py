@@ -1,24 +1,29 @@
 """A work folder belongs to one training at a time, and to none once that has ended, however it ended."""
 
+import multiprocessing
 import os
 import random
 import shutil
 import signal
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch.distributed
 
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.run import main
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.pipeline.stages import LOCK, kept, sole_use, stage_key
+from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, kept, sole_use, stage_key
 from langsplat_core.progress import Report
 from tests.support.photographs import poses, write_model, write_photos
 from tests.support.processes import resize, small_disk
-from tests.support.tiny_models import tiny_clip
+from tests.support.tiny_models import tiny_clip, tiny_room, tiny_sam
 
 pytestmark = pytest.mark.long
 
@@ -70,6 +75,84 @@ def test_lock_excludes_a_second_training_in_one_process(tmp_path: Path) -> None:
     with sole_use(tmp_path / "a"), sole_use(tmp_path / "b"):
         (tmp_path / "a" / "result").touch()
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", LOCK, "result"]  # b held nothing
+
+
+# Several processes that share one training: the same scene as from one.
+
+OPTIONS = (
+    *("--dataset.max-side", "64", "--dataset.test-every", "4", "--radiance.steps", "20"),
+    *("--radiance.sh-degree", "0", "--masks.source", "graph", "--clip.device", "cpu", "--codec.size", "20"),
+)
+
+
+def test_every_item_is_shared_once(monkeypatch):
+    items = list(range(11))
+    shares = [ProcessGroup(rank, 3).share(items) for rank in range(3)]
+    assert sorted(item for share in shares for item in share) == items
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+    assert [ProcessGroup(rank, 3).is_main for rank in range(3)] == [True, False, False]
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    assert join_processes() == ProcessGroup(0, 1)  # without a launcher
+
+
+def test_barrier_names_a_lost_process(monkeypatch):
+    def lost() -> None:
+        raise RuntimeError("Connection closed by peer [127.0.0.1]:55\nmore")
+
+    monkeypatch.setattr("torch.distributed.barrier", lost)
+    with pytest.raises(InputError, match=r"ended \(Connection closed by peer .*what is finished is kept"):
+        ProcessGroup(1, 2).barrier()
+
+
+def train(room: Path, out: Path, said: Path, surroundings: dict[str, str], *more: str) -> None:
+    """The command, in an environment; its exit code becomes this process's, unless it is 0."""
+    os.environ.update(surroundings)
+    words = ["train", str(room), "--out", str(out), "--phrases", "red mug", *OPTIONS, *more]
+    with said.open("w") as file, redirect_stdout(file), redirect_stderr(file):
+        code = main("langsplat", lambda: parse([*words, "--clip.model", str(room / "encoder")]))
+    if code:
+        sys.exit(code)
+
+
+def train_by_two(room: Path, out: Path, *more: str) -> tuple[list[int | None], list[str]]:
+    """Exit codes and what is said, joined as torchrun joins them: it keeps the store where they meet."""
+    store = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+    there = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port), "WORLD_SIZE": "2"}
+    there["TORCHELASTIC_USE_AGENT_STORE"] = "True"
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["tests.pipeline.test_stages"])
+    two, said = [], [out.with_name("0.txt"), out.with_name("1.txt")]
+    for rank, text in enumerate(said):
+        surroundings = there | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
+        arguments = (room, out, text, surroundings, *more)
+        two.append(processes.Process(target=train, args=arguments, daemon=True))
+    for process in two:
+        process.start()
+    for process in two:
+        process.join(300)
+    return [process.exitcode for process in two], [text.read_text() for text in said]
+
+
+def test_two_processes_make_the_scene_of_one(tmp_path: Path) -> None:
+    room = tiny_room(tmp_path / "room")
+    train(room, tmp_path / "one.ply", tmp_path / "one.txt", {})
+    codes, texts = train_by_two(room, tmp_path / "two.ply")
+    assert codes == [0, 0], texts
+    assert [text.count("Gaussians from 5 photographs") for text in texts] == [1, 0]
+    for suffix in (".ply", ".langsplat.safetensors"):
+        assert (tmp_path / f"two{suffix}").read_bytes() == (tmp_path / f"one{suffix}").read_bytes()
+
+
+def test_two_processes_without_a_mask_both_end_before_training(tmp_path: Path) -> None:
+    room = tiny_room(tmp_path / "room")
+    tiny_sam(tmp_path / "sam")  # random weights, whose scores are far below one
+    picky = ("--masks.source", "sam", "--masks.sam", str(tmp_path / "sam"), "--masks.predicted-iou", "1")
+    codes, texts = train_by_two(room, tmp_path / "two.ply", *picky)
+    assert codes == [2, 2], texts
+    for text in texts:
+        assert text.strip().splitlines()[-1].count("no photograph has masks") == 1
+        assert "Traceback" not in text
+    assert not list(tmp_path.glob("two.work/radiance*"))
 
 
 # Trainings that are stopped in every stage, by a signal or a full disk, end as if nothing had been.
