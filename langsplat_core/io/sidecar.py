@@ -39,7 +39,7 @@ executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and 
     temperature      of the softmax that reads this encoder's cosines, decimal
     found            relevancy from which a phrase counts as present, decimal
     odds             JSON: a list of numbers for each `PlattScaling` of `scene.Calibration`; absent where
-                     there is none
+                     there is none ("calibration" of older files is of another scale, and is not read)
     origin           JSON: three numbers, where the positions are relative to, see `Scene`; absent for zero
     taught           JSON: of each taught word a list of its name, its level (0, 1, 2) and the number of its
                      examples; absent where there are none
@@ -50,6 +50,9 @@ format "langsplat words", version "1", encoder and taught.
 "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
 like the one in memory. The PLY stays a plain file that other programs edit; the checksum notices it, and the
 positions let `rematch_language` carry the field over to an edited PLY.
+
+Older versions are read too: version 2 has no tree but `things`, which are not read; in version 1 everything
+is float32, with `means` (N, 3) in place of positions and corners, no temperature and no found.
 """
 
 import hashlib
@@ -78,10 +81,10 @@ from langsplat_core.scene.language import CANONICAL_PHRASES, MOST_SHOWN, PlattSc
 
 SUFFIX = ".langsplat.safetensors"
 CODEC = "codec."
-# Formats: name and version in the metadata, and what it is in words
-_Format = tuple[str, str, str]
-FIELD: _Format = ("langsplat", "3", "a language field")
-WORDS: _Format = ("langsplat words", "1", "taught words")
+# Formats: name in the metadata, versions that are read, the last of which is written, and what it is in words
+_Format = tuple[str, tuple[str, ...], str]
+FIELD: _Format = ("langsplat", ("1", "2", "3"), "a language field")
+WORDS: _Format = ("langsplat words", ("1",), "taught words")
 
 _Odds = tuple[float, float, float, float]
 _Count = Annotated[int, Meta(ge=1, le=MOST_SHOWN)]
@@ -97,6 +100,7 @@ _PARSED: Mapping[str, Any] = {  # metadata that are JSON
 }
 _KINDS = {  # types of tensors that hold no floating-point numbers
     "codes": ("U16",),
+    "things": ("U16",),
     "positions": ("U64",),
     "tree.leaves": ("U16", "U32"),
     "tree.parents": ("U32",),
@@ -123,6 +127,8 @@ def read_stored(path: Path) -> Stored:
         tensors, about = _read(path, FIELD)
         if about["levels"] != ",".join(LEVELS):
             raise ValueError(f"levels {quoted(about['levels'])}; expected {','.join(LEVELS)!r}")
+        if "means" in tensors:  # of version 1
+            tensors["positions"], tensors["corners"] = pack_positions(tensors["means"])
         field = _field(tensors, about)
         if (about["d"], about["gaussians"]) != (field.codec.latent_dim, len(field)):
             raise ValueError("the header's d or number of Gaussians is not that of the tensors")
@@ -136,18 +142,23 @@ def read_stored(path: Path) -> Stored:
         return Stored(field, means + about.get("origin", 0.0), precision, about["means_blake2b"])
 
 
-_ALWAYS = ("confidence", "positions", "corners", "canonical", "everyday", "phrasebook")
-_STATED = {*_PARSED, "format", "version", "encoder", "levels", "codec", "means_blake2b"}
+_ALWAYS = ("confidence", "positions", "corners", "means", "canonical", "everyday", "phrasebook")
+_STATED = {*_PARSED, "format", "version", "encoder", "levels", "codec", "means_blake2b", "calibration"}
 
 
 def _passed_over(field: LanguageField, tensors: dict[str, Array], about: dict[str, Any]) -> Iterator[str]:
-    """Yield, for `report_losses`, what of a field is passed over."""
+    """Yield, for `report_losses`, what of a field is passed over or guessed."""
     read = {*_ALWAYS, "latents" if field.codec.blends else "codes"}
     read.update(CODEC + name for name in field.codec.tensors())
     read.update(name for name in _KINDS if name.startswith("tree.") and field.tree is not None)
     read.update(name for name in ("taught", "taught.rivals") if field.taught)
     yield unread("tensors", (quoted(name, 40) for name in tensors if name not in read))
     yield unread("metadata", (quoted(name, 40) for name in about if name not in _STATED))
+    if "calibration" in about:
+        yield "its calibration is of another scale, not read: `langsplat train --gaussians` makes one anew"
+    absent = [name for name in ("temperature", "found") if name not in about and about["version"] != "1"]
+    if absent:
+        yield f"{' and '.join(absent)} not given: taken as of the encoder CLIP"
 
 
 @contextmanager
@@ -166,15 +177,15 @@ def _faults(path: Path) -> Iterator[None]:
 def _read(path: Path, kind: _Format) -> tuple[dict[str, Array], dict[str, Any]]:
     """Tensors of a file of this kind, floats as float32, and metadata."""
     open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
-    name, version, what = kind
+    name, versions, what = kind
     tensors = {}
     with safe_open(path, framework="numpy") as file:
         about: dict[str, Any] = file.metadata() or {}
         if about.get("format") != name:
             raise ValueError(f"a safetensors file, but not of {what}")
-        if about.get("version") != version:
+        if about.get("version") not in versions:
             found = f"version {quoted(about.get('version'))} of {what}"
-            raise malformed(path, f"{found}; this program reads {version}", "make it anew, or update this")
+            raise malformed(path, f"{found}; this program reads {' and '.join(versions)}", "update it")
         about |= {
             key: decode_json(about[key].encode(), kind, path) for key, kind in _PARSED.items() if key in about
         }
@@ -189,6 +200,8 @@ def _read(path: Path, kind: _Format) -> tuple[dict[str, Array], dict[str, Any]]:
 
 def _bounded(name: str, tensor: Array) -> Array:
     """Return a tensor of numbers that the layout above has room for, and that do not overflow when used."""
+    if name == "means":  # as they were in the PLY
+        return tensor
     if not np.isfinite(tensor).all():
         raise ValueError(f"tensor {quoted(name)} holds numbers that are not finite")
     layers = name.startswith((f"{CODEC}encoder.", f"{CODEC}decoder."))  # which the codec bounds itself
@@ -210,6 +223,7 @@ def _field(tensors: dict[str, Array], about: dict[str, Any]) -> LanguageField:
     check_array("phrasebook", vectors, (len(phrases), codec.vector_dim))
     check_array("canonical", tensors["canonical"], (len(CANONICAL_PHRASES), codec.vector_dim))
     odds = about.get("odds")
+    known = {key: about[key] for key in ("temperature", "found") if key in about}
     tree = None
     if "tree.leaves" in tensors:
         leaves, parents = _signed(tensors["tree.leaves"]), _signed(tensors["tree.parents"])
@@ -221,8 +235,7 @@ def _field(tensors: dict[str, Array], about: dict[str, Any]) -> LanguageField:
         tensors["canonical"],
         FromFile(about["encoder"]),
         dict(zip(phrases, vectors, strict=True)),
-        temperature=about["temperature"],
-        found=about["found"],
+        **known,
         calibration=odds and Calibration(*(PlattScaling(*numbers) for numbers in odds)),
         tree=tree,
         everyday=tensors.get("everyday"),
@@ -277,7 +290,7 @@ def _save(path: Path | str, kind: _Format, tensors: dict[str, Array], about: dic
 
     The library writes the metadata in an order of its own, another one each time; here they are sorted.
     """
-    about = {"format": kind[0], "version": kind[1], **about}
+    about = {"format": kind[0], "version": kind[1][-1], **about}
     with atomic_path(path) as temporary:
         tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
         save_file(tensors, temporary, about)

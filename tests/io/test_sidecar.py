@@ -187,8 +187,7 @@ MISTAUGHT: dict[str, Spoil] = {
 }  # fmt: skip
 MALFORMED: dict[str, Spoil] = {
     "another program's": says(format="gguf"),
-    "an older version": says(version="2"),
-    "no temperature": says(temperature=None),
+    "a newer version": says(version="4"),
     "levels in another order": says(levels="whole,part,subpart"),
     "the other codec": says(codec="linear"),
     "a wrong count": says(gaussians="61"),
@@ -250,11 +249,19 @@ def test_malformed_words_are_refused_in_a_line(own_words, case):
     assert_refused(read_words, own_words)
 
 
-def test_files_without_tree_and_odds_are_read(sidecar, means):
+def test_things_of_version_2_are_not_read(sidecar, means, caplog):
+    change(sidecar, things=np.zeros(N, np.uint16), **NO_TREE)
+    says(version="2")(sidecar)
+    assert read_language(sidecar, means).tree is None
+    assert ["things" in message for message in caplog.messages] == [True]
+
+
+def test_files_without_tree_and_odds_are_read(sidecar, means, caplog):
     change(sidecar, **NO_TREE, everyday=None)
-    says(odds=None)(sidecar)
+    says(odds=None, calibration="[-0.25, 18.5, 2.75, 0.625]")(sidecar)  # of another scale: not read
     field = read_language(sidecar, means)
     assert (field.tree, field.everyday, field.calibration) == (None, None, None)
+    assert "langsplat train --gaussians" in caplog.messages[0]
     assert (field.temperature, field.found) == (11.7, 0.73)
     assert rematch_language(sidecar, means[:9]).tree is None
 
@@ -305,6 +312,20 @@ def test_a_code_without_a_codeword_is_refused(tmp_path, means):
     field.latents[1, 5] = 11
     write_language(tmp_path / "a", field, means)
     assert_refused(lambda path: read_language(path, means), tmp_path / "a")
+
+
+def test_version_1_is_read(tmp_path, means):
+    """As the first release wrote it: everything float32, and the means themselves."""
+    field = replace(random_field(N), everyday=None)
+    path = tmp_path / "a"
+    write_language(path, field, means)
+    metadata = header_of(path)["__metadata__"]
+    del metadata["temperature"], metadata["found"]
+    tensors = load_file(path)
+    del tensors["positions"], tensors["corners"]
+    save_file(tensors | {"means": means}, path, metadata | {"version": "1"})
+    assert_same_field(read_language(path, means), field)
+    assert_same_field(rematch_language(path, means), field)
 
 
 def test_packed_positions_are_exact_to_half_a_step():
