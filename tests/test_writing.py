@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from threading import Barrier
@@ -290,22 +291,38 @@ def test_two_windows_keep_what_each_changed(tmp_path: Path) -> None:
     assert load_preferences(tmp_path).recent == ("b", "a", "old")
 
 
-def test_writing_keeps_links_mode_and_group(tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", [3, 300_000])
+def test_writing_keeps_links_mode_and_group(size: int, tmp_path: Path) -> None:
     (tmp_path / "shared").mkdir()
     file, link, other = tmp_path / "shared/a.json", tmp_path / "a.json", tmp_path / "b.json"
-    file.write_bytes(b"before")
+    file.write_bytes(b"before" * 100)
     file.chmod(0o660)
     group = next(iter({*os.getgroups(), os.getgid()} - {file.stat().st_gid}), file.stat().st_gid)
     os.chown(file, -1, group)
     link.symlink_to(Path("shared") / "a.json")
-    other.hardlink_to(file)
-    with atomic_path(link) as temporary:
-        temporary.write_bytes(b"after")
-    assert link.is_symlink()
-    assert (file.read_bytes(), other.read_bytes()) == (b"after", b"before")  # a copy made by a hard link
-    about = file.stat()
-    assert (about.st_mode & 0o777, about.st_gid) == (0o660, group)
+    for names in (1, 2):
+        with atomic_path(link) as temporary:
+            temporary.write_bytes(bytes(size + names))
+        assert link.is_symlink()
+        assert file.read_bytes() == bytes(size + names)
+        about = file.stat()
+        assert (about.st_mode & 0o777, about.st_gid, about.st_nlink) == (0o660, group, names)
+        if names == 1:
+            other.hardlink_to(file)
+    assert other.read_bytes() == file.read_bytes()
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.json", "a.json", "b.json", "shared"]
+
+
+def test_a_full_disk_leaves_a_file_of_several_names(tmp_path: Path) -> None:
+    file = tmp_path / "a"
+    file.write_bytes(b"before")
+    (tmp_path / "b").hardlink_to(file)
+    full = pytest.raises(OSError, match="large")
+    with full as caught, ExitStack() as later, atomic_path(file) as temporary:
+        temporary.write_bytes(bytes(9000))
+        later.enter_context(files_of_at_most(5000))
+    assert caught.value.filename == str(file)
+    assert file.read_bytes() == b"before"
 
 
 def test_temporary_names_are_in_no_message(tmp_path: Path) -> None:

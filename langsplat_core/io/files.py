@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import re
+import shutil
 import stat
 import sys
 import tempfile
@@ -32,8 +33,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary name beside `path`; on a clean exit it is renamed to `path`, else removed.
 
     The temporary name keeps the suffix, because some writers choose the format by it. A symbolic link stays
-    one, and a file keeps its mode and group. Where the disk takes no more, an OSError with `path` comes out,
-    whatever the writer said; none names the temporary file.
+    one, and a file its mode and group and, where it may be written, its other names. Where the disk takes no
+    more, an OSError with `path` comes out, whatever the writer said; none names the temporary file.
     """
     target = Path(path)
     suffix = target.suffix if len(os.fsencode(target.suffix)) <= 64 else ""  # else the name may be too long
@@ -47,8 +48,9 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        _take_rights(temporary, place)
-        patiently(lambda: temporary.replace(place))
+        if not (place.is_file() and place.stat().st_nlink > 1 and _filled(place, temporary)):
+            _take_rights(temporary, place)
+            patiently(lambda: temporary.replace(place))
     except LangSplatError as error:  # which may name what is written: by the name that the user knows
         error.args = tuple(str(part).replace(str(temporary), str(target)) for part in error.args)
         raise
@@ -86,6 +88,25 @@ def _take_rights(temporary: Path, place: Path) -> None:
     with suppress(OSError, AttributeError):  # a group that one is not of; Windows
         os.chown(temporary, -1, before.st_gid)
     temporary.chmod(stat.S_IMODE(before.st_mode))
+
+
+def _filled(place: Path, temporary: Path) -> bool:
+    """Write a file's content into one with other names, which keeps them; False where one may not."""
+    try:
+        file = place.open("r+b")
+    except OSError:
+        return False
+    with file, temporary.open("rb") as source:
+        size, before = os.fstat(source.fileno()).st_size, os.fstat(file.fileno()).st_size
+        try:
+            if size > before and hasattr(os, "posix_fallocate"):  # what has no room leaves the old content
+                os.posix_fallocate(file.fileno(), 0, size)
+        except OSError:
+            file.truncate(before)
+            raise
+        shutil.copyfileobj(source, file)
+        file.truncate(size)
+    return True
 
 
 def write_json(path: Path, content: object) -> None:
