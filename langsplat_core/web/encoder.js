@@ -34,6 +34,7 @@ class ClipText {
   encode(key) {
     const ids = this.tokenNumbers(key);
     const { config, width } = this;
+    const gelu = (value) => value * sigmoid(1.702 * value);
     let states = this.embedded(ids);
     for (let number = 0; number < config.num_hidden_layers; ++number) {
       const layer = (name) => `text_model.encoder.layers.${number}.${name}`;
@@ -41,7 +42,7 @@ class ClipText {
       const attended = this.attention(layer("self_attn."), seen, ids.length);
       states = states.map((value, i) => value + attended[i]);
       const inner = this.linear(layer("mlp.fc1"), this.normed(layer("layer_norm2"), states), width);
-      const outer = this.linear(layer("mlp.fc2"), inner.map(quickGelu), config.intermediate_size);
+      const outer = this.linear(layer("mlp.fc2"), inner.map(gelu), config.intermediate_size);
       states = states.map((value, i) => value + outer[i]);
     }
     const end = states.subarray((ids.length - 1) * width);
@@ -137,8 +138,6 @@ class ClipText {
     return this.linear(`${name}out_proj`, mixed, width);
   }
 }
-
-const quickGelu = (value) => value * sigmoid(1.702 * value);
 // [/page]
 
 export { PhraseError, ClipText, dot };

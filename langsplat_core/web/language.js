@@ -124,8 +124,10 @@ class Language {
     }
     const things = this.wholesOf(asked);
     if (kind === "without") {
-      const left = things.filter((thing) => !others.includes(thing));
-      return other.verdict.found ? this.restricted(asked, left, asked) : asked;
+      const isPart = other.level + 1 < this.meta.levels.length;
+      const left = things.filter((thing) => isPart || !others.includes(thing));
+      const less = isPart ? this.spread(other).members.map((is, row) => is | asked.less?.[row]) : asked.less;
+      return other.verdict.found ? this.restricted({ ...asked, less }, left, asked) : asked;
     }
     return this.restricted(asked, this.space.chosen(kind, things, others, camera, most), other ?? asked);
   }
@@ -311,8 +313,8 @@ class Language {
   }
 
   // The relevancy of every Gaussian at the level of an answer, its region there (-1: none), and whether it is a
-  // member.
-  spread({ level, inside, codes, regionFits }) {
+  // member: in the answer's regions and not in `less`, if there is that.
+  spread({ level, inside, codes, regionFits, less }) {
     const [first] = regionsAt(this.regions, level);
     const row = (tensor) => tensor.subarray(level * this.gaussians, (level + 1) * this.gaussians);
     const owners = Int32Array.from(row(this.tensors.regions), (own) => (own < 0 ? -1 : first + own));
@@ -321,7 +323,8 @@ class Language {
       ? Float32Array.from(row(this.tensors.codes), (code) => codes[code])
       : Float32Array.from(owners, fit);
     const among = new Set(inside);
-    return { values, owners, members: Uint8Array.from(owners, (region) => +among.has(region)) };
+    const members = Uint8Array.from(owners, (region, row) => +(among.has(region) && !less?.[row]));
+    return { values, owners, members };
   }
 
   // Values of the Gaussians as display/displays.py has them (heats): of an answer from `base` to 1 by what heat is
@@ -354,11 +357,6 @@ class Language {
     const own = codes.subarray(level * this.gaussians, (level + 1) * this.gaussians);
     const colour = (code, channel) => (code < this.codewords ? palette[3 * code + channel] / 255 : 0.5);
     return [0, 1, 2].map((channel) => Float32Array.from(own, (code) => colour(code, channel)));
-  }
-
-  // Eight corners of the box of a region, relative to the page's origin.
-  corners(region) {
-    return this.tensors.corners.subarray(24 * region, 24 * region + 24);
   }
 }
 // [/page]

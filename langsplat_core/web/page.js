@@ -430,9 +430,9 @@ class Page {
       const whole = wholeOf(this.language.regions, region);
       things.set(whole, [...(things.get(whole) ?? []), region]);
     }
-    return [...things]
-      .slice(0, MOST_BOXES)
-      .map(([whole, own]) => this.language.corners(own.length > 1 ? whole : own[0]));
+    const { corners } = this.language.tensors;
+    const shown = [...things].slice(0, MOST_BOXES).map(([whole, own]) => (own.length > 1 ? whole : own[0]));
+    return shown.map((region) => corners.subarray(24 * region, 24 * region + 24));
   }
 
   view(number) {

@@ -103,11 +103,13 @@ function named(text, joint, lists) {
 // What a phrase asks for: { text }, or { kind, what, anchor } of such, of a count { count, what }. The rules, in
 // their order and by their names, are those of query/grammar.py.
 function parse(text, lists) {
-  const sides = named(text, EXCLUDE, lists);
-  const isPart = (side, i) => i && namedBy(side, lists) !== "thing";
-  return (sides.some(isPart) ? [text] : sides)
-    .map((side) => clause(side, lists))
-    .reduce((what, anchor) => ({ kind: "without", what, anchor }));
+  const isPart = (tree) => tree.text && namedBy(tree.text, lists) !== "thing";
+  const ofIt = (what, anchor) => ({ kind: "inside", what: anchor, anchor: what }); // "mug without handle"
+  const trees = named(text, EXCLUDE, lists).map((side) => clause(side, lists));
+  return trees.reduce((what, other) => {
+    const anchor = isPart(other) && what.text && !isPart(what) ? ofIt(what, other) : other;
+    return { kind: "without", what, anchor };
+  });
 }
 
 function clause(text, lists) {

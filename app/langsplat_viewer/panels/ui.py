@@ -108,7 +108,8 @@ def stoppable(label: str, fraction: float, ems: float, tag: str = "") -> bool:
     """Draw a bar `ems` wide with a button beside it, `tag` in its id; return whether that was clicked."""
     width = hello_imgui.em_size(ems)
     with theme.styled(plot_histogram="pressed"):
-        imgui.progress_bar(fraction, ImVec2(width, 0), elided(label, width))
+        room = width - 2 * imgui.get_style().item_inner_spacing.x
+        imgui.progress_bar(fraction, ImVec2(width, 0), elided(label, room))
     imgui.same_line()
     return bool(imgui.button(f"Cancel{tag}"))
 
