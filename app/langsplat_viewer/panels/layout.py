@@ -255,7 +255,7 @@ def _float_search(viewer: Viewer, area: ui.Area, left: float) -> ui.Area:
     width = min(hello_imgui.em_size(CARD_EM), CARD_SHARE * area.width)
     at = ImVec2(area.left + left + margin, area.top + margin)
     if search.TITLE not in opened(viewer.state):
-        with ui.floating("search button", at, padding_em=0.3):
+        with ui.floating("Folded search", at, padding_em=0.3):
             if imgui.button(f"{icons_fontawesome_6.ICON_FA_MAGNIFYING_GLASS}##search"):
                 queries.focus_search(viewer)
             ui.tip(with_key("Search", queries.focus_search))

@@ -50,7 +50,7 @@ def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Textur
         if place:
             paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), SHADE, 4.0)
             paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), WHITE, 1.5)
-    cards = map(imgui.internal.find_window_by_name, ("Search", "search button"))  # open, or folded
+    cards = map(imgui.internal.find_window_by_name, ("Search", "Folded search"))  # open, or folded
     gap, card = hello_imgui.em_size(0.6), next((card for card in cards if card and card.active), None)
     for place, (part, name) in enumerate(zip(parts, names, strict=False) if len(parts) > 1 else ()):
         is_left = split.has_line and not place  # and ends at the line
@@ -288,7 +288,7 @@ def _names(named: list[Named], area: ui.Area) -> None:
         wanted.append(PlacedText(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
     taken = [
         PlacedText(low.x - area.left, low.y - area.top, high.x - low.x, high.y - low.y)
-        for low, high in ui.lying_over("Search", "search button", "Tools", "relevancy")
+        for low, high in ui.lying_over("Search", "Folded search", "Tools", "relevancy")
     ]
     found = placed(wanted, (area.width, area.height), taken)
     for name, alone, label in zip(named, wanted, found, strict=True):
