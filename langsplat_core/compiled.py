@@ -25,7 +25,9 @@ from typing import Any
 
 import numba
 import numpy as np
+from llvmlite.binding import add_symbol
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.runtime import _nrt_python as runtime
 
 from langsplat_core.arrays import Array, check_array
 
@@ -93,6 +95,13 @@ class _KernelCache(FunctionCache):
         # Looked at before the index, whose types may be gone, is unpickled.
         self._cache_file._version = f"{numba.__version__} {digest}"  # noqa: SLF001
 
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return code that is kept, else None. numba would set up compiling first: 26 MB, 0.2 seconds."""
+        for name, address in runtime.c_helpers.items():  # all that kept code calls of numba's runtime
+            add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
+
     def save_overload(self, *overload: Any) -> None:
         """Keep code; on a full disk the next process compiles it again. numba leaves no half files."""
         try:
@@ -131,8 +140,7 @@ def _imported(text: str) -> Iterator[Path]:
     """Yield the package's files that a source imports, whatever else it imports."""
     for module, names in _IMPORT.findall(text):
         base = _PACKAGE.joinpath(*module.split(".")[1:])
-        candidates = [base, *(base / name for name in re.findall(r"\w+", names))]
-        for candidate in candidates:
+        for candidate in (base, *(base / name for name in re.findall(r"\w+", names))):
             yield from (p for p in (candidate.with_suffix(".py"), candidate / "__init__.py") if p.is_file())
 
 

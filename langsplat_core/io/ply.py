@@ -106,7 +106,7 @@ class PlyFile:
             plain = [name.removeprefix(CLOUDCOMPARE) for name in element.numbers]
             if len(set(plain)) == len(plain) and not element.has_lists:
                 element.numbers = dict(zip(plain, element.numbers.values(), strict=True))
-        self._order = BYTE_ORDERS[self._format]  # "<" or ">"; empty of ascii
+        self.byte_order = BYTE_ORDERS[self._format]  # "<" or ">"; empty of ascii
 
     def _parse(self, line: str) -> bool:
         last = next(reversed(self.elements.values()), PlyElement("", 0))
@@ -136,11 +136,6 @@ class PlyFile:
             case _:
                 return False
         return True
-
-    @property
-    def is_binary(self) -> bool:
-        """True if numbers are stored as their types say, and not as text."""
-        return bool(self._order)
 
     @property
     def vertex(self) -> PlyElement:
@@ -195,30 +190,30 @@ class PlyFile:
         yield unread("elements", (f"{each.name} ({each.count} rows)" for each in others))
         if self._beyond:
             yield f"{self._beyond} numbers do not fit the types of their properties"
-        if self._order and any(each.has_lists for each in self.elements.values()):
+        if self.byte_order and any(each.has_lists for each in self.elements.values()):
             return  # where the last row ends only walking them tells
         self._seek(None)
         left = (
             self._size - self._file.tell()
-            if self._order
+            if self.byte_order
             else sum(bool(line.strip()) for line in self._lines())
         )
         if left:
-            yield f"{left} {'bytes' if self._order else 'lines'} behind the last row not read"
+            yield f"{left} {'bytes' if self.byte_order else 'lines'} behind the last row not read"
 
     def _seek(self, wanted: PlyElement | None) -> None:
         """Go to the first row of `wanted`, which the file has room for; None: behind the last row of all."""
         self._file.seek(self.header_size)
         for element in self.elements.values():
-            left, least = self._size - self._file.tell(), element.row(self._order).itemsize
-            if not self._order:  # a character and a separator a number; the file's last needs none
+            left, least = self._size - self._file.tell(), element.row(self.byte_order).itemsize
+            if not self.byte_order:  # a character and a separator a number; the file's last needs none
                 left, least = left + 1, 2 * max(len(element.numbers), 1)
             if element.count * least > left:
                 needs = f"{element.count} rows of element {element.name} need {element.count * least} bytes"
                 raise malformed(self.path, f"truncated: {needs} at least, the file has {left} left")
             if element is wanted:
                 return
-            if not self._order:
+            if not self.byte_order:
                 lines = (line for line in self._lines() if line.strip())
                 if sum(1 for _ in islice(lines, element.count)) < element.count:
                     raise malformed(self.path, f"truncated: it ends in element {element.name}")
@@ -237,10 +232,10 @@ class PlyFile:
 
     def _chunks(self, element: PlyElement) -> Iterator[tuple[int, Array]]:
         """Yield (index of the first row, structured rows) of an element without lists, from its first on."""
-        dtype = element.row(self._order)
+        dtype = element.row(self.byte_order)
         for start in range(0, element.count, CHUNK_ROWS):
             count = min(CHUNK_ROWS, element.count - start)
-            if self._order:
+            if self.byte_order:
                 data = self._file.read(count * dtype.itemsize)
                 if (missing := count * dtype.itemsize - len(data)) > 0:
                     raise malformed(self.path, f"truncated: {missing} bytes are missing")
@@ -389,7 +384,7 @@ def _read_plain(ply: PlyFile, vertex: PlyElement, tell: Tell) -> tuple[Gaussians
     layout = (SCALE, ROTATION, ("opacity",), (*BASE_COLOUR, *by_coefficient))
     others = [name for name in vertex.numbers if name not in {*POSITION, *NORMAL}.union(*layout)]
     normals = [name for name in NORMAL if name in vertex.numbers]
-    single = ply.is_binary and all(vertex.numbers.get(axis) == "f4" for axis in POSITION)
+    single = bool(ply.byte_order) and all(vertex.numbers.get(axis) == "f4" for axis in POSITION)
     tables = ply.read(
         vertex,
         (POSITION, "f4" if single else "f8"),

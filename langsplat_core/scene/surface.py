@@ -62,8 +62,7 @@ class Surface:
 
     def connected(self, inside: Array, seed: int) -> Array:
         """Return numbers of all that are linked to a member of (M,) bool through members."""
-        order, _ = _search(self.links.indptr, self.links.indices, np.array([seed]), inside.copy())
-        return order
+        return _search(self.links.indptr, self.links.indices, np.array([seed]), inside.copy())[0]
 
 
 def surface_weights(gaussians: Gaussians, min_opacity: float = 0.1) -> Array:
