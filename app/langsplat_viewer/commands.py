@@ -105,9 +105,7 @@ def _overlay(name: Overlay, title: str) -> Command:
 
 
 def _step(step: editing.Step, act: editing.Action, *keys: str) -> Command:
-    def now(viewer: Viewer) -> str:
-        return editing.named_step(viewer, step)
-
+    now = partial(editing.named_step, step=step)
     return Command(step, act, keys, repeats=True, is_edit=True, apart=step == "undo", now=now)
 
 

@@ -211,6 +211,8 @@ class Window:
         gl.glsl_version = "410" if (major, minor) >= (4, 1) else "330"
         gl.use_core_profile = gl.use_forward_compat = True
         gl.anti_aliasing_samples = 0  # splats gain nothing from it
+        for bits in (glfw.DEPTH_BITS, glfw.STENCIL_BITS):  # nor from these, which take as much as the image
+            glfw.window_hint(bits, 0)
         params.fps_idling.fps_idle = IDLE_FPS
         params.fps_idling.time_active_after_last_event = AWAKE_SECONDS
         params.callbacks.default_icon_font = hello_imgui.DefaultIconFont.font_awesome6
