@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.table import Table
 
 from langsplat_core.arrays import Array, length_text
 from langsplat_core.cli.arguments import EncoderOption, JsonOption, Level, Needs, TrainedScene
 from langsplat_core.cli.query import Unit, basis_fields, camera_of, in_world, unit_of
-from langsplat_core.cli.run import OutputConsole, print_json
+from langsplat_core.cli.run import aligned, print_json
 from langsplat_core.config import CountOrZero, PictureConfig
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io import sidecar as files
@@ -32,8 +31,6 @@ from langsplat_core.scene import LEVELS, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.relevancy import read_vocabulary
-
-WIDTH = 118  # characters of a table that is not written to a terminal
 
 
 @dataclass(frozen=True)
@@ -117,16 +114,15 @@ def _percent(described: dict[str, Any]) -> str:
 
 
 def _print_inventory(entries: list[dict[str, Any]], origin: Array) -> None:
-    table = Table("what", "also", "level", "p %", "surface %", "centre", box=None)
+    rows = [("what", "also", "level", "p %", "surface %", "centre")]
     for entry in entries:
         sure = _percent(entry).strip(" %") or "-"
         names = (entry["phrase"], ", ".join(entry["also"]), entry["level"], sure)
         for number, spot in enumerate(entry["spots"]):
             centre = length_text(spot["centre"] - origin, least=2, origin=origin)
             start = names if number == 0 else ("", "", "", "")
-            table.add_row(*start, f"{100 * spot['share']:.2f}", centre)
-    console = OutputConsole()
-    OutputConsole(width=max(WIDTH, console.width)).print(table)
+            rows.append((*start, f"{100 * spot['share']:.2f}", centre))
+    print(*aligned(rows, left=3), sep="\n")
     if not entries:
         print("nothing of the vocabulary was found in the scene")
 

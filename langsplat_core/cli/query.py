@@ -13,7 +13,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array, length_text
 from langsplat_core.cli import arguments
-from langsplat_core.cli.run import print_json
+from langsplat_core.cli.run import aligned, print_json
 from langsplat_core.config import Count, CountOrZero, LevelChoice, PictureConfig
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
@@ -99,10 +99,7 @@ def instance_lines(instances: Sequence[Instance], unit: Unit) -> list[str]:
         )
         for number, instance in enumerate(instances, 1)
     ]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
-    ]
+    return aligned(rows)
 
 
 def listed(instances: Sequence[Instance]) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from rich.console import Console
 
 from langsplat_core import __version__
 from langsplat_core.cli.arguments import Runnable, check_arguments
@@ -210,9 +209,8 @@ def print_json(content: Any) -> None:
     print(json.dumps(content, indent=1, default=np.ndarray.tolist))
 
 
-class OutputConsole(Console):
-    """A console that leaves to `main` what happens when nobody reads any more; rich's own ends with 1."""
-
-    def on_broken_pipe(self) -> None:
-        """Raise BrokenPipeError, as `print` does."""
-        raise BrokenPipeError
+def aligned(rows: Sequence[Sequence[str]], left: int = 0) -> list[str]:
+    """Return lines of aligned columns: the first `left` of them begin, the others end below each other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    signs = [f"{{:{'<' if at < left else '>'}{width}}}" for at, width in enumerate(widths)]
+    return ["  ".join(["", *signs]).format(*row).rstrip() for row in rows]
