@@ -18,15 +18,14 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from langsplat_core.arrays import Array, ViewScore, sigmoid
+from langsplat_core.arrays import Array, ViewScore
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.workspace import Matches
 from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.raster.render import render
-from langsplat_core.scene import Gaussians, Scene
-from langsplat_core.scene.transform import C0
+from langsplat_core.scene import Camera, Gaussians, Scene
 
 REPORT, PAGE = "report.json", "report.html"
 PREVIEW = "so-far.ply"  # in the work folder: what the window shows of a training under way
@@ -152,7 +151,6 @@ def camera_groups(positions: Array) -> list[Array]:
 MOST_VIEWS = 48  # on the page, held-out ones first
 SIDE = 400  # px, longer side of an image
 PLOT = 640  # units of a drawing's side
-CELLS = 220  # of the map, along its longer side
 SLIDE = 'oninput = ({ target }) => target.parentNode.style.setProperty("--at", target.value + "%");'
 
 
@@ -269,7 +267,7 @@ def _uri(image: Image.Image) -> str:
 
 
 def _from_above(scene: Scene, held_out: Container[str]) -> str:
-    """Draw the cameras and most Gaussians from above, with the cameras' longest way across the page."""
+    """Draw the cameras, and what lies below their eyes, with their longest way across the page."""
     up, eyes = scene.up(), np.array([camera.position for camera in scene.cameras])
     flat = (eyes - eyes.mean(0)) - np.outer((eyes - eyes.mean(0)) @ up, up)
     right = np.linalg.svd(flat)[2][0]
@@ -281,13 +279,15 @@ def _from_above(scene: Scene, held_out: Container[str]) -> str:
     margin = max(0.06 * float((high - low).max()), 1e-30)
     low, high = low - margin, high + margin
     scale = PLOT / float((high - low).max())
-    width, height = (high - low) * scale
-
-    def at(place: Array) -> Array:
-        return np.asarray((place - low) * scale * (1, -1) + (0, height))
-
-    drawn = [_ground(at(points), gaussians, width, height)]
-    for camera, place in zip(scene.cameras, at(places), strict=True):
+    width, height = np.maximum((high - low) * scale, 1).round().astype(int).tolist()
+    pose = np.eye(4)
+    pose[:3, :3] = axes[0], -axes[1], -up
+    pose[:3, 3] = -pose[:3, :3] @ ((low[0], high[1], (eyes @ up).max() + scene.near) @ np.vstack([axes, up]))
+    plan = Camera(width, height, scale, scale, 0.0, 0.0, pose, orthographic=True)
+    ground = render(scene, plan)
+    shade = 1 - 0.75 * (ground.alpha[..., None] - ground.colours).clip(0, 1)  # faint, as a map's ground
+    drawn = [f"<image width='{width}' height='{height}' href='{_uri(_image(shade))}'/>"]
+    for camera, place in zip(scene.cameras, plan.project(eyes)[0], strict=True):
         # A wedge for what a camera looks towards; one that looks straight down is its dot alone.
         ahead = axes @ camera.rotation[2] * (1, -1)
         across = np.array([-ahead[1], ahead[0]]) * min(0.5 * camera.width / camera.fx, 1.0)
@@ -301,21 +301,4 @@ def _from_above(scene: Scene, held_out: Container[str]) -> str:
         f"<span class='soft key'><i style='background:{colour}'></i>{name}</span>"
         for colour, name in (("#3b6fb6", "trained on"), ("#e07b00", "held out"), ("#b9c0ca", "Gaussians"))
     )
-    return f"<svg viewBox='0 0 {width:.0f} {height:.0f}' role=img>{''.join(drawn)}</svg>{key}"
-
-
-def _ground(places: Array, gaussians: Gaussians, width: float, height: float) -> str:
-    """Draw the mean colours of Gaussians at `places` (N, 2) on the page, faint as a map's ground."""
-    cell = max(width, height) / CELLS
-    rows, columns = max(1, int(np.ceil(height / cell))), max(1, int(np.ceil(width / cell)))
-    column, row = (places // cell).astype(int).T
-    inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
-    colours = (0.5 + C0 * gaussians.sh[:, 0]).clip(0, 1)
-    weights = sigmoid(gaussians.opacity_logits)[:, None] * np.column_stack([colours, np.ones(len(colours))])
-    sums = np.zeros((rows, columns, 4))
-    np.add.at(sums, (row[inside], column[inside]), weights[inside])
-    total = sums[..., 3:]
-    full = float(np.quantile(total[total > 0], 0.7)) if total.any() else 1.0
-    shade = 1 - 0.75 * np.minimum(1, total / full) * (1 - sums[..., :3] / np.maximum(total, 1e-9))
-    size = f"width='{columns * cell:.1f}' height='{rows * cell:.1f}'"
-    return f"<image {size} href='{_uri(_image(shade))}'/>"
+    return f"<svg viewBox='0 0 {width} {height}' role=img>{''.join(drawn)}</svg>{key}"
