@@ -22,30 +22,23 @@ ALLOWED = {"format_whitelist": "mov,matroska,avi,mpegts", "protocol_whitelist": 
 FEWEST = 3  # images, of which cameras can be found
 
 
+@optional_imports()
 def kept_frames(video: Path, count: int, work: Path, progress: Progress = silent) -> Path:
-    """Return the folder in `work` with the images of `video`, made there unless it is whole already."""
+    """Return the folder in `work` with the sharpest image of each of `count` equal spans of a video's time.
+
+    They are frame_0001.jpg ..., turned as the video is shown, and made where the folder is not whole already.
+    Spans without an image are left out. Raises InputError where too little is left, and FormatError for a
+    file that cannot be read as a video.
+    """
     file, _ = open_for_reading(video)
     with file:
         content = hashlib.file_digest(file, "sha256").hexdigest()[:12]  # type: ignore[arg-type]
     folder = work / f"frames-{content}-{count}-srgb"  # earlier ones have other colours
-    if not folder.is_dir():
-        extract_frames(video, folder, count, progress)
-    return folder
-
-
-@optional_imports()
-def extract_frames(video: Path, out: Path, count: int, progress: Progress = silent) -> list[Path]:
-    """Write the sharpest image of each of `count` equal spans of time as out/frame_0001.jpg ...
-
-    Images are turned as the video is shown. `out` appears when it is whole. Spans without an image are left
-    out. Raises InputError where `out` has something in it already or too little is left, and FormatError for
-    a file that cannot be read as a video.
-    """
+    if folder.is_dir():
+        return folder
     import av
 
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{shown(out)}: holds something already; name a new folder")
-    unfinished = out.with_name(f"{out.name}.part")
+    unfinished = folder.with_name(f"{folder.name}.part")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
     try:
@@ -53,9 +46,7 @@ def extract_frames(video: Path, out: Path, count: int, progress: Progress = sile
             written = _write(container, unfinished, count, progress)
         if written < FEWEST:
             raise InputError(f"{shown(video)}: has {written} images; at least {FEWEST} are needed")
-        if out.is_dir():
-            out.rmdir()
-        unfinished.rename(out)
+        unfinished.rename(folder)
     # Damaged data, no stream of images, sizes that cannot be, or a place to read at that cannot be.
     except (av.FFmpegError, OSError, IndexError, ValueError, MemoryError) as error:
         plain = isinstance(error, OSError) and not isinstance(error, av.FFmpegError)
@@ -67,7 +58,7 @@ def extract_frames(video: Path, out: Path, count: int, progress: Progress = sile
         raise FormatError(f"{shown(video)}: not a readable video ({reason}); copy it again") from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-    return sorted(out.iterdir())
+    return folder
 
 
 def _write(container: Any, folder: Path, count: int, progress: Progress) -> int:

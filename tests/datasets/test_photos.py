@@ -32,7 +32,7 @@ from langsplat_core.datasets.photos import (
     say_unread,
     unique_names,
 )
-from langsplat_core.datasets.video import extract_frames, kept_frames
+from langsplat_core.datasets.video import kept_frames
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import PictureError, is_video, picture_size
 from langsplat_core.progress import WorkCancelledError, silent
@@ -473,7 +473,7 @@ def test_videos_are_read_as_they_are_shown(size, deep, tags, aspect, tmp_path):
             shown.colorspace, shown.color_trc, shown.color_primaries, shown.color_range = *tags, 1
             container.mux(stream.encode(shown))
         container.mux(stream.encode())
-    first = np.asarray(Image.open(extract_frames(tmp_path / "a.mp4", tmp_path / "out", 3)[0]))
+    first = np.asarray(Image.open(kept_frames(tmp_path / "a.mp4", 3, tmp_path) / "frame_0001.jpg"))
     assert first.shape[:2] == (round(size[1] / min(aspect, 1)), round(size[0] * max(aspect, 1)))
     assert np.abs(shown_patches(first).astype(int) - PATCHES).max() <= 5
 
@@ -498,7 +498,7 @@ def clip(tmp_path: Path) -> Path:
 
 
 def test_the_sharpest_image_of_every_part_is_taken(clip: Path, tmp_path: Path) -> None:
-    written = extract_frames(clip, tmp_path / "out", 8)
+    written = sorted(kept_frames(clip, 8, tmp_path).iterdir())
     assert [path.name for path in written] == [f"frame_{k:04d}.jpg" for k in range(1, 9)]
     for path, step in zip(written, range(2, 40, 5), strict=True):
         image = np.asarray(Image.open(path)).astype(int)
@@ -523,7 +523,7 @@ def test_work_folder_keeps_whole_sets_of_frames_alone(clip: Path, tmp_path: Path
 @pytest.mark.parametrize("suffix", [".mov", ".mkv", ".avi", ".ts"])
 def test_containers_of_videos_are_read(suffix: str, tmp_path: Path) -> None:
     video = write_video(tmp_path / f"a{suffix}", [scene(k) for k in range(12)])
-    assert len(extract_frames(video, tmp_path / "out", 4)) == 4
+    assert len(list(kept_frames(video, 4, tmp_path).iterdir())) == 4
 
 
 def test_heic_is_a_photograph(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import exif_facts, optics, read_photo
-from langsplat_core.datasets.video import extract_frames
+from langsplat_core.datasets.video import kept_frames
 from langsplat_core.display.displays import latent_colours
 from langsplat_core.errors import InputError, LangSplatError, printable_line
 from langsplat_core.extensions.benchmarks.raster_speed import peak_memory, restart_peak
@@ -793,7 +793,7 @@ def or_text(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> b
 
 def filmed(path: Path) -> float:
     with TemporaryDirectory(dir=path.parent) as folder:
-        frames = extract_frames(path, Path(folder) / "out", 4)
+        frames = kept_frames(path, 4, Path(folder)).iterdir()
         return float(bool([photograph(frame) for frame in frames]))
 
 
