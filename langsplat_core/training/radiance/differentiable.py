@@ -187,18 +187,15 @@ def evaluate_views(
         with torch.no_grad():
             rendered = renderer.render(parameters, camera, gaussians.sh_degree)
         image = rendered.image.clamp(0, 1)
-        counted = torch.tensor(
-            np.ones(target.shape[:2], bool) if mask is None else mask, device=renderer.device
-        )
+        counted = torch.tensor(True if mask is None else mask, device=renderer.device)
+        counted = counted.expand(target.shape[:2])
         target = torch.where(counted[..., None], target, image)
-        similarity = 1 - (1 - float(ssim_map(image, target).mean())) / max(
-            float(counted.float().mean()), 1e-9
-        )
+        unlike = 1 - float(ssim_map(image, target).mean())
         scores.append(
             ViewScore(
                 camera.name,
                 psnr(image[counted].cpu().numpy(), target[counted].cpu().numpy()),
-                similarity,
+                1 - unlike / max(float(counted.float().mean()), 1e-9),
                 float((rendered.alpha >= 0.5)[counted].float().mean()),
                 _psnr_exposed(image, target, counted),
                 None if small is None else _psnr_small(camera, image, small, number),

@@ -66,19 +66,13 @@ def initial_gaussians(
 
 def _usable_points(points: Array, rgb: Array, cameras: Sequence[Camera]) -> tuple[Array, Array]:
     """Leave out points, with their colours, that are no good to start from; see `initial_gaussians`."""
-    keep = np.isfinite(points).all(1)
-    points, rgb = points[keep], rgb[keep]
-    first = np.sort(np.unique(points, axis=0, return_index=True)[1])
-    points, rgb = points[first], rgb[first]
-    seen = np.zeros(len(points), bool)
-    for camera in cameras:
-        seen |= camera.in_image(*camera.project(points))
-    points, rgb = points[seen], rgb[seen]
-    if len(points) > 3:
-        distance = _neighbour_distance(points)
-        keep = distance <= 10 * np.median(distance)
-        points, rgb = points[keep], rgb[keep]
-    return points, rgb
+    keep = np.flatnonzero(np.isfinite(points).all(1))
+    keep = keep[np.sort(np.unique(points[keep], axis=0, return_index=True)[1])]
+    keep = keep[np.any([camera.in_image(*camera.project(points[keep])) for camera in cameras], axis=0)]
+    if len(keep) > 3:
+        distance = _neighbour_distance(points[keep])
+        keep = keep[distance <= 10 * np.median(distance)]
+    return points[keep], rgb[keep]
 
 
 def _neighbour_distance(points: Array) -> Array:
@@ -253,12 +247,6 @@ def _children(values: dict[str, Tensor], splits: Tensor, state: TrainingState) -
     parents["means"] = parents["means"] + (offsets + 2 * (w * cross + torch.linalg.cross(q, cross)))
     parents["log_scales"] = parents["log_scales"] - torch.log(offsets.new_tensor(1.6))
     return parents
-
-
-def remove_gaussians(state: TrainingState, rows: Array) -> None:
-    """Remove the Gaussians where the (N,) bool `rows` are True, unless hardly any would be left."""
-    if len(state) - np.count_nonzero(rows) >= FEWEST_GAUSSIANS:
-        rearrange(state, torch.from_numpy(np.flatnonzero(~rows)).to(state.device))
 
 
 def reset_opacities(state: TrainingState) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from langsplat_core.arrays import Array, psnr, sigmoid
+from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.config import GOOD, INRIA, QUICK, RadianceConfig, check_settings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import InputError
@@ -68,10 +68,6 @@ class Schedule:
         """Return the share of the work up to a step: one on a whole image takes as long as two on halves."""
         done, whole = (count + max(count - self.coarse_until, 0) for count in (step, self.steps))
         return done / whole
-
-    def clears_free_space(self, step: int) -> bool:
-        """Return True where Gaussians before surfaces go after this step; the last steps mend that."""
-        return self.densify_from < step <= self.joint_from and step % self.densify_every == 0
 
     def resets_opacity(self, step: int) -> bool:
         """Return True where opacities are capped at 0.01 after the step."""
@@ -156,11 +152,13 @@ def train_radiance(
     members = config.ensemble if config.ensemble > 1 else 0
     config = replace(config, ensemble=members, max_gaussians=max(config.max_gaussians // (members or 1), 1))
     first = _first_gaussians(capture, train_indices, depths, config)
-    extent = _extent(capture, first)
+    centre = np.mean([camera.position for camera in capture.cameras], axis=0)
+    distance = float(np.median(np.linalg.norm(first.means - centre, axis=1)))
+    extent = max(capture.extent(), 0.05 * distance)  # cameras may stand in one place
     near = near_plane(first, capture.cameras)
     renderer = differentiable.renderer_for(config.backend, config.formation(near))
     views = _Views(capture, train_indices, renderer.device)
-    judged = _Views(capture, held_out[:: -(-len(held_out) // JUDGED) or 1], renderer.device)
+    judged = held_out[:: -(-len(held_out) // JUDGED) or 1]
     run = _Run(config, schedule_for(config, extent), views, judged, renderer, extent, depths)
     if checkpoint and checkpoint.exists():
         state = training.load_checkpoint(checkpoint, made_from, renderer.device)
@@ -179,7 +177,7 @@ def train_radiance(
                 # Every photograph has another loss: what is told is the mean over each 200th of the run.
                 if state.step * 200 // config.steps > (state.step - 1) * 200 // config.steps:
                     metrics, recent = metrics | {"loss": float(np.mean(recent))}, []
-                metrics = metrics | run.held_out(state)
+                metrics = metrics | run.held_out(state, capture)
                 progress(STAGE, run.work(state), f"{len(state)} Gaussians", **metrics)
                 if signals:
                     raise Terminated if signal.SIGTERM in signals else KeyboardInterrupt
@@ -189,7 +187,7 @@ def train_radiance(
             if checkpoint:
                 training.save_checkpoint(checkpoint, state, made_from)
             raise
-    gaussians = state.gaussians()  # without those that no image can show
+    gaussians = losses.with_metering(state.gaussians(), state.exposures.cpu().numpy(), views.cameras)
     return gaussians.take(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= INRIA.alpha_min))
 
 
@@ -236,7 +234,7 @@ class _Run:
     config: RadianceConfig
     schedule: Schedule
     views: _Views
-    judged: _Views  # held out
+    judged: Sequence[int]  # views of the capture, held out
     renderer: differentiable.DifferentiableRenderer
     extent: float  # world units
     depths: Sequence[DepthMap]  # of surfaces that Gaussians do not stay before; none for many views
@@ -296,39 +294,32 @@ class _Run:
         training.adam_step(state, schedule.learning_rates(step))
         if schedule.densifies(step):
             training.densify(state, config, self.extent, prune_large=0 < schedule.reset_every < step)
-        if self.depths and schedule.clears_free_space(step):
+        clears = schedule.densify_from < step <= schedule.joint_from  # the last steps mend that
+        if self.depths and clears and step % schedule.densify_every == 0:
             means = state.values["means"].detach().cpu().numpy()
-            training.remove_gaussians(state, in_free_space(means, self.depths))
+            keep = np.flatnonzero(~in_free_space(means, self.depths))
+            if len(keep) >= training.FEWEST_GAUSSIANS:
+                training.rearrange(state, torch.from_numpy(keep).to(state.device))
         if schedule.resets_opacity(step):
             training.reset_opacities(state)
         state.step = step
         return float(loss.detach())
 
-    def drawn(self, state: TrainingState, camera: Camera, focal: float) -> Tensor:
-        """Return the (H, W, 3) image of a camera, without gradients."""
-        with torch.no_grad():
-            degree = self.schedule.active_sh_degree(state.step)
-            return self.renderer.render(state.values, camera, degree, focal).image
-
-    def held_out(self, state: TrainingState) -> dict[str, float]:
+    def held_out(self, state: TrainingState, capture: Capture) -> dict[str, float]:
         """Return the mean PSNR of the views that are judged, dB, a dozen times in a run; else nothing."""
-        if not len(self.judged) or state.step % max(self.config.steps // 12, 1):
+        if not self.judged or state.step % max(self.config.steps // 12, 1):
             return {}
-        scores = []
-        for index in range(len(self.judged)):
-            camera, target, mask = self.judged.at(index, coarse=False)
-            counted = (slice(None), slice(None)) if mask is None else mask
-            image = self.drawn(state, camera, self.judged.focals[index]).clamp(0, 1)
-            scores.append(psnr(*(one[counted].cpu().numpy() for one in (image, target))))
-        return {"psnr": float(np.mean(scores))}
+        scores = differentiable.evaluate_views(state.gaussians(), capture, self.judged, self.config.backend)
+        return {"psnr": float(np.mean([score.psnr for score in scores]))}
 
     def find_exposures(self, state: TrainingState) -> Tensor:
         """Return (V, 4, 3) exposures of the training views; none where they explain too little."""
-        pairs: list[tuple[Tensor, Tensor]] = []
+        pairs, degree = [], self.schedule.active_sh_degree(state.step)
         for index in range(len(self.views)):
             camera, target, mask = self.views.at(index, coarse=True)
             mask = self.counted(state, index, mask, camera)
-            image = self.drawn(state, camera, self.views.focals[index])
+            with torch.no_grad():
+                image = self.renderer.render(state.values, camera, degree, self.views.focals[index]).image
             counted = (slice(None), slice(None)) if mask is None else mask
             # One pixel in seven tells the exposure.
             pairs.append((image[counted].reshape(-1, 3)[::7], target[counted].reshape(-1, 3)[::7]))
@@ -379,13 +370,6 @@ def _first_gaussians(
         colours=np.concatenate([capture.colours, colours[chosen]]),
     )
     return training.initial_gaussians(capture, indices, config.sh_degree, config.max_gaussians, config.seed)
-
-
-def _extent(capture: Capture, gaussians: Gaussians) -> float:
-    """Return the cameras' extent, at least a twentieth of their distance to the Gaussians."""
-    centre = np.mean([camera.position for camera in capture.cameras], axis=0)
-    distance = float(np.median(np.linalg.norm(gaussians.means - centre, axis=1)))
-    return max(capture.extent(), 0.05 * distance)
 
 
 # Few photographs can be overfitted, and from some number of steps on they are: views that were held out get

@@ -12,11 +12,11 @@ from skimage.metrics import structural_similarity
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.scene import Camera, look_at
+from langsplat_core.scene.transform import C0, sh_basis
 from langsplat_core.training.radiance.losses import (
     GRID,
     MOST,
     SAME_SURFACE,
-    colour_difference,
     connected_patches,
     count_agreeing,
     fit_exposure,
@@ -25,6 +25,7 @@ from langsplat_core.training.radiance.losses import (
     radiance_loss,
     ssim_map,
     with_exposure,
+    with_metering,
 )
 from langsplat_core.training.radiance.stereo import (
     RADIUS,
@@ -35,6 +36,7 @@ from langsplat_core.training.radiance.stereo import (
     plane_scores,
     sweep,
 )
+from tests.support.scenes import truth
 
 
 def pictures(seed: int, shape: tuple[int, int, int] = (31, 40, 3)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -99,6 +101,22 @@ def test_exposure_is_a_ridge_regression() -> None:
     torch.testing.assert_close(fit_exposure([(nothing, nothing)]), torch.eye(4, 3))
 
 
+def test_colours_follow_exposures_that_direction_tells() -> None:
+    """Of Gaussians alike from all sides, seen from around; by turns, and with degree 0, they stay so."""
+    turns = np.radians(np.arange(-55, 60, 10))
+    directions = np.stack([np.sin(turns), 0 * turns, np.cos(turns)], 1)
+    around = [look_at(-4 * direction, np.zeros(3), UP, SIZE, 20.0) for direction in directions]
+    plain = truth()
+    alike = replace(plain, sh=np.pad(plain.sh, [(0, 0), (0, 3), (0, 0)]))
+    gains = (1 + 0.2 * directions[:, 0])[:, None, None]
+    found = with_metering(alike, gains * np.eye(4, 3), around)
+    colours = 0.5 + np.einsum("vk,nkc->vnc", sh_basis(directions, 4), found.sh)
+    np.testing.assert_allclose(colours, gains * (0.5 + C0 * plain.sh[:, 0]), rtol=0.05)
+    by_turns = [0, 10, 2, 8, 4, 6, 5, 7, 3, 9, 1, 11]
+    assert with_metering(alike, gains[by_turns] * np.eye(4, 3), around) is alike
+    assert with_metering(plain, gains * np.eye(4, 3), around) is plain
+
+
 # Transients.
 
 SIZE = (64, 48)
@@ -151,20 +169,6 @@ def test_views_agree_on_the_surface_that_both_see() -> None:
         assert found.max() == 2
 
 
-def test_colour_difference_ignores_exposure() -> None:
-    rng = np.random.default_rng(1)
-    drawn = rng.random((GRID, GRID, 3)).astype(np.float32)
-    seen = 0.8 * drawn + np.float32(0.05)
-    seen[4:10, 4:10] += 0.3
-    drawn[20, :] = np.nan  # masked
-    found = colour_difference(drawn, seen)
-    moved = np.zeros((GRID, GRID), bool)
-    moved[4:10, 4:10] = True
-    assert np.abs(found[~moved & (np.arange(GRID) != 20)[:, None]]).max() < 0.02  # what the ridge holds
-    np.testing.assert_allclose(found[moved], -0.3, atol=0.02)
-    assert np.isnan(found[20]).all()
-
-
 def test_transients_are_connected_patches() -> None:
     differs, sizes = np.zeros((GRID, GRID), bool), np.zeros((GRID, GRID))
     differs[3:5, 3:5], differs[10:13, 10], differs[20:23, 20:23] = True, True, True
@@ -178,14 +182,16 @@ def test_transients_are_connected_patches() -> None:
 
 
 def test_patches_that_other_views_contradict_are_transient() -> None:
-    """A patch counts as moving while its view alone differs there; once all differ it counts again."""
+    """A patch moves while its view alone differs there, beyond an exposure; once all differ it counts."""
     rng = np.random.default_rng(2)
     colours = rng.uniform(0.2, 0.8, (GRID, GRID, 3)).astype(np.float32)
-    apart = colours.copy()
+    apart, masked = 0.8 * colours + np.float32(0.05), colours.copy()
     apart[12:18, 12:18, 0] += 0.3
+    masked[20] = np.nan
     found, depths = no_transients(3), [wall(camera) for camera in cameras()]
     for index, seen in ((0, colours), (2, colours), (1, apart), (1, apart)):
-        found.observe(index, cameras(), colours, seen, depths[index])
+        found.observe(index, cameras(), masked, seen, depths[index])
+    assert np.isnan(found.differences[1][20]).all()
     inside = np.zeros((GRID, GRID), bool)
     inside[12:18, 12:18] = True
     assert found.moving[1][inside].all()

@@ -239,14 +239,8 @@ def test_opacity_decay_is_the_gradient_of_the_mean_opacity() -> None:
 # Ensembles and checkpoints.
 
 
-def state_of(seed: int) -> TrainingState:
-    rng = np.random.default_rng(seed)
-    arrays = [rng.normal(size=shape) for shape in ((9, 3), (9, 3), (9, 4), (9,), (9, 4, 3))]
-    return start(Gaussians(*arrays), 5, CPU)
-
-
 def test_members_merge_with_a_share_of_their_opacity() -> None:
-    states = [state_of(seed) for seed in range(3)]
+    states = [make_state(9, seed) for seed in range(3)]
     for before, state in pairwise(states):
         state.finished, state.member = members(before), before.member + 1
     scenes, all_of_them = [state.gaussians() for state in states], merged(states[-1])
@@ -259,7 +253,7 @@ def test_members_merge_with_a_share_of_their_opacity() -> None:
 
 def test_a_checkpoint_of_another_run_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.safetensors"
-    save_checkpoint(path, state_of(0), "abc")
+    save_checkpoint(path, make_state(9), "abc")
     with pytest.raises(InputError, match="other photographs or settings; delete it") as caught:
         load_checkpoint(path, "def", CPU)
     assert not isinstance(caught.value, FormatError)
@@ -269,7 +263,7 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("damage", ["truncated", "foreign", "missing tensor"])
 def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "run.safetensors"
-    save_checkpoint(path, state_of(0), "abc")
+    save_checkpoint(path, make_state(9), "abc")
     whole = path.read_bytes()
     if damage == "truncated":
         path.write_bytes(whole[:-20])
