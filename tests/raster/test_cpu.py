@@ -123,7 +123,8 @@ def test_depth_order_is_a_stable_sort():
         np.append(1 + 1e-14 * rng.random(5000), 1e300),  # a plane, nearly, and a floater
     ):
         rows = np.flatnonzero(rng.random(len(depths)) < 0.7).astype(np.int32)
-        assert np.array_equal(depth_order(depths, rows), rows[np.argsort(depths[rows], kind="stable")])
+        found = depth_order(depths, rows, CPU.workers)
+        assert np.array_equal(found, rows[np.argsort(depths[rows], kind="stable")])
 
 
 @pytest.mark.parametrize("degree", range(4))

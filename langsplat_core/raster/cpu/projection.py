@@ -23,7 +23,6 @@ from langsplat_core.config import RasterSettings
 from langsplat_core.raster.cpu.lanes import borrowed, prefetch
 from langsplat_core.raster.protocol import dilation, farthest, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
-from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
 from langsplat_core.scene.transform import C0, C1, C2, C3
 
 COLUMNS = 8  # of the geometry: one cache line a row
@@ -32,9 +31,7 @@ MEAN_X, MEAN_Y, FACTOR_A, FACTOR_K, FACTOR_C, LOG2_OPACITY, HALF_WIDTH, HALF_HEI
 HALF_LOG2_E = 0.5 / np.log(2.0)
 LN2 = np.log(2.0)
 COMPENSATION_MIN = 0.005**2  # floor of det with the fitted dilation / det with all of it, as INRIA has it
-_MAX_LOG_SCALE, _MIN_QUAT_SQUARED = 80.0, 1e-24  # see Gaussians.valid
 _TINY = 1e-30
-_LARGEST_BITS = int(np.float32(LARGEST_COEFFICIENT).view(np.uint32))  # positive floats order as their bits
 
 
 Point = tuple[float, float, float]
@@ -47,7 +44,6 @@ class Rows(NamedTuple):
     log_scales: Array  # (N, 3) float32
     quats_wxyz: Array  # (N, 4) float32
     opacity_logits: Array  # (N,) float32
-    sh_bits: Array  # (N, 3 K) uint32: the SH coefficients' bits, only to see whether they are usable
     sizes: Array  # (N,) float32 the largest of a row's scales or a little more, world units; or `UNUSABLE`
 
 
@@ -198,22 +194,6 @@ def opacity_of(logit: float) -> float:
 
 
 @helper
-def _is_valid(rows: Rows, i: int) -> bool:
-    """Return the compiled twin of `Gaussians.valid`."""
-    mean, log_scales, quat, sh_bits = rows.means[i], rows.log_scales[i], rows.quats_wxyz[i], rows.sh_bits[i]
-    ok = not np.isnan(rows.opacity_logits[i])
-    squared = 0.0
-    for n in range(3):
-        ok &= np.isfinite(mean[n]) & (log_scales[n] <= _MAX_LOG_SCALE)
-    for n in range(4):
-        squared += np.float64(quat[n]) * np.float64(quat[n])
-    highest = np.uint32(0)
-    for n in range(sh_bits.shape[0]):
-        highest = max(highest, sh_bits[n] & np.uint32(0x7FFFFFFF))
-    return ok & np.isfinite(squared) & (squared > _MIN_QUAT_SQUARED) & (highest <= np.uint32(_LARGEST_BITS))
-
-
-@helper
 def _is_outside(x: float, y: float, over: float, size: float, camera: KernelCamera) -> bool:
     """Return True only for footprints that cannot meet a pixel centre, whatever their shape.
 
@@ -225,33 +205,24 @@ def _is_outside(x: float, y: float, over: float, size: float, camera: KernelCame
     return (u + wide < 0) | (u - wide > camera.width) | (v + high < 0) | (v - high > camera.height)
 
 
-@kernel
-def _measure(first: int, last: int, rows: Rows) -> None:
-    """Fill the sizes of rows [first, last)."""
-    for i in range(first, last):
-        logs = rows.log_scales[i]
-        largest = np.exp(np.float64(max(logs[0], logs[1], logs[2])))
-        rows.sizes[i] = 1.000001 * largest + _TINY if _is_valid(rows, i) else UNUSABLE
-
-
 _SIZES: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()  # Gaussians are not changed
 
 
 def rows_of(gaussians: Gaussians) -> Rows:
     """Return the Gaussians as kernels take them; their sizes are measured once."""
-    sizes = _SIZES.get(gaussians)  # asked once: another thread may be measuring them
-    rows = Rows(
+    sizes = _SIZES.get(gaussians)
+    if sizes is None:
+        with np.errstate(over="ignore", invalid="ignore"):  # of rows that are not valid
+            a, b, c = gaussians.log_scales.T
+            largest = 1.000001 * np.exp(np.maximum(np.maximum(a, b), c)) + np.float32(_TINY)
+        _SIZES[gaussians] = sizes = np.where(gaussians.valid(), largest, np.float32(UNUSABLE))
+    return Rows(
         plain(gaussians.means),
         plain(gaussians.log_scales),
         plain(gaussians.quats_wxyz),
         plain(gaussians.opacity_logits),
-        plain(gaussians.sh).reshape(len(gaussians), gaussians.sh.shape[1] * 3).view(np.uint32),
-        np.empty(len(gaussians), np.float32) if sizes is None else sizes,
+        sizes,
     )
-    if sizes is None:
-        shared_workers().run(_measure, len(gaussians), rows)
-        _SIZES[gaussians] = rows.sizes
-    return rows
 
 
 @kernel

@@ -281,7 +281,10 @@ class CpuView(LiftingView):
         )
         workers.run(projection.project, n, self._rows, self._kernel_camera, found)
         drawn = np.flatnonzero(found.drawn).astype(np.int32)
-        self.order, self._depths = tiling.depth_order(found.depths, drawn), found.depths  # (M,), (N,)
+        self.order, self._depths = (
+            tiling.depth_order(found.depths, drawn, workers),
+            found.depths,
+        )  # (M,), (N,)
         size = camera.width, camera.height
         self.tiles = tiling.bin_tiles(found.geometry, self.order, size, settings, workers, self._empty)
 

@@ -78,53 +78,86 @@ def _pack(rank: int, tile: int, low: int, high: int) -> int:
 
 @helper
 def _digit_of(key: Any, digit: int) -> Any:
-    return (key >> np.uint32(_DIGIT * digit)) & np.uint32((1 << _DIGIT) - 1)
+    return key >> _DIGIT * digit & (1 << _DIGIT) - 1
 
 
 @kernel
-def _sort_depths(keys: Array, depths: Array, order: Array) -> bool:
-    """Map (2, M) uint32 keys and int32 rows, first those of rising rows to order[1]: by depth, ties by row.
+def _sort_half(first: int, last: int, depths: Array, rows: Array, pairs: Array) -> None:
+    """pairs[1, first:last] <- rows[first:last] by float32 depth, which stands in the upper 32 bits.
 
-    False where it gave up, as very many depths are nearly equal. Sorted by key (radix, least significant
-    digit first, each pass stable); then neighbours of one key that are in the wrong order change places.
+    Positive floats order as their bits do. Radix, least significant digit first, each pass stable.
     """
-    keys, depths, order = borrowed((keys, depths, order))
-    number = order.shape[1]
+    depths, rows, pairs = borrowed((depths, rows, pairs))
     ends = np.zeros((_PASSES, 1 << _DIGIT), np.int64)
-    for i in range(number):
+    rounded = np.empty(1, np.float32)
+    key = rounded.view(np.int32)
+    for i in range(first, last):
+        rounded[0] = depths[rows[i]]
+        pairs[0, i] = np.int64(key[0]) << 32 | rows[i]
         for digit in range(_PASSES):
-            ends[digit, _digit_of(keys[0, i], digit)] += 1
+            ends[digit, _digit_of(key[0], digit)] += 1
     for digit in range(_PASSES):
-        here, total = digit % 2, 0
+        here, total = digit % 2, first
         for value in range(1 << _DIGIT):
             total, ends[digit, value] = total + ends[digit, value], total
-        for i in range(number):
-            key = keys[here, i]
-            value = _digit_of(key, digit)
+        for i in range(first, last):
+            pair = pairs[here, i]
+            value = _digit_of(pair >> 32, digit)
             place = ends[digit, value]
             ends[digit, value] = place + 1
-            keys[1 - here, place], order[1 - here, place] = key, order[here, i]
-    by_key, by_depth, moves = keys[_PASSES % 2], order[_PASSES % 2], 0
-    for i in range(1, number):
-        if by_key[i] != by_key[i - 1]:
-            continue
-        row, place = by_depth[i], i
-        while place > 0 and depths[by_depth[place - 1]] > depths[row] and moves <= _MOVES * number:
-            by_depth[place] = by_depth[place - 1]
-            place -= 1
-            moves += 1
-        by_depth[place] = row
+            pairs[1 - here, place] = pair
+
+
+@kernel
+def _merge(first: int, last: int, pairs: Array, middle: int) -> None:
+    """pairs[0, first:last] <- these of the sorted pairs[1, :middle] and pairs[1, middle:] together."""
+    number, by_key = pairs.shape[1], pairs[1]
+    left, most = max(0, first - (number - middle)), min(first, middle)
+    while left < most:  # how many of the first sequence lie before place `first`
+        tried = (left + most) // 2
+        if by_key[tried] < by_key[middle + first - tried - 1]:
+            left = tried + 1
+        else:
+            most = tried
+    right = middle + first - left
+    for place in range(first, last):
+        if left < middle and right < number:
+            one, other = by_key[left], by_key[right]
+            pairs[0, place] = min(one, other)
+            left, right = left + (one < other), right + (other < one)
+        else:
+            pairs[0, place] = by_key[left if left < middle else right]
+            left, right = left + 1, right + 1
+
+
+@kernel
+def _settle(pairs: Array, depths: Array, order: Array) -> bool:
+    """Fill `order` with rows by depth, ties by row, from the merged pairs.
+
+    Neighbours of one key that are in the wrong order change places. False where it gave up, as very many
+    depths are nearly equal.
+    """
+    by_key, number, moves = pairs[0], order.shape[0], 0
+    for i in range(number):
+        row, place = np.int32(by_key[i] & 0xFFFFFFFF), i
+        if i > 0 and by_key[i] >> 32 == by_key[i - 1] >> 32:
+            while place > 0 and depths[order[place - 1]] > depths[row] and moves <= _MOVES * number:
+                order[place] = order[place - 1]
+                place -= 1
+                moves += 1
+        order[place] = row
     return moves <= _MOVES * number
 
 
-def depth_order(depths: Array, rows: Array) -> Array:
-    """Map (N,) positive float64 depths, (M,) int32 rising rows to the rows by depth, ties by row."""
-    keys, order = np.empty((2, len(rows)), np.uint32), np.empty((2, len(rows)), np.int32)
-    with np.errstate(over="ignore"):  # infinity is the largest key
-        keys[0] = depths[rows].astype(np.float32).view(np.uint32)  # positive floats order as their bits do
-    order[0] = rows
-    if _sort_depths(keys, depths, order):
-        return order[_PASSES % 2]
+def depth_order(depths: Array, rows: Array, workers: Workers) -> Array:
+    """Return (M,) int32 rising rows by their depths, (N,) positive float64, ties by row."""
+    number, middle = len(rows), len(rows) // 2
+    pairs, order = np.empty((2, number), np.int64), np.empty(number, np.int32)
+    halves = (0, middle), (middle, number)
+    workers.each(_sort_half, [(*half, depths, rows, pairs) for half in halves])
+    workers.each(_merge, [(*half, pairs, middle) for half in halves])
+    if _settle(pairs, depths, order):
+        return order
     return rows[np.argsort(depths[rows], kind="stable")]
 
 
@@ -173,8 +206,8 @@ def _touch(
 ) -> tuple[Array, int, Array]:
     """Find the tiles that ranks [first, last) touch, in an image of `size` (width, height).
 
-    geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles it touches. Returns these
-    intersections, their number, and how often each tile was touched.
+    geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles ranks [first, rank] touch.
+    Returns these intersections, their number, and how often each tile was touched.
     """
     order, footprints, geometry, firsts = borrowed((order, footprints, geometry, firsts))
     width, height = size
@@ -187,7 +220,7 @@ def _touch(
             prefetch(footprints, np.int64(order[min(rank + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
             for n in range(cp.COLUMNS):
                 geometry[rank, n] = footprints[order[rank], n]
-            g, before = geometry[rank], used
+            g = geometry[rank]
             left, right = _span(g[cp.MEAN_X], -g[cp.HALF_WIDTH], g[cp.HALF_WIDTH], width)
             begin, end = left // TILE, (right + TILE - 1) // TILE if left < right else 0
             if used + (end - begin) * lines_of_tiles + 2 > found.shape[0]:
@@ -207,7 +240,7 @@ def _touch(
                     found[used + n] = _pack(rank, tile + n * columns, 0, min(high - top - n * TILE, TILE))
                     counts[tile + n * columns] += 1
                 used += lines
-            firsts[rank + 1], first = used - before, rank + 1
+            firsts[rank + 1], first = used, rank + 1
         if first < last:  # outside of the loop, which takes twice as long with an array that may change
             found = grown(found, used)
     return found, used, counts
@@ -245,7 +278,8 @@ def bin_tiles(
     pieces = list(pairwise(len(order) * i // _PIECES for i in range(_PIECES + 1)))
     shared = order, footprints, size, geometry, firsts
     found = workers.each(_touch, [(*piece, *shared) for piece in pieces])
-    np.cumsum(firsts, out=firsts)
+    for first, last in pieces:
+        firsts[first + 1 : last + 1] += firsts[first]
     total = int(firsts[-1])
     if max(total, 4 * len(order)) > _MOST:  # ranks have two bits less, see `_pack`
         raise BackendError(

@@ -19,6 +19,7 @@ import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array, sigmoid, unit
+from langsplat_core.compiled import shared_workers
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster.cpu.tiles import depth_order
@@ -150,7 +151,7 @@ class SceneTextures:
         depths = x * a + y * b + z * c + d
         ahead = np.flatnonzero((depths > settings.near) & (depths <= farthest(settings))).astype(np.int32)
         self._drawn = len(ahead)
-        self.order.write(depth_order(depths, ahead)[::-1].tobytes())
+        self.order.write(depth_order(depths, ahead, shared_workers())[::-1].tobytes())
 
     def texels(self) -> Array:
         """(m,) int32 texels that are drawn, back to front, read from `order`."""
