@@ -34,6 +34,7 @@ from langsplat_core.arrays import Array, check_array
 log = logging.getLogger("langsplat")
 
 _PIECES_PER_THREAD = 4
+_SEEN = "0.68."  # numba whose kept code calls nothing but what `load_overload` names; a missing name crashes
 _PACKAGE = Path(__file__).resolve().parent
 _IMPORT = re.compile(rf"^\s*from {_PACKAGE.name}([\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
 
@@ -97,6 +98,8 @@ class _KernelCache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return code that is kept, else None. numba would set up compiling first: 26 MB, 0.2 seconds."""
+        if not numba.__version__.startswith(_SEEN):
+            return super().load_overload(sig, target_context)
         for name, address in runtime.c_helpers.items():  # all that kept code calls of numba's runtime
             add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
         with self._guard_against_spurious_io_errors():
