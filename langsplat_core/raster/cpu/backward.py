@@ -11,7 +11,7 @@ Alpha at its cap has no gradient. As log2(alpha) is a quadratic in the whitened 
 `projection`, a footprint's gradient needs only the moments of q = alpha d loss / d alpha in (w, v).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -77,7 +77,7 @@ def backward(
     partial: Array,
     reached: Array,
 ) -> None:
-    """Return (M, C) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha.
+    """Pull gradients (H, W, C) by the image and (H, W, 1) by alpha back; values: (M, C) in depth order.
 
     Fills (I,) bool `reached`, and (I, 8 + padded(C)) partial sums where that is True. float32, for tiles
     [first, last).
@@ -274,24 +274,26 @@ def _point_gradient(point: cp.Point, camera: cp.KernelCamera, du: float, dv: flo
 
 
 @helper
-def _axes_gradient(
-    work: Array, scales: cp.Point, by_covariance: cp.Point, by_turn: Array, by_b: Array, by_log_scale: Array
-) -> None:
-    """Return a = B turn diag(s) gets 2 G A from the covariance's gradient G.
+def _doubles(row: Array) -> cp.Point:
+    return np.float64(row[0]), np.float64(row[1]), np.float64(row[2])
 
-    From there to B, turn and log(s).
-    """
-    turn, b, a = work[0], work[1], work[2]
+
+@helper
+def _axes_gradient(
+    matrices: Any, scales: cp.Point, by_covariance: cp.Point, by_turn: Array, by_b: Array, by_log_scale: Array
+) -> None:
+    """Pull the covariance's gradient G back: A = B turn diag(s) gets 2 G A, then B, turn and log(s)."""
+    turn, b, a = matrices
     gxx, gxy, gyy = by_covariance
     by_b[:] = 0
     for k in range(3):
-        d0, d1 = 2 * (gxx * a[0, k] + gxy * a[1, k]), 2 * (gxy * a[0, k] + gyy * a[1, k])
-        by_log_scale[k] = d0 * a[0, k] + d1 * a[1, k]
+        d0, d1 = 2 * (gxx * a[0][k] + gxy * a[1][k]), 2 * (gxy * a[0][k] + gyy * a[1][k])
+        by_log_scale[k] = d0 * a[0][k] + d1 * a[1][k]
         d0, d1 = d0 * scales[k], d1 * scales[k]
         for m in range(3):
-            by_turn[m, k] = b[0, m] * d0 + b[1, m] * d1
-            by_b[0, m] += d0 * turn[m, k]
-            by_b[1, m] += d1 * turn[m, k]
+            by_turn[m, k] = b[0][m] * d0 + b[1][m] * d1
+            by_b[0, m] += d0 * turn[m][k]
+            by_b[1, m] += d1 * turn[m][k]
 
 
 @kernel
@@ -310,7 +312,7 @@ def to_parameters(
     """
     added = np.empty(sums.partial.shape[1])
     moments = added[:MOMENTS]
-    work, by_b, by_turn = np.empty((3, 3, 3)), np.empty((2, 3)), np.empty((3, 3))
+    by_b, by_turn = np.empty((2, 3)), np.empty((3, 3))
     r = camera.rotation
     for i in range(first, last):
         _fetch(i, last, tiles, sums)
@@ -322,10 +324,13 @@ def to_parameters(
         du, dv, by_covariance = _footprint_gradient(tiles.geometry[rank], moments)
         out.means_px[i, 0], out.means_px[i, 1] = du, dv
         out.opacity_logits[i] = moments[Q] * (1 - cp.opacity_of(rows.opacity_logits[i]))
-        point = cp.camera_point(rows.means[i], camera)
-        scales, inverse = cp.fill_axes(point, rows.log_scales[i], rows.quats_wxyz[i], camera, work)
-        by_covariance = _with_compensation(by_covariance, work[2], camera, moments[Q])
-        _axes_gradient(work, scales, by_covariance, by_turn, by_b, out.log_scales[i])
+        point = cp.camera_point(_doubles(rows.means[i]), camera)
+        s0, s1, s2 = _doubles(rows.log_scales[i])
+        scales, quat = (np.exp(s0), np.exp(s1), np.exp(s2)), rows.quats_wxyz[i]
+        q0, q1, q2 = _doubles(quat)
+        inverse, turn, b, a = cp.axes(point, scales, (q0, q1, q2, np.float64(quat[3])), camera)
+        by_covariance = _with_compensation(by_covariance, a, camera, moments[Q])
+        _axes_gradient((turn, b, a), scales, by_covariance, by_turn, by_b, out.log_scales[i])
         dx, dy, dz = _point_gradient(point, camera, du, dv, by_b)
         for n in range(3):
             out.means[i, n] = dx * r[0, n] + dy * r[1, n] + dz * r[2, n]

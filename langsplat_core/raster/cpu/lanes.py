@@ -1,68 +1,78 @@
-"""Sixteen float32 lanes as one value inside compiled code.
+"""Sixteen float32, or eight float64, lanes as one value inside compiled code.
 
 A tile is 16 pixels wide, so one row of it is one `<16 x float>` of LLVM: a single AVX-512 register, two
 AVX or four SSE/NEON ones. Writing rows as values of that type, instead of as loops that an optimiser may
-or may not vectorise, makes the kernels' speed a property of their source. Lanes are added, subtracted,
-multiplied and divided with `+ - * /`, scalars broadcast; the rest are the functions below, used in kernels.
+or may not vectorise, makes the kernels' speed a property of their source. Eight Gaussians are projected as
+one value of doubles, which round at every step as numbers do. Lanes are added, subtracted, multiplied and
+divided with `+ - * /`, scalars broadcast, `min` and `max` take them, and `np.sqrt` doubles; the rest are the
+functions below, used in kernels.
 """
 
+import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from inspect import signature as parameters_of
 from itertools import product
 from typing import Any
 
 import llvmlite.ir as ir
+import numpy as np
 from numba import types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-LANES = 16
-Lanes = Any  # how a value of sixteen lanes is annotated in kernels
-FLOAT, INT = ir.FloatType(), ir.IntType(32)
-FLOATS, INTS, DOUBLES = (ir.VectorType(kind, LANES) for kind in (FLOAT, INT, ir.DoubleType()))
+LANES, EIGHT = 16, 8
+Lanes = Any  # how a value of lanes is annotated in kernels
+FLOAT, DOUBLE, INT, LONG = ir.FloatType(), ir.DoubleType(), ir.IntType(32), ir.IntType(64)
+FLOATS, INTS, WIDE = (ir.VectorType(kind, LANES) for kind in (FLOAT, INT, DOUBLE))
+DOUBLES, LONGS = ir.VectorType(DOUBLE, EIGHT), ir.VectorType(LONG, EIGHT)
 _FUSE = ("contract",)  # a * b + c may round once; nothing is reordered
 
 # 2^x on [-0.5, 0.5], minimax in relative error (7.5e-8, found by iteratively reweighted least squares).
-_EXP2 = (1.00000007, 0.693146967, 0.240221197, 0.0555071327, 0.00967554133, 0.00132764715)
+_EXP2 = [1.00000007, 0.693146967, 0.240221197, 0.0555071327, 0.00967554133, 0.00132764715]
+_EXP2_SERIES = [math.log(2) ** n / math.factorial(n) for n in range(14)]
+_LOG2_SERIES = [2 / math.log(2) / (2 * n + 1) for n in range(11)]  # of 2 artanh(x) / x / ln 2, in x^2
 
 
 class _Lanes(types.Type):
-    def __init__(self) -> None:
-        super().__init__(name="lanes16")
+    def __init__(self, kind: Any) -> None:
+        super().__init__(name=f"lanes{kind.count}")
+        self.kind = kind
 
 
-lanes16 = _Lanes()
+lanes16, lanes8 = _Lanes(FLOATS), _Lanes(DOUBLES)
 
 
 @register_model(_Lanes)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, numba_type: Any) -> None:
-        super().__init__(manager, numba_type, FLOATS)
+        super().__init__(manager, numba_type, numba_type.kind)
 
 
-def _kept(builder: Any, value: float) -> Any:
+def _kept(builder: Any, value: float, kind: Any = FLOATS) -> Any:
     """Return a constant that loops keep in a register; LLVM would fetch it from memory at every use."""
-    kind = ir.FunctionType(FLOATS, [FLOATS])
-    fence = builder.module.declare_intrinsic(f"llvm.arithmetic.fence.v{LANES}f32", (), kind)
-    return builder.call(fence, [ir.Constant(FLOATS, [float(value)] * LANES)])
+    name = f"llvm.arithmetic.fence.v{kind.count}f{32 if kind == FLOATS else 64}"
+    fence = builder.module.declare_intrinsic(name, (), ir.FunctionType(kind, [kind]))
+    return builder.call(fence, [ir.Constant(kind, [float(value)] * kind.count)])
 
 
 def as_lanes(builder: Any, value: Any, kind: Any = FLOATS) -> Any:
-    """Return a float, double or lanes as lanes; as sixteen doubles if `kind` is that."""
+    """Return an integer, float, double or lanes as lanes of a kind."""
     if value.type == kind:
         return value
-    if isinstance(value.type, ir.DoubleType) and kind == FLOATS:
+    if isinstance(value.type, ir.IntType):
+        value = builder.sitofp(value, kind.element)
+    elif isinstance(value.type, ir.DoubleType) and kind == FLOATS:
         value = builder.fptrunc(value, FLOAT)
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, value, INT(0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(INTS, [0] * LANES))
+    return shuffle(builder, first, undefined, [0] * kind.count)
 
 
 def lanewise(build: Callable[..., Any], symbol: Any = None) -> Any:
     """Let kernels call `build`, or use the operator `symbol`, without its first argument, the builder.
 
-    The others may be lanes or floats, of which one at least must be lanes.
+    The others may be lanes or numbers; one at least must be lanes, all of them of one kind.
     """
     symbol, arity = symbol or build, len(parameters_of(build).parameters) - 1
 
@@ -70,23 +80,31 @@ def lanewise(build: Callable[..., Any], symbol: Any = None) -> Any:
         key = symbol
 
         def generic(self, arguments: Any, keywords: Any) -> Any:
-            fits = len(arguments) == arity and all(isinstance(a, (_Lanes, types.Float)) for a in arguments)
-            return signature(lanes16, *arguments) if fits and lanes16 in arguments else None
+            kinds = {a for a in arguments if isinstance(a, _Lanes)}
+            fits = len(arguments) == arity and all(isinstance(a, (_Lanes, types.Number)) for a in arguments)
+            return signature(*kinds, *map(types.unliteral, arguments)) if fits and len(kinds) == 1 else None
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return build(builder, *(as_lanes(builder, argument) for argument in arguments))
+        return build(builder, *(as_lanes(builder, argument, sig.return_type.kind) for argument in arguments))
 
     infer_global(symbol, types.Function(Typing))
-    for kinds in product((_Lanes, types.Float), repeat=arity):
+    for kinds in product((_Lanes, types.Float, types.Integer), repeat=arity):
         if _Lanes in kinds:
             lower_builtin(symbol, *kinds)(lower)
     return build
 
 
-lanewise(lambda builder, a, b: builder.fadd(a, b, flags=_FUSE), operator.add)
-lanewise(lambda builder, a, b: builder.fsub(a, b, flags=_FUSE), operator.sub)
-lanewise(lambda builder, a, b: builder.fmul(a, b, flags=_FUSE), operator.mul)
+def _flags(a: Any) -> tuple[str, ...]:
+    return _FUSE if a.type == FLOATS else ()
+
+
+lanewise(lambda builder, a, b: builder.fadd(a, b, flags=_flags(a)), operator.add)
+lanewise(lambda builder, a, b: builder.fsub(a, b, flags=_flags(a)), operator.sub)
+lanewise(lambda builder, a, b: builder.fmul(a, b, flags=_flags(a)), operator.mul)
 lanewise(lambda builder, a, b: builder.fdiv(a, b), operator.truediv)
+lanewise(lambda builder, a: builder.fneg(a), operator.neg)
+lanewise(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b), min)
+lanewise(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b), max)
 
 
 @intrinsic
@@ -100,8 +118,8 @@ def ramp(typing: Any, start: Any, step: Any) -> Any:
     """Return start + step * (0, 1, ... 15), computed in float64."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        start, step = (as_lanes(builder, argument, DOUBLES) for argument in arguments)
-        steps = builder.fmul(step, ir.Constant(DOUBLES, [float(i) for i in range(LANES)]), flags=_FUSE)
+        start, step = (as_lanes(builder, argument, WIDE) for argument in arguments)
+        steps = builder.fmul(step, ir.Constant(WIDE, [float(i) for i in range(LANES)]), flags=_FUSE)
         return builder.fptrunc(builder.fadd(start, steps, flags=_FUSE), FLOATS)
 
     return lanes16(types.float64, types.float64), lower
@@ -113,26 +131,51 @@ def where_at_least(builder: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
     return builder.select(builder.fcmp_ordered(">=", a, b), yes, no)
 
 
-@lanewise
-def smaller(builder: Any, a: Any, b: Any) -> Any:
-    """Return min(a, b)."""
-    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
+def _polynomial(builder: Any, x: Any, coefficients: list[float]) -> Any:
+    """Polynomial in x; the coefficients are those of rising powers."""
+    result = _kept(builder, coefficients[-1], x.type)
+    for coefficient in coefficients[-2::-1]:
+        scaled = builder.fmul(result, x, flags=_FUSE)
+        result = builder.fadd(scaled, _kept(builder, coefficient, x.type), flags=_FUSE)
+    return result
 
 
 @lanewise
 def exp2(builder: Any, power: Any) -> Any:
-    """2^power for -126 <= power <= 127, relative error 2e-7; other powers give any number."""
-    # So large a float has no digits behind the point: the sum is rounded to an integer, in its lowest bits.
-    large = _kept(builder, 1.5 * 2**23)
+    """2^power for -126 <= power <= 127, relative error 2e-7; other powers give any number.
+
+    Of doubles for -1022 <= power <= 1023, relative error 4e-16.
+    """
+    # So large a number has no digits behind the point: the sum is rounded to an integer, in its lowest bits.
+    digits, whole = (23, INTS) if power.type == FLOATS else (52, LONGS)
+    large = _kept(builder, 1.5 * 2**digits, power.type)
     shifted = builder.fadd(power, large)
     rest = builder.fsub(power, builder.fsub(shifted, large))
-    result = _kept(builder, _EXP2[-1])
-    for coefficient in _EXP2[-2::-1]:
-        scaled = builder.fmul(result, rest, flags=_FUSE)
-        result = builder.fadd(scaled, _kept(builder, coefficient), flags=_FUSE)
+    result = _polynomial(builder, rest, _EXP2 if power.type == FLOATS else _EXP2_SERIES)
     # Multiplying by a power of two is an addition to the exponent's bits.
-    exponent = builder.shl(builder.bitcast(shifted, INTS), ir.Constant(INTS, [23] * LANES))
-    return builder.bitcast(builder.add(builder.bitcast(result, INTS), exponent), FLOATS)
+    exponent = builder.shl(builder.bitcast(shifted, whole), ir.Constant(whole, [digits] * whole.count))
+    return builder.bitcast(builder.add(builder.bitcast(result, whole), exponent), power.type)
+
+
+@lanewise
+def log2(builder: Any, x: Any) -> Any:
+    """log2 of positive normal doubles, relative error 4e-16: of 2^k m with m from sqrt(1/2) to sqrt(2)."""
+    one, digits = _kept(builder, 1, DOUBLES), ir.Constant(LONGS, [52] * EIGHT)
+    root = builder.bitcast(_kept(builder, math.sqrt(0.5), DOUBLES), LONGS)
+    bits = builder.bitcast(x, LONGS)
+    k = builder.ashr(builder.sub(bits, root), digits)
+    m = builder.bitcast(builder.sub(bits, builder.shl(k, digits)), DOUBLES)
+    ratio = builder.fdiv(builder.fsub(m, one), builder.fadd(m, one))
+    series = _polynomial(builder, builder.fmul(ratio, ratio), _LOG2_SERIES)
+    return builder.fadd(builder.sitofp(k, DOUBLES), builder.fmul(ratio, series))
+
+
+def _root(builder: Any, x: Any) -> Any:
+    kind = ir.FunctionType(DOUBLES, [DOUBLES])
+    return builder.call(builder.module.declare_intrinsic(f"llvm.sqrt.v{EIGHT}f64", (), kind), [x])
+
+
+lanewise(_root, np.sqrt)
 
 
 def shuffle(builder: Any, a: Any, b: Any, picks: list[int]) -> Any:
@@ -160,10 +203,9 @@ def largest(typing: Any, value: Any) -> Any:
     """Return the greatest of the lanes as a float32."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        def larger(a: Any, b: Any) -> Any:
-            return builder.select(builder.fcmp_ordered(">", a, b), a, b)
-
-        return _fold(builder, arguments[0], larger)
+        return _fold(
+            builder, arguments[0], lambda a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b)
+        )
 
     return types.float32(value), lower
 
@@ -243,6 +285,40 @@ def store_totals(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, a, b, c, d), lower
+
+
+def _elements(context: Any, builder: Any, sig: Any, arguments: Any) -> Iterator[Any]:
+    """Yield pointers to array[rows[start + j], column] for eight j, of a 1D array (column 0) or a 2D one."""
+    array, rows = (context.make_array(sig.args[i])(context, builder, arguments[i]) for i in (0, 1))
+    columns = builder.extract_value(array.shape, 1) if sig.args[0].ndim == 2 else LONG(1)
+    for j in range(EIGHT):
+        row = builder.load(builder.gep(rows.data, [builder.add(arguments[2], LONG(j))]))
+        yield builder.gep(array.data, [builder.add(builder.mul(row, columns), arguments[3])])
+
+
+@intrinsic
+def gathered(typing: Any, array: Any, rows: Any, start: Any, column: Any) -> Any:
+    """Eight doubles array[rows[start + j], column] of a float array, 1D (column 0) or 2D; rows: int64."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        value = ir.Constant(ir.VectorType(context.get_value_type(array.dtype), EIGHT), ir.Undefined)
+        for j, pointer in enumerate(_elements(context, builder, sig, arguments)):
+            value = builder.insert_element(value, builder.load(pointer), INT(j))
+        return value if value.type == DOUBLES else builder.fpext(value, DOUBLES)
+
+    return lanes8(array, rows, types.intp, types.intp), lower
+
+
+@intrinsic
+def scatter(typing: Any, array: Any, rows: Any, start: Any, column: Any, value: Any) -> Any:
+    """array[rows[start + j], column] = value[j] for eight j; a float64 array as `gathered` takes it."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        for j, pointer in enumerate(_elements(context, builder, sig, arguments)):
+            builder.store(builder.extract_element(arguments[4], INT(j)), pointer)
+        return context.get_dummy_value()
+
+    return types.void(array, rows, types.intp, types.intp, value), lower
 
 
 @intrinsic

@@ -12,7 +12,7 @@ and det are the 2D covariance's). A long thin footprint's conic is a difference 
 is not, so float32 pixels suffice.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -20,7 +20,16 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
 from langsplat_core.config import RasterSettings
-from langsplat_core.raster.cpu.lanes import borrowed, prefetch
+from langsplat_core.raster.cpu.lanes import (
+    Lanes,
+    borrowed,
+    exp2,
+    gathered,
+    log2,
+    prefetch,
+    scatter,
+    where_at_least,
+)
 from langsplat_core.raster.protocol import dilation, farthest, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.scene.transform import C0, C1, C2, C3
@@ -32,7 +41,7 @@ HALF_LOG2_E = 0.5 / np.log(2.0)
 LN2 = np.log(2.0)
 COMPENSATION_MIN = 0.005**2  # floor of det with the fitted dilation / det with all of it, as INRIA has it
 _TINY = 1e-30
-
+_BLOCK = 256  # Gaussians that may be seen, of which the rest is found together
 
 Point = tuple[float, float, float]
 
@@ -113,74 +122,74 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
 
 
 @helper
-def camera_point(mean: Array, camera: KernelCamera) -> Point:
+def camera_point(mean: Point, camera: KernelCamera) -> Point:
     """Return a mean in the camera's frame, float64, in the reference's order of operations."""
-    r, t = camera.rotation, camera.translation
-    m0, m1, m2 = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+    r, t, (x, y, z) = camera.rotation, camera.translation, mean
     return (
-        r[0, 0] * m0 + r[0, 1] * m1 + r[0, 2] * m2 + t[0],
-        r[1, 0] * m0 + r[1, 1] * m1 + r[1, 2] * m2 + t[1],
-        r[2, 0] * m0 + r[2, 1] * m1 + r[2, 2] * m2 + t[2],
+        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0],
+        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1],
+        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2],
     )
 
 
 @helper
-def _jacobian(x: float, y: float, z: float, camera: KernelCamera) -> tuple[float, float, float, float]:
+def _over(z: float, camera: KernelCamera) -> float:
+    """Return what turns camera coordinates into tangents: the inverse depth, or 1 without perspective."""
+    return z * 0.0 + 1.0 if camera.orthographic else 1.0 / z
+
+
+@helper
+def _jacobian(point: Point, camera: KernelCamera) -> tuple[float, float, float, float]:
     """Non-zero entries (0,0), (0,2), (1,1), (1,2) of d(pixel)/d(camera point), taken at the clamped point."""
-    if camera.orthographic:
-        return camera.fx, 0.0, camera.fy, 0.0
-    tx = min(max(x / z, -camera.left), camera.right)
-    ty = min(max(y / z, -camera.top), camera.bottom)
-    return camera.fx / z, -camera.fx * tx / z, camera.fy / z, -camera.fy * ty / z
-
-
-@helper
-def fill_axes(
-    point: Point, log_scales: Array, quat: Array, camera: KernelCamera, work: Array
-) -> tuple[Point, float]:
-    """Fill work: [0] the quaternion's rotation, [1] B = J R (two rows), [2] A = B rotation diag(s).
-
-    Returns the scales s and the inverse length of the quaternion.
-    """
     x, y, z = point
-    j00, j02, j11, j12 = _jacobian(x, y, z, camera)
-    q0, q1, q2, q3 = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
-    inverse = 1 / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
-    q0, q1, q2, q3 = q0 * inverse, q1 * inverse, q2 * inverse, q3 * inverse
-    turn, b, a = work[0], work[1], work[2]
-    turn[0, 0] = 1 - 2 * (q2 * q2 + q3 * q3)
-    turn[0, 1] = 2 * (q1 * q2 - q0 * q3)
-    turn[0, 2] = 2 * (q1 * q3 + q0 * q2)
-    turn[1, 0] = 2 * (q1 * q2 + q0 * q3)
-    turn[1, 1] = 1 - 2 * (q1 * q1 + q3 * q3)
-    turn[1, 2] = 2 * (q2 * q3 - q0 * q1)
-    turn[2, 0] = 2 * (q1 * q3 - q0 * q2)
-    turn[2, 1] = 2 * (q2 * q3 + q0 * q1)
-    turn[2, 2] = 1 - 2 * (q1 * q1 + q2 * q2)
-    s0, s1, s2 = np.float64(log_scales[0]), np.float64(log_scales[1]), np.float64(log_scales[2])
-    scales = np.exp(s0), np.exp(s1), np.exp(s2)
-    for n in range(3):
-        b[0, n] = j00 * camera.rotation[0, n] + j02 * camera.rotation[2, n]
-        b[1, n] = j11 * camera.rotation[1, n] + j12 * camera.rotation[2, n]
-    for r in range(2):
-        a[r, 0] = (b[r, 0] * turn[0, 0] + b[r, 1] * turn[1, 0] + b[r, 2] * turn[2, 0]) * scales[0]
-        a[r, 1] = (b[r, 0] * turn[0, 1] + b[r, 1] * turn[1, 1] + b[r, 2] * turn[2, 1]) * scales[1]
-        a[r, 2] = (b[r, 0] * turn[0, 2] + b[r, 1] * turn[1, 2] + b[r, 2] * turn[2, 2]) * scales[2]
-    return scales, inverse
+    over = _over(z, camera)
+    fx, fy, along = camera.fx * over, camera.fy * over, 0.0 if camera.orthographic else -1.0
+    tx = min(max(x * over, -camera.left), camera.right)
+    ty = min(max(y * over, -camera.top), camera.bottom)
+    return fx, along * fx * tx, fy, along * fy * ty
 
 
 @helper
-def covariance(a: Array, dilation: float, fitted: float) -> tuple[float, float, float, float, float]:
+def _scaled(b: Point, turn: tuple[Point, Point, Point], scales: Point) -> Point:
+    """Return a row of B rotation diag(s)."""
+    first, second, third = turn
+    return (
+        (b[0] * first[0] + b[1] * second[0] + b[2] * third[0]) * scales[0],
+        (b[0] * first[1] + b[1] * second[1] + b[2] * third[1]) * scales[1],
+        (b[0] * first[2] + b[1] * second[2] + b[2] * third[2]) * scales[2],
+    )
+
+
+@helper
+def axes(point: Point, scales: Point, quat: tuple[float, float, float, float], camera: KernelCamera) -> Any:
+    """Return the inverse length of the quaternion, its rotation, and B = J R, A = B rotation diag(s).
+
+    Matrices are tuples of rows; the last two have two.
+    """
+    r, (j00, j02, j11, j12), (q0, q1, q2, q3) = camera.rotation, _jacobian(point, camera), quat
+    inverse = 1.0 / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    q0, q1, q2, q3 = q0 * inverse, q1 * inverse, q2 * inverse, q3 * inverse
+    turn = (
+        (1 - 2 * (q2 * q2 + q3 * q3), 2 * (q1 * q2 - q0 * q3), 2 * (q1 * q3 + q0 * q2)),
+        (2 * (q1 * q2 + q0 * q3), 1 - 2 * (q1 * q1 + q3 * q3), 2 * (q2 * q3 - q0 * q1)),
+        (2 * (q1 * q3 - q0 * q2), 2 * (q2 * q3 + q0 * q1), 1 - 2 * (q1 * q1 + q2 * q2)),
+    )
+    across = j00 * r[0, 0] + j02 * r[2, 0], j00 * r[0, 1] + j02 * r[2, 1], j00 * r[0, 2] + j02 * r[2, 2]
+    down = j11 * r[1, 0] + j12 * r[2, 0], j11 * r[1, 1] + j12 * r[2, 1], j11 * r[1, 2] + j12 * r[2, 2]
+    return inverse, turn, (across, down), (_scaled(across, turn, scales), _scaled(down, turn, scales))
+
+
+@helper
+def covariance(
+    a: tuple[Point, Point], dilation: float, fitted: float
+) -> tuple[float, float, float, float, float]:
     """2D covariance xx, xy, yy with dilation, its determinant, and that with the fitted dilation.
 
     det(A A^T) = |row0 x row1|^2 (Cauchy-Binet): no cancellation, however thin the needle.
     """
-    xx = a[0, 0] * a[0, 0] + a[0, 1] * a[0, 1] + a[0, 2] * a[0, 2]
-    yy = a[1, 0] * a[1, 0] + a[1, 1] * a[1, 1] + a[1, 2] * a[1, 2]
-    xy = a[0, 0] * a[1, 0] + a[0, 1] * a[1, 1] + a[0, 2] * a[1, 2]
-    c0 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
-    c1 = a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]
-    c2 = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    (a0, a1, a2), (d0, d1, d2) = a
+    xx, yy, xy = a0 * a0 + a1 * a1 + a2 * a2, d0 * d0 + d1 * d1 + d2 * d2, a0 * d0 + a1 * d1 + a2 * d2
+    c0, c1, c2 = a1 * d2 - a2 * d1, a2 * d0 - a0 * d2, a0 * d1 - a1 * d0
     sharp = c0 * c0 + c1 * c1 + c2 * c2
     det = sharp + dilation * (xx + yy) + dilation * dilation
     return xx + dilation, xy, yy + dilation, det, sharp + fitted * (xx + yy) + fitted * fitted
@@ -191,18 +200,6 @@ def opacity_of(logit: float) -> float:
     """Return the logistic function of a logit, float64."""
     e = np.exp(-abs(np.float64(logit)))
     return (1.0 if logit >= 0 else e) / (1 + e)
-
-
-@helper
-def _is_outside(x: float, y: float, over: float, size: float, camera: KernelCamera) -> bool:
-    """Return True only for footprints that cannot meet a pixel centre, whatever their shape.
-
-    These are most of those that do not. over: depth, or 1 without perspective.
-    """
-    u, v = camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy
-    wide = camera.reach_x * size / over + camera.margin
-    high = camera.reach_y * size / over + camera.margin
-    return (u + wide < 0) | (u - wide > camera.width) | (v + high < 0) | (v - high > camera.height)
 
 
 _SIZES: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()  # Gaussians are not changed
@@ -225,6 +222,70 @@ def rows_of(gaussians: Gaussians) -> Rows:
     )
 
 
+@helper
+def _exp(x: Lanes) -> Lanes:
+    """e^x of doubles up to 708, relative error 1e-15 for |x| < 10; as at -708 below that."""
+    return exp2(max(x * (2 * HALF_LOG2_E), -1022.0))
+
+
+@helper
+def _three(array: Array, rows: Array, start: int) -> Point:
+    """Return the first three columns of eight rows."""
+    return gathered(array, rows, start, 0), gathered(array, rows, start, 1), gathered(array, rows, start, 2)
+
+
+@helper
+def _room(u: float, v: float, wide: float, high: float, edge: float, camera: KernelCamera) -> float:
+    """Return how far footprints reach over the image's nearest side, less `edge`, px; < 0 outside of it."""
+    across = min(u + wide, camera.width - (u - wide))
+    return min(across, min(v + high, camera.height - (v - high))) - edge
+
+
+@helper
+def _may_be_seen(rows: Rows, which: Array, camera: KernelCamera, depths: Array) -> float:
+    """Depths of eight Gaussians; < 0 for invalid ones and those that meet no pixel, whatever their shape.
+
+    The latter are most of those that meet none.
+    """
+    x, y, z = camera_point(_three(rows.means, which, 0), camera)
+    scatter(depths, which, 0, 0, z)
+    over, size = _over(z, camera), gathered(rows.sizes, which, 0, 0)
+    u, v = camera.fx * x * over + camera.cx, camera.fy * y * over + camera.cy
+    wide, high = camera.reach_x * size * over + camera.margin, camera.reach_y * size * over + camera.margin
+    least = min(min(_room(u, v, wide, high, 0.0, camera), camera.far - z), size)
+    return where_at_least(camera.near, z, -1.0, least)
+
+
+@helper
+def _footprints(rows: Rows, found: Array, at: int, camera: KernelCamera, out: Array) -> float:
+    """Fill the geometry of eight Gaussians found[at], ...; < 0 for those that meet no pixel centre."""
+    x, y, z = point = camera_point(_three(rows.means, found, at), camera)
+    logit, quats = gathered(rows.opacity_logits, found, at, 0), rows.quats_wxyz
+    faint = _exp(min(logit, -logit))
+    opacity = where_at_least(logit, 0.0, 1.0, faint) / (1 + faint)
+    s0, s1, s2 = _three(rows.log_scales, found, at)
+    q0, q1, q2 = _three(quats, found, at)
+    quat = q0, q1, q2, gathered(quats, found, at, 3)
+    _, _, _, a = axes(point, (_exp(s0), _exp(s1), _exp(s2)), quat, camera)
+    xx, xy, yy, det, det_fitted = covariance(a, camera.dilation, camera.fitted)
+    if camera.fitted < camera.dilation:
+        opacity = opacity * np.sqrt(max(det_fitted / det, COMPENSATION_MIN))
+    log2_opacity = log2(opacity)
+    reach = 2 * LN2 * max(log2_opacity - np.log2(camera.alpha_min), 0.0)  # squared
+    over = _over(z, camera)
+    u, v = camera.fx * x * over + camera.cx, camera.fy * y * over + camera.cy
+    wide, high, inverse = np.sqrt(reach * xx), np.sqrt(reach * yy), 1.0 / yy
+    scatter(out, found, at, MEAN_X, u)
+    scatter(out, found, at, MEAN_Y, v)
+    scatter(out, found, at, FACTOR_A, np.sqrt(HALF_LOG2_E * yy / det))
+    scatter(out, found, at, FACTOR_K, xy * inverse)
+    scatter(out, found, at, FACTOR_C, np.sqrt(HALF_LOG2_E * inverse))
+    scatter(out, found, at, LOG2_OPACITY, log2_opacity)
+    scatter(out, found, at, HALF_WIDTH, wide)
+    scatter(out, found, at, HALF_HEIGHT, high)
+    return min(_room(u, v, wide, high, 0.5, camera), opacity - camera.alpha_min)
+
+
 @kernel
 def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projection) -> None:
     """Fill `out` for rows [first, last).
@@ -232,43 +293,24 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
     A Gaussian whose alpha = alpha_min contour meets no pixel centre is not drawn.
     """
     rows, camera, out = borrowed((rows, camera, out))
-    work = np.empty((3, 3, 3))
-    log2_least = np.log2(camera.alpha_min)
-    for i in range(first, last):
-        out.drawn[i] = False
-        if rows.sizes[i] == UNUSABLE:
+    which, each, least = np.empty(8, np.int64), np.arange(8), np.empty(8)
+    found, number = np.empty(_BLOCK + 16, np.int64), 0
+    for start in range(first, last, 8):
+        for j in range(8):
+            which[j] = min(start + j, last - 1)
+        scatter(least, each, 0, 0, _may_be_seen(rows, which, camera, out.depths))
+        for j in range(min(8, last - start)):
+            out.drawn[start + j] = False
+            found[number] = start + j
+            number += least[j] >= 0
+        if number < _BLOCK and start + 8 < last:
             continue
-        x, y, z = camera_point(rows.means[i], camera)
-        if not (camera.near < z <= camera.far):
-            continue
-        over = 1.0 if camera.orthographic else z
-        if _is_outside(x, y, over, rows.sizes[i], camera):
-            continue
-        opacity = opacity_of(rows.opacity_logits[i])
-        if not opacity >= camera.alpha_min:
-            continue
-        fill_axes((x, y, z), rows.log_scales[i], rows.quats_wxyz[i], camera, work)
-        xx, xy, yy, det, det_fitted = covariance(work[2], camera.dilation, camera.fitted)
-        if camera.fitted < camera.dilation:
-            opacity *= np.sqrt(max(det_fitted / det, COMPENSATION_MIN))
-            if opacity < camera.alpha_min:
-                continue
-        log2_opacity = np.log2(opacity)
-        reach = 2 * LN2 * max(log2_opacity - log2_least, 0.0)  # squared
-        u, v = camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy
-        wide, high = np.sqrt(reach * xx), np.sqrt(reach * yy)
-        right, bottom = camera.width - 0.5, camera.height - 0.5  # the last pixel's centre
-        if u + wide < 0.5 or u - wide > right or v + high < 0.5 or v - high > bottom:
-            continue
-        out.drawn[i] = True
-        out.depths[i] = z
-        g = out.geometry[i]
-        g[MEAN_X], g[MEAN_Y] = u, v
-        g[FACTOR_A] = np.sqrt(HALF_LOG2_E * yy / det)
-        g[FACTOR_K] = xy / yy
-        g[FACTOR_C] = np.sqrt(HALF_LOG2_E / yy)
-        g[LOG2_OPACITY] = log2_opacity
-        g[HALF_WIDTH], g[HALF_HEIGHT] = wide, high
+        found[number : number + 8] = which[7]  # the last eight may be fewer, and this one is last in any case
+        for k in range(0, number, 8):
+            scatter(least, each, 0, 0, _footprints(rows, found, k, camera, out.geometry))
+            for j in range(min(8, number - k)):
+                out.drawn[found[k + j]] = least[j] >= 0
+        number = 0
 
 
 # View-dependent colours on the CPU: the compiled twin of `reference.colours`, and its adjoint.

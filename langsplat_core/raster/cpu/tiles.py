@@ -20,12 +20,13 @@ from langsplat_core.raster.cpu.lanes import (
     Lanes,
     borrowed,
     exp2,
+    gathered,
     lanes,
     largest,
     load,
     prefetch,
     ramp,
-    smaller,
+    scatter,
     store,
     store_totals,
     total,
@@ -39,10 +40,9 @@ _MOST = 2**31 - 1  # intersections of Gaussians and tiles in one view
 _SPAN, _PLACE = 10, 24  # bits of a span of rows and of a tile's number, beside those of a rank
 _DIGIT, _PASSES = 11, 3  # bits per pass of the radix sort, of 32
 _MOVES = 4  # for each depth, after which sorting by neighbours is given up
+_BLOCK = 256  # columns of tiles that Gaussians meet, whose rows are found together
 _PIECES = 16  # of the depth order that are binned side by side; the result does not depend on it
 
-# Of a footprint: centre, half width, abscissa of its lowest point, slope and bulge of `_rows_in_column`; px.
-Ellipse = tuple[float, float, float, float, float, float]
 Size = tuple[int, int]  # width and height of an image, px
 
 
@@ -162,34 +162,35 @@ def depth_order(depths: Array, rows: Array, workers: Workers) -> Array:
 
 
 @helper
-def _span(centre: float, low: float, high: float, size: int) -> tuple[int, int]:
-    """Pixels [first, last) of `size` whose centres lie in [centre + low, centre + high]; int rounds down."""
-    first = int(min(max(centre + low + 0.5 - _SLACK, 0.0), float(size)))
-    return first, int(min(max(centre + high + 0.5 + _SLACK, 0.0), float(size)))
+def _columns_of(g: Array, width: int) -> tuple[int, int]:
+    """Columns of tiles [first, last) in which a footprint may meet a pixel centre."""
+    left = min(max(g[cp.MEAN_X] - g[cp.HALF_WIDTH] + 0.5 - _SLACK, 0.0), float(width))
+    right = min(max(g[cp.MEAN_X] + g[cp.HALF_WIDTH] + 0.5 + _SLACK, 0.0), float(width))
+    return int(left) // TILE, (int(right) + TILE - 1) // TILE if int(left) < int(right) else 0
 
 
 @helper
-def _ellipse(g: Array) -> Ellipse:
-    a, c, k = g[cp.FACTOR_A], g[cp.FACTOR_C], g[cp.FACTOR_K]
-    across = a * a * k * k + c * c
-    wide = g[cp.HALF_WIDTH]
-    return g[cp.MEAN_X], g[cp.MEAN_Y], wide, k * g[cp.HALF_HEIGHT], a * a * k / across, a * c / across
+def _rows_in_columns(geometry: Array, pairs: Array, k: int, height: int, out: Array) -> None:
+    """out[0 and 1, k : k + 8] <- pixel rows [first, last) in which footprints meet a column of tiles each.
 
-
-@helper
-def _rows_in_column(ellipse: Ellipse, column: int, height: int) -> tuple[int, int]:
-    """Pixel rows [first, last) in which a footprint meets a column of tiles.
-
-    At abscissa dx the ellipse spans dy = slope dx +- bulge sqrt(half_width^2 - dx^2); its lowest point over
-    a strip of columns is the ellipse's own, or else on the strip's border nearest to that.
+    The footprints' ranks and the columns are pairs[:2, k : k + 8]. At abscissa dx an ellipse spans
+    dy = slope dx +- bulge sqrt(half_width^2 - dx^2); its lowest point over a strip of columns is its own, or
+    else on the strip's border nearest to that.
     """
-    x, y, wide, peak, slope, bulge = ellipse
-    left = max(column * TILE + 0.5 - _SLACK - x, -wide)
-    right = min(column * TILE + TILE - 0.5 + _SLACK - x, wide)
+    ranks = pairs[0]
+    x, y = gathered(geometry, ranks, k, cp.MEAN_X), gathered(geometry, ranks, k, cp.MEAN_Y)
+    a, c = gathered(geometry, ranks, k, cp.FACTOR_A), gathered(geometry, ranks, k, cp.FACTOR_C)
+    skew, wide = gathered(geometry, ranks, k, cp.FACTOR_K), gathered(geometry, ranks, k, cp.HALF_WIDTH)
+    peak = skew * gathered(geometry, ranks, k, cp.HALF_HEIGHT)
+    across = a / (a * a * skew * skew + c * c)
+    slope, bulge = across * a * skew, across * c
+    start = gathered(out[0], pairs[2], k, 0) * TILE - x
+    left, right = max(start + (0.5 - _SLACK), -wide), min(start + (TILE - 0.5 + _SLACK), wide)
     bottom, top = min(max(peak, left), right), min(max(-peak, left), right)
-    high = slope * bottom + bulge * np.sqrt(max(wide * wide - bottom * bottom, 0.0))
-    low = slope * top - bulge * np.sqrt(max(wide * wide - top * top, 0.0))
-    return _span(y, low, high, height)
+    high = y + slope * bottom + bulge * np.sqrt(max(wide * wide - bottom * bottom, 0.0))
+    low = y + slope * top - bulge * np.sqrt(max(wide * wide - top * top, 0.0))
+    scatter(out[0], pairs[2], k, 0, min(max(low + (0.5 - _SLACK), 0.0), float(height)))
+    scatter(out[1], pairs[2], k, 0, min(max(high + (0.5 + _SLACK), 0.0), float(height)))
 
 
 @helper
@@ -207,59 +208,71 @@ def _touch(
     """Find the tiles that ranks [first, last) touch, in an image of `size` (width, height).
 
     geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles ranks [first, rank] touch.
-    Returns these intersections, their number, and how often each tile was touched.
+    Returns pairs of numbers, one for each column of tiles that a Gaussian touches: the packed first of its
+    tiles there, and where it ends, in rows from that tile's top; how many numbers; how often each tile was
+    touched.
     """
     order, footprints, geometry, firsts = borrowed((order, footprints, geometry, firsts))
     width, height = size
     columns, lines_of_tiles = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    found = np.empty(4 * (last - first) + 2 * lines_of_tiles + 2, np.int64)
-    counts = np.zeros((lines_of_tiles + 2) * columns, np.int64)  # two lines more than there are, see below
-    used = 0
+    found = np.empty(2 * (3 * (last - first) + _BLOCK + columns), np.int64)
+    counts = np.zeros((lines_of_tiles + 1) * columns, np.int64)  # in a column: less those of the line above
+    pairs, rows = np.zeros((3, _BLOCK + columns + 8), np.int64), np.zeros((2, _BLOCK + columns + 8))
+    pairs[2], used = np.arange(pairs.shape[1]), 0
+    begun, total = first, 0
     while first < last:
-        for rank in range(first, last):
-            prefetch(footprints, np.int64(order[min(rank + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
+        number = 0
+        while first < last and number < _BLOCK:
+            prefetch(footprints, np.int64(order[min(first + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
             for n in range(cp.COLUMNS):
-                geometry[rank, n] = footprints[order[rank], n]
-            g = geometry[rank]
-            left, right = _span(g[cp.MEAN_X], -g[cp.HALF_WIDTH], g[cp.HALF_WIDTH], width)
-            begin, end = left // TILE, (right + TILE - 1) // TILE if left < right else 0
-            if used + (end - begin) * lines_of_tiles + 2 > found.shape[0]:
-                break
-            ellipse = _ellipse(g)
+                geometry[first, n] = footprints[order[first], n]
+            begin, end = _columns_of(geometry[first], width)
             for column in range(begin, end):
-                low, high = _rows_in_column(ellipse, column, height)
-                line = low // TILE
-                lines = (high + TILE - 1) // TILE - line if low < high else 0
-                tile, top = line * columns + column, line * TILE
-                # Most have one tile or two: writing two always, without a branch to foretell, is faster.
-                found[used] = _pack(rank, tile, low - top, min(high - top, TILE))
-                found[used + 1] = _pack(rank, tile + columns, 0, min(high - top - TILE, TILE))
-                counts[tile] += lines >= 1
-                counts[tile + columns] += lines >= 2
-                for n in range(2, lines):
-                    found[used + n] = _pack(rank, tile + n * columns, 0, min(high - top - n * TILE, TILE))
-                    counts[tile + n * columns] += 1
-                used += lines
-            firsts[rank + 1], first = used, rank + 1
-        if first < last:  # outside of the loop, which takes twice as long with an array that may change
+                pairs[0, number], pairs[1, number], rows[0, number] = first, column, column
+                number += 1
+            firsts[first + 1] = 0
+            first += 1
+        for k in range(0, number, 8):
+            _rows_in_columns(geometry, pairs, k, height, rows)
+        for k in range(number):
+            rank, column = pairs[0, k], pairs[1, k]
+            low, high = int(rows[0, k]), int(rows[1, k])
+            line, some = low // TILE, low < high
+            lines = (high + TILE - 1) // TILE - line if some else 0
+            tile, top = line * columns + column, line * TILE
+            found[used], found[used + 1] = _pack(rank, tile, low - top, 0), high - top
+            counts[tile] += some
+            counts[tile + lines * columns] -= some
+            used += 2 * some
+            firsts[rank + 1] += lines
+        if used + 2 * (_BLOCK + columns) > found.shape[0]:
             found = grown(found, used)
+    for tile in range(columns, lines_of_tiles * columns):
+        counts[tile] += counts[tile - columns]
+    for rank in range(begun, last):
+        total += firsts[rank + 1]
+        firsts[rank + 1] = total
     return found, used, counts
 
 
 @kernel
 def _place(first: int, last: int, touched: Array, places: Array, start: int, tiles: Tiles) -> None:
-    """Write intersections [first, last) that `_touch` found into their tiles.
+    """Write intersections that `_touch` found, touched[first:last], into their tiles.
 
     Those of a tile go to places[tile] and on: within a tile ranks ascend, whoever runs which piece. They are
     the view's from `start` on.
     """
     touched, places, tiles = borrowed((touched, places, tiles))
-    for n in range(first, last):
-        tile = touched[n] >> _SPAN & (1 << _PLACE) - 1
-        place = places[tile]
-        places[tile] = place + 1
-        tiles.met[place] = touched[n]
-        tiles.slots[start + n] = place
+    for n in range(first, last, 2):
+        met, high = touched[n], touched[n + 1]
+        tile = met >> _SPAN & (1 << _PLACE) - 1
+        while high > 0:
+            place = places[tile]
+            places[tile] = place + 1
+            tiles.met[place] = met | min(high, TILE) << 5
+            tiles.slots[start] = place
+            start, tile, high = start + 1, tile + tiles.columns, high - TILE
+            met = (met & ~31) + (tiles.columns << _SPAN)
 
 
 def bin_tiles(
@@ -270,7 +283,7 @@ def bin_tiles(
     workers: Workers,
     empty: Callable[[tuple[int, ...], Any], Array],
 ) -> Tiles:
-    """Map (N, 8) footprints, (M,) the drawn ones in depth order to the tiles of an image of `size`.
+    """Find the tiles of an image of `size` that footprints (N, 8) meet; order: (M,) the drawn by depth.
 
     `empty` makes arrays as `numpy.empty` does.
     """
@@ -486,9 +499,9 @@ def blend_row(
     All sixteen lanes are stored: a masked store would stall the next Gaussian's load of the same row.
     """
     before, power = load(transmittance, at), log2_height - w * w
-    alpha = where_at_least(power, cutoffs.log2_alpha_min, smaller(exp2(power), cutoffs.alpha_max), 0.0)
+    alpha = where_at_least(power, cutoffs.log2_alpha_min, min(exp2(power), cutoffs.alpha_max), 0.0)
     after = before - alpha * before
-    stopped = smaller(before, 0.0 - before)
+    stopped = min(before, 0.0 - before)
     store(transmittance, at, where_at_least(cutoffs.transmittance_min, after, stopped, after))
     return where_at_least(cutoffs.transmittance_min, after, 0.0, alpha), before
 
