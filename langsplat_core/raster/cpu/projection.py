@@ -13,7 +13,6 @@ is not, so float32 pixels suffice.
 """
 
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -35,13 +34,10 @@ from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.scene.transform import C0, C1, C2, C3
 
 COLUMNS = 8  # of the geometry: one cache line a row
-UNUSABLE = -1.0  # size of a row that is not valid
 MEAN_X, MEAN_Y, FACTOR_A, FACTOR_K, FACTOR_C, LOG2_OPACITY, HALF_WIDTH, HALF_HEIGHT = range(8)  # columns
 HALF_LOG2_E = 0.5 / np.log(2.0)
 LN2 = np.log(2.0)
 COMPENSATION_MIN = 0.005**2  # floor of det with the fitted dilation / det with all of it, as INRIA has it
-_TINY = 1e-30
-_BLOCK = 256  # Gaussians that may be seen, of which the rest is found together
 
 Point = tuple[float, float, float]
 
@@ -53,7 +49,7 @@ class Rows(NamedTuple):
     log_scales: Array  # (N, 3) float32
     quats_wxyz: Array  # (N, 4) float32
     opacity_logits: Array  # (N,) float32
-    sizes: Array  # (N,) float32 the largest of a row's scales or a little more, world units; or `UNUSABLE`
+    valid: Array  # (N,) bool
 
 
 class Projection(NamedTuple):
@@ -85,24 +81,12 @@ class KernelCamera(NamedTuple):
     fitted: float  # of the dilation, see `protocol.Dilation`
     alpha_min: float
     orthographic: bool
-    reach_x: float  # bounds of a footprint's half width and height: px for each unit of size over depth
-    reach_y: float
-    margin: float  # px that are to be added
 
 
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
     """Return camera and settings as kernels take them."""
     limits = dict(zip(("left", "top", "right", "bottom"), tangent_limits(camera, settings), strict=True))
     added, fitted = dilation(camera, settings)
-    # Half width = reach sqrt((A A^T)_xx + dilation), A = J R S: so at most
-    # reach (|J_x| |R| size + sqrt(dilation)).
-    reach = np.sqrt(-2 * np.log(min(settings.alpha_min, 1.0)))
-    wide, high = (
-        (0.0, 0.0)
-        if camera.orthographic
-        else (max(limits["left"], limits["right"]), max(limits["top"], limits["bottom"]))
-    )
-    most = 1.001 * reach * np.linalg.norm(camera.rotation, 2)  # 1.001: room for rounding
     plane = {name: float(value) for name, value in vars(camera.intrinsics).items()}
     return KernelCamera(
         rotation=np.ascontiguousarray(camera.rotation),
@@ -115,9 +99,6 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
         fitted=float(fitted),
         alpha_min=float(settings.alpha_min),
         orthographic=camera.orthographic,
-        reach_x=float(most * camera.fx * np.hypot(1, wide)),
-        reach_y=float(most * camera.fy * np.hypot(1, high)),
-        margin=float(1.001 * reach * np.sqrt(added) + 1e-3),
     )
 
 
@@ -202,23 +183,14 @@ def opacity_of(logit: float) -> float:
     return (1.0 if logit >= 0 else e) / (1 + e)
 
 
-_SIZES: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()  # Gaussians are not changed
-
-
 def rows_of(gaussians: Gaussians) -> Rows:
-    """Return the Gaussians as kernels take them; their sizes are measured once."""
-    sizes = _SIZES.get(gaussians)
-    if sizes is None:
-        with np.errstate(over="ignore", invalid="ignore"):  # of rows that are not valid
-            a, b, c = gaussians.log_scales.T
-            largest = 1.000001 * np.exp(np.maximum(np.maximum(a, b), c)) + np.float32(_TINY)
-        _SIZES[gaussians] = sizes = np.where(gaussians.valid(), largest, np.float32(UNUSABLE))
+    """Return the Gaussians as kernels take them."""
     return Rows(
         plain(gaussians.means),
         plain(gaussians.log_scales),
         plain(gaussians.quats_wxyz),
         plain(gaussians.opacity_logits),
-        sizes,
+        gaussians.valid(),
     )
 
 
@@ -235,37 +207,18 @@ def _three(array: Array, rows: Array, start: int) -> Point:
 
 
 @helper
-def _room(u: float, v: float, wide: float, high: float, edge: float, camera: KernelCamera) -> float:
-    """Return how far footprints reach over the image's nearest side, less `edge`, px; < 0 outside of it."""
-    across = min(u + wide, camera.width - (u - wide))
-    return min(across, min(v + high, camera.height - (v - high))) - edge
+def _footprints(rows: Rows, which: Array, camera: KernelCamera, each: Array, out: Array) -> None:
+    """Fill (8, 10): geometry, depths, and numbers < 0 where no pixel centre is met, of eight Gaussians.
 
-
-@helper
-def _may_be_seen(rows: Rows, which: Array, camera: KernelCamera, depths: Array) -> float:
-    """Depths of eight Gaussians; < 0 for invalid ones and those that meet no pixel, whatever their shape.
-
-    The latter are most of those that meet none.
+    which: (8,) their rows; each: (8,) 0 to 7.
     """
-    x, y, z = camera_point(_three(rows.means, which, 0), camera)
-    scatter(depths, which, 0, 0, z)
-    over, size = _over(z, camera), gathered(rows.sizes, which, 0, 0)
-    u, v = camera.fx * x * over + camera.cx, camera.fy * y * over + camera.cy
-    wide, high = camera.reach_x * size * over + camera.margin, camera.reach_y * size * over + camera.margin
-    least = min(min(_room(u, v, wide, high, 0.0, camera), camera.far - z), size)
-    return where_at_least(camera.near, z, -1.0, least)
-
-
-@helper
-def _footprints(rows: Rows, found: Array, at: int, camera: KernelCamera, out: Array) -> float:
-    """Fill the geometry of eight Gaussians found[at], ...; < 0 for those that meet no pixel centre."""
-    x, y, z = point = camera_point(_three(rows.means, found, at), camera)
-    logit, quats = gathered(rows.opacity_logits, found, at, 0), rows.quats_wxyz
+    x, y, z = point = camera_point(_three(rows.means, which, 0), camera)
+    logit, quats = gathered(rows.opacity_logits, which, 0, 0), rows.quats_wxyz
     faint = _exp(min(logit, -logit))
     opacity = where_at_least(logit, 0.0, 1.0, faint) / (1 + faint)
-    s0, s1, s2 = _three(rows.log_scales, found, at)
-    q0, q1, q2 = _three(quats, found, at)
-    quat = q0, q1, q2, gathered(quats, found, at, 3)
+    s0, s1, s2 = _three(rows.log_scales, which, 0)
+    q0, q1, q2 = _three(quats, which, 0)
+    quat = q0, q1, q2, gathered(quats, which, 0, 3)
     _, _, _, a = axes(point, (_exp(s0), _exp(s1), _exp(s2)), quat, camera)
     xx, xy, yy, det, det_fitted = covariance(a, camera.dilation, camera.fitted)
     if camera.fitted < camera.dilation:
@@ -275,15 +228,19 @@ def _footprints(rows: Rows, found: Array, at: int, camera: KernelCamera, out: Ar
     over = _over(z, camera)
     u, v = camera.fx * x * over + camera.cx, camera.fy * y * over + camera.cy
     wide, high, inverse = np.sqrt(reach * xx), np.sqrt(reach * yy), 1.0 / yy
-    scatter(out, found, at, MEAN_X, u)
-    scatter(out, found, at, MEAN_Y, v)
-    scatter(out, found, at, FACTOR_A, np.sqrt(HALF_LOG2_E * yy / det))
-    scatter(out, found, at, FACTOR_K, xy * inverse)
-    scatter(out, found, at, FACTOR_C, np.sqrt(HALF_LOG2_E * inverse))
-    scatter(out, found, at, LOG2_OPACITY, log2_opacity)
-    scatter(out, found, at, HALF_WIDTH, wide)
-    scatter(out, found, at, HALF_HEIGHT, high)
-    return min(_room(u, v, wide, high, 0.5, camera), opacity - camera.alpha_min)
+    scatter(out, each, 0, MEAN_X, u)
+    scatter(out, each, 0, MEAN_Y, v)
+    scatter(out, each, 0, FACTOR_A, np.sqrt(HALF_LOG2_E * yy / det))
+    scatter(out, each, 0, FACTOR_K, xy * inverse)
+    scatter(out, each, 0, FACTOR_C, np.sqrt(HALF_LOG2_E * inverse))
+    scatter(out, each, 0, LOG2_OPACITY, log2_opacity)
+    scatter(out, each, 0, HALF_WIDTH, wide)
+    scatter(out, each, 0, HALF_HEIGHT, high)
+    scatter(out, each, 0, COLUMNS, z)
+    across = min(u + wide, camera.width - (u - wide))
+    inside = min(across, min(v + high, camera.height - (v - high))) - 0.5
+    least = min(min(inside, opacity - camera.alpha_min), camera.far - z)
+    scatter(out, each, 0, COLUMNS + 1, where_at_least(camera.near, z, -1.0, least))
 
 
 @kernel
@@ -293,24 +250,18 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
     A Gaussian whose alpha = alpha_min contour meets no pixel centre is not drawn.
     """
     rows, camera, out = borrowed((rows, camera, out))
-    which, each, least = np.empty(8, np.int64), np.arange(8), np.empty(8)
-    found, number = np.empty(_BLOCK + 16, np.int64), 0
+    which, each, found = np.empty(8, np.int64), np.arange(8), np.empty((8, COLUMNS + 2))
     for start in range(first, last, 8):
         for j in range(8):
             which[j] = min(start + j, last - 1)
-        scatter(least, each, 0, 0, _may_be_seen(rows, which, camera, out.depths))
+        _footprints(rows, which, camera, each, found)
         for j in range(min(8, last - start)):
-            out.drawn[start + j] = False
-            found[number] = start + j
-            number += least[j] >= 0
-        if number < _BLOCK and start + 8 < last:
-            continue
-        found[number : number + 8] = which[7]  # the last eight may be fewer, and this one is last in any case
-        for k in range(0, number, 8):
-            scatter(least, each, 0, 0, _footprints(rows, found, k, camera, out.geometry))
-            for j in range(min(8, number - k)):
-                out.drawn[found[k + j]] = least[j] >= 0
-        number = 0
+            i = start + j
+            out.drawn[i] = rows.valid[i] and found[j, COLUMNS + 1] >= 0
+            if out.drawn[i]:
+                out.depths[i] = found[j, COLUMNS]
+                for n in range(COLUMNS):
+                    out.geometry[i, n] = found[j, n]
 
 
 # View-dependent colours on the CPU: the compiled twin of `reference.colours`, and its adjoint.
