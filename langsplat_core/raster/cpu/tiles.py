@@ -82,62 +82,37 @@ def _digit_of(key: Any, digit: int) -> Any:
 
 
 @kernel
-def _sort_half(first: int, last: int, depths: Array, rows: Array, pairs: Array) -> None:
-    """pairs[1, first:last] <- rows[first:last] by float32 depth, which stands in the upper 32 bits.
+def _sort_depths(rows: Array, depths: Array, middle: float, near: bool) -> tuple[Array, bool]:
+    """Return those of (M,) int32 rising rows before `middle`, or else behind it, by depth, ties by row.
 
-    Positive floats order as their bits do. Radix, least significant digit first, each pass stable.
+    False where it gave up, as very many depths are nearly equal. Sorted by float32 depth, whose bits order as
+    the numbers do (radix, least significant digit first, each pass stable); then neighbours of one key that
+    are in the wrong order change places.
     """
-    depths, rows, pairs = borrowed((depths, rows, pairs))
+    rows, depths = borrowed((rows, depths))
+    number, moves = 0, 0
     ends = np.zeros((_PASSES, 1 << _DIGIT), np.int64)
+    pairs = np.empty((2, rows.shape[0] + 1), np.int64)  # keys, above 32 bits of row
     rounded = np.empty(1, np.float32)
     key = rounded.view(np.int32)
-    for i in range(first, last):
-        rounded[0] = depths[rows[i]]
-        pairs[0, i] = np.int64(key[0]) << 32 | rows[i]
+    for row in rows:
+        rounded[0] = depths[row]
+        pairs[0, number] = np.int64(key[0]) << 32 | row
+        some = (depths[row] < middle) == near
+        number += some
         for digit in range(_PASSES):
-            ends[digit, _digit_of(key[0], digit)] += 1
+            ends[digit, _digit_of(key[0], digit)] += some
     for digit in range(_PASSES):
-        here, total = digit % 2, first
+        here, total = digit % 2, 0
         for value in range(1 << _DIGIT):
             total, ends[digit, value] = total + ends[digit, value], total
-        for i in range(first, last):
+        for i in range(number):
             pair = pairs[here, i]
             value = _digit_of(pair >> 32, digit)
             place = ends[digit, value]
             ends[digit, value] = place + 1
             pairs[1 - here, place] = pair
-
-
-@kernel
-def _merge(first: int, last: int, pairs: Array, middle: int) -> None:
-    """pairs[0, first:last] <- these of the sorted pairs[1, :middle] and pairs[1, middle:] together."""
-    number, by_key = pairs.shape[1], pairs[1]
-    left, most = max(0, first - (number - middle)), min(first, middle)
-    while left < most:  # how many of the first sequence lie before place `first`
-        tried = (left + most) // 2
-        if by_key[tried] < by_key[middle + first - tried - 1]:
-            left = tried + 1
-        else:
-            most = tried
-    right = middle + first - left
-    for place in range(first, last):
-        if left < middle and right < number:
-            one, other = by_key[left], by_key[right]
-            pairs[0, place] = min(one, other)
-            left, right = left + (one < other), right + (other < one)
-        else:
-            pairs[0, place] = by_key[left if left < middle else right]
-            left, right = left + 1, right + 1
-
-
-@kernel
-def _settle(pairs: Array, depths: Array, order: Array) -> bool:
-    """Fill `order` with rows by depth, ties by row, from the merged pairs.
-
-    Neighbours of one key that are in the wrong order change places. False where it gave up, as very many
-    depths are nearly equal.
-    """
-    by_key, number, moves = pairs[0], order.shape[0], 0
+    by_key, order = pairs[_PASSES % 2], np.empty(number, np.int32)
     for i in range(number):
         row, place = np.int32(by_key[i] & 0xFFFFFFFF), i
         if i > 0 and by_key[i] >> 32 == by_key[i - 1] >> 32:
@@ -146,18 +121,16 @@ def _settle(pairs: Array, depths: Array, order: Array) -> bool:
                 place -= 1
                 moves += 1
         order[place] = row
-    return moves <= _MOVES * number
+    return order, moves <= _MOVES * number
 
 
 def depth_order(depths: Array, rows: Array, workers: Workers) -> Array:
     """Return (M,) int32 rising rows by their depths, (N,) positive float64, ties by row."""
-    number, middle = len(rows), len(rows) // 2
-    pairs, order = np.empty((2, number), np.int64), np.empty(number, np.int32)
-    halves = (0, middle), (middle, number)
-    workers.each(_sort_half, [(*half, depths, rows, pairs) for half in halves])
-    workers.each(_merge, [(*half, pairs, middle) for half in halves])
-    if _settle(pairs, depths, order):
-        return order
+    sample = np.sort(depths[rows[::64]])
+    middle = sample[len(sample) // 2] if len(sample) else 0.0
+    halves = workers.each(_sort_depths, [(rows, depths, middle, near) for near in (True, False)])
+    if all(done for _, done in halves):
+        return np.concatenate([order for order, _ in halves])
     return rows[np.argsort(depths[rows], kind="stable")]
 
 
