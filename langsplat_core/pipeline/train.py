@@ -46,7 +46,7 @@ from langsplat_core.training.radiance import trainer
 from langsplat_core.training.radiance.differentiable import evaluate_views
 
 FEWEST_VIEWS = 3
-VERSION = 10  # of what training makes
+VERSION = 9  # of what training makes
 
 Until = Literal["gaussians", "language field"]  # what a training ends with
 

@@ -57,6 +57,12 @@ def test_drawn_gaussians_have_the_footprints_of_the_reference():
     assert view.drawn[drawn].all()
     assert (view.drawn & ~drawn).mean() < 0.05  # hidden ones only
     np.testing.assert_allclose(view.tiles.geometry[:, HALF_WIDTH:], extents, rtol=1e-12)
+    sizes, opacities = np.geomspace(1e-30, 1e6, 900).reshape(300, 3), np.linspace(-5.5, 40, 300)
+    extreme = replace(gaussians, log_scales=np.log(sizes), opacity_logits=opacities)
+    view = CPU.view(extreme, camera)
+    extents = REFERENCE.view(extreme, camera).footprints.extents_px[view.order]
+    assert len(extents) > 100
+    np.testing.assert_allclose(view.tiles.geometry[:, HALF_WIDTH:], extents, rtol=1e-12)
 
 
 def test_arrays_of_any_type_and_layout_are_taken():

@@ -323,7 +323,7 @@ def to_parameters(
         out.values[i] = added[MOMENTS : MOMENTS + out.values.shape[1]]
         du, dv, by_covariance = _footprint_gradient(tiles.geometry[rank], moments)
         out.means_px[i, 0], out.means_px[i, 1] = du, dv
-        out.opacity_logits[i] = moments[Q] * (1 - cp.opacity_of(rows.opacity_logits[i]))
+        out.opacity_logits[i] = moments[Q] / (1 + np.exp(np.float64(rows.opacity_logits[i])))
         point = cp.camera_point(_doubles(rows.means[i]), camera)
         s0, s1, s2 = _doubles(rows.log_scales[i])
         scales, quat = (np.exp(s0), np.exp(s1), np.exp(s2)), rows.quats_wxyz[i]

@@ -176,13 +176,6 @@ def covariance(
     return xx + dilation, xy, yy + dilation, det, sharp + fitted * (xx + yy) + fitted * fitted
 
 
-@helper
-def opacity_of(logit: float) -> float:
-    """Return the logistic function of a logit, float64."""
-    e = np.exp(-abs(np.float64(logit)))
-    return (1.0 if logit >= 0 else e) / (1 + e)
-
-
 def rows_of(gaussians: Gaussians) -> Rows:
     """Return the Gaussians as kernels take them."""
     return Rows(

@@ -39,6 +39,7 @@ _SLACK = 1e-3  # px by which footprints are widened here; the blending kernels t
 _MOST = 2**31 - 1  # intersections of Gaussians and tiles in one view
 _SPAN, _PLACE = 10, 24  # bits of a span of rows and of a tile's number, beside those of a rank
 _DIGIT, _PASSES = 11, 3  # bits per pass of the radix sort, of 32
+_LOWEST = (1 << _DIGIT) - 1  # mask of a digit
 _MOVES = 4  # for each depth, after which sorting by neighbours is given up
 _BLOCK = 256  # columns of tiles that Gaussians meet, whose rows are found together
 _PIECES = 16  # of the depth order that are binned side by side; the result does not depend on it
@@ -76,11 +77,6 @@ def _pack(rank: int, tile: int, low: int, high: int) -> int:
     return (rank << _PLACE | tile) << _SPAN | high << 5 | low
 
 
-@helper
-def _digit_of(key: Any, digit: int) -> Any:
-    return key >> _DIGIT * digit & (1 << _DIGIT) - 1
-
-
 @kernel
 def _sort_depths(rows: Array, depths: Array, middle: float, near: bool) -> tuple[Array, bool]:
     """Return those of (M,) int32 rising rows before `middle`, or else behind it, by depth, ties by row.
@@ -101,14 +97,14 @@ def _sort_depths(rows: Array, depths: Array, middle: float, near: bool) -> tuple
         some = (depths[row] < middle) == near
         number += some
         for digit in range(_PASSES):
-            ends[digit, _digit_of(key[0], digit)] += some
+            ends[digit, key[0] >> _DIGIT * digit & _LOWEST] += some
     for digit in range(_PASSES):
         here, total = digit % 2, 0
         for value in range(1 << _DIGIT):
             total, ends[digit, value] = total + ends[digit, value], total
         for i in range(number):
             pair = pairs[here, i]
-            value = _digit_of(pair >> 32, digit)
+            value = pair >> 32 + _DIGIT * digit & _LOWEST
             place = ends[digit, value]
             ends[digit, value] = place + 1
             pairs[1 - here, place] = pair

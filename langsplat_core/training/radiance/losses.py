@@ -7,7 +7,7 @@ as in the INRIA code.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,9 @@ import torch
 from scipy.ndimage import binary_dilation, label
 from torch import Tensor
 
-from langsplat_core.arrays import Array, unit
+from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
-from langsplat_core.scene import Camera, Gaussians
-from langsplat_core.scene.transform import C0, sh_basis
+from langsplat_core.scene import Camera
 
 RADIUS, SIGMA = 5, 1.5  # of the window, pixels
 C1, C2 = 0.01**2, 0.03**2  # of SSIM, for a data range of 1
@@ -279,35 +278,6 @@ def fit_exposures(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, float
         before += float((image - target).square().sum())
         after += float((with_exposure(image, exposure) - target).square().sum())
     return exposures, 10 * math.log10(max(before, 1e-12) / max(after, 1e-12))
-
-
-def with_metering(gaussians: Gaussians, exposures: Array, cameras: Sequence[Camera]) -> Gaussians:
-    """Return the Gaussians in the colours of (V, 4, 3) exposures, as far as direction tells these.
-
-    A camera meters what it sees: photographs from like directions have like exposures, as has a view between
-    them. Harmonics up to degree 1 are fitted to the exposures over 5x5 rays of each photograph, held by a
-    hundredth. Gaussians stay as they are where the other photographs tell less than a fifth of one's squared
-    change of grey, or where harmonics end at degree 0.
-    """
-    if gaussians.sh_degree == 0 or len(exposures) < 4:
-        return gaussians
-    small = [camera.resized(5, 5) for camera in cameras]
-    rays = np.stack([one.unproject(one.pixel_centres(), 1.0) - one.position for one in small])
-    basis = sh_basis(unit(rays.reshape(len(rays), -1, 3), 1e-12), 4)
-    change, means = exposures - np.eye(4)[:, :3], basis.mean(1)
-    moments, wanted = basis.swapaxes(1, 2) @ basis, 25 * means[..., None] * change.reshape(-1, 1, 12)
-    hold = 0.25 * len(rays) * np.diag([0, 1, 1, 1])
-    others = np.linalg.solve(moments.sum(0) - moments + hold, wanted.sum(0) - wanted)
-    missed = change - (means[:, None] @ others).reshape(change.shape)
-    unsure, whole = (np.square((0.5, 0.5, 0.5, 1) @ part).sum() for part in (missed, change))
-    if unsure > 0.8 * whole:
-        return gaussians
-    told = np.linalg.solve(moments.sum(0) + hold, wanted.sum(0)).reshape(4, 4, 3)
-    # A colour times 1 + sum_k Y_k(d) told_k; products of two of degree 1 are left out.
-    sh, even = gaussians.sh.copy(), np.pad(0.5 + C0 * gaussians.sh[:, 0], [(0, 0), (0, 1)], constant_values=1)
-    sh[:, 1:] += sh[:, 1:] @ (C0 * told[0, :3])
-    sh[:, :4] += np.einsum("ni,kij->nkj", even, told)
-    return replace(gaussians, sh=sh)
 
 
 # Transients: parts of a photograph that others contradict, such as people who walk by.

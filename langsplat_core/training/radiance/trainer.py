@@ -187,7 +187,7 @@ def train_radiance(
             if checkpoint:
                 training.save_checkpoint(checkpoint, state, made_from)
             raise
-    gaussians = losses.with_metering(state.gaussians(), state.exposures.cpu().numpy(), views.cameras)
+    gaussians = state.gaussians()  # without those that no image can show
     return gaussians.take(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= INRIA.alpha_min))
 
 

@@ -12,7 +12,6 @@ from skimage.metrics import structural_similarity
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.scene import Camera, look_at
-from langsplat_core.scene.transform import C0, sh_basis
 from langsplat_core.training.radiance.losses import (
     GRID,
     MOST,
@@ -25,7 +24,6 @@ from langsplat_core.training.radiance.losses import (
     radiance_loss,
     ssim_map,
     with_exposure,
-    with_metering,
 )
 from langsplat_core.training.radiance.stereo import (
     RADIUS,
@@ -36,7 +34,6 @@ from langsplat_core.training.radiance.stereo import (
     plane_scores,
     sweep,
 )
-from tests.support.scenes import truth
 
 
 def pictures(seed: int, shape: tuple[int, int, int] = (31, 40, 3)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -99,22 +96,6 @@ def test_exposure_is_a_ridge_regression() -> None:
     np.testing.assert_allclose(fit_exposure([(image, target)], ridge=0.5), held, atol=1e-5)
     nothing = torch.zeros((0, 3))
     torch.testing.assert_close(fit_exposure([(nothing, nothing)]), torch.eye(4, 3))
-
-
-def test_colours_follow_exposures_that_direction_tells() -> None:
-    """Of Gaussians alike from all sides, seen from around; by turns, and with degree 0, they stay so."""
-    turns = np.radians(np.arange(-55, 60, 10))
-    directions = np.stack([np.sin(turns), 0 * turns, np.cos(turns)], 1)
-    around = [look_at(-4 * direction, np.zeros(3), UP, SIZE, 20.0) for direction in directions]
-    plain = truth()
-    alike = replace(plain, sh=np.pad(plain.sh, [(0, 0), (0, 3), (0, 0)]))
-    gains = (1 + 0.2 * directions[:, 0])[:, None, None]
-    found = with_metering(alike, gains * np.eye(4, 3), around)
-    colours = 0.5 + np.einsum("vk,nkc->vnc", sh_basis(directions, 4), found.sh)
-    np.testing.assert_allclose(colours, gains * (0.5 + C0 * plain.sh[:, 0]), rtol=0.05)
-    by_turns = [0, 10, 2, 8, 4, 6, 5, 7, 3, 9, 1, 11]
-    assert with_metering(alike, gains[by_turns] * np.eye(4, 3), around) is alike
-    assert with_metering(plain, gains * np.eye(4, 3), around) is plain
 
 
 # Transients.
