@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rich.console  # noqa: F401  before anything is taken away: it would draw as on Windows
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.app import parse

@@ -103,11 +103,12 @@ def _fields(answered: Answered, hits: Sequence[Hit], library: Library) -> dict[s
 
 
 def _hit_fields(hit: Hit, library: Library) -> dict[str, Any]:
-    own = ("verdict", "probability", "by_chance", "margin", "metres_per_unit")
+    own = ("verdict", "probability", "margin", "metres_per_unit")
     answer = hit.answer
     fields = {
         "scene": _name(hit, library),
         **{name: getattr(hit, name) for name in own},
+        "by_chance": hit.judgement.by_chance,
         "exact": answer is not None,
         "level": None if answer is None else LEVELS[answer.level],
         "place": None if answer is None else answer.place,
