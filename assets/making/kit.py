@@ -497,7 +497,7 @@ class Kit:
         return Material(colour_word(colour) or "", colour, darker(colour, 4), "plaster", 0.0)
 
     def metal(self) -> Material:
-        """Return grey metal."""
+        """Return the material of bare metal, which is grey."""
         return self.steel("gray")
 
 

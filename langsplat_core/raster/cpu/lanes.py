@@ -144,7 +144,7 @@ def _polynomial(builder: Any, x: Any, coefficients: list[float]) -> Any:
 def exp2(builder: Any, power: Any) -> Any:
     """2^power for -126 <= power <= 127, relative error 2e-7; other powers give any number.
 
-    Of doubles for -1022 <= power <= 1023, relative error 4e-16.
+    Of doubles for -1022 <= power <= 1023, relative error 2e-16.
     """
     # So large a number has no digits behind the point: the sum is rounded to an integer, in its lowest bits.
     digits, whole = (23, INTS) if power.type == FLOATS else (52, LONGS)

@@ -1,7 +1,7 @@
 """Projection of Gaussians for the CPU backend: steps 1 and 2 of `reference.py`, compiled.
 
-Everything here is float64, in the reference's order of operations: depths agree with it bit for bit, and
-coordinates of a million world units lose nothing. It costs about 0.02 microseconds a Gaussian, eight at once.
+Everything here is float64. Depths are in the reference's order of operations and agree with it bit for bit,
+and coordinates of a million world units lose nothing. Eight at once, a Gaussian costs 0.02 microseconds.
 
 A footprint is kept as the triangular factor of its conic, not as the conic: with (dx, dy) = pixel - mean,
 
