@@ -37,6 +37,11 @@ def check_array(
     return dims
 
 
+def pieces(count: int, size: int) -> list[slice]:
+    """Return the slices that take `count` rows `size` at a time, so that what is made of them fits memory."""
+    return [slice(start, start + size) for start in range(0, count, size)]
+
+
 def sigmoid(x: Array) -> Array:
     """Logistic function, exact at +-infinity and free of overflow; dtype is kept."""
     x = np.asarray(x)
@@ -111,6 +116,13 @@ def rotation_matrices(quats_wxyz: Array) -> Array:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def affine(linear: Array, offset: Array) -> Array:
+    """Return the (4, 4) matrix of the map x -> linear @ x + offset, a (3, 3) matrix and (3,) numbers."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, offset
+    return matrix
 
 
 def linear_light(display: Array) -> Array:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from langsplat_core.arrays import Array, rotation_matrices
+from langsplat_core.arrays import Array, affine, rotation_matrices
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.capture import Capture, develop, report_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
@@ -168,10 +168,7 @@ def _image(name: str, camera_id: int, pose: Array) -> ModelImage:
     quaternion, translation = pose[:4], pose[4:]
     if not ((np.abs(translation) <= FARTHEST).all() and 1e-9 < np.abs(quaternion).max() < 1e9):
         raise ValueError(f"image {name} has an impossible pose")
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrices(quaternion[None])[0]
-    matrix[:3, 3] = translation
-    return ModelImage(name, camera_id, matrix)
+    return ModelImage(name, camera_id, affine(rotation_matrices(quaternion), translation))
 
 
 # Binary files: a number, and as many records.

@@ -19,7 +19,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Raw, Struct
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, affine
 from langsplat_core.errors import malformed, quoted, report_losses, unread
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, decode_json, read_file
@@ -67,14 +67,9 @@ def write_cameras(path: Path | str, cameras: tuple[Camera, ...]) -> None:
         {
             "id": index,
             "img_name": camera.name,
-            "width": camera.width,
-            "height": camera.height,
+            **vars(camera.intrinsics),
             "position": camera.position.tolist(),
             "rotation": camera.rotation.T.tolist(),
-            "fx": camera.fx,
-            "fy": camera.fy,
-            "cx": camera.cx,
-            "cy": camera.cy,
         }
         for index, camera in enumerate(cameras)
     ]
@@ -88,9 +83,7 @@ def _camera(entry: _Entry, what: str) -> Camera:
     rotation = np.array(entry.rotation)
     if not is_rotation(rotation):
         raise malformed(what, "'rotation' is not a rotation matrix")
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation.T
-    matrix[:3, 3] = -rotation.T @ np.array(entry.position)
+    pose = affine(rotation.T, -rotation.T @ np.array(entry.position))
     # Newer INRIA files keep the photograph's suffix; a name such as "frame.01" must keep its own dot.
     name = entry.img_name
     ending = next((suffix for suffix in PHOTO_SUFFIXES if name.lower().endswith(suffix)), "")
@@ -98,7 +91,7 @@ def _camera(entry: _Entry, what: str) -> Camera:
     cy = entry.height / 2 if entry.cy is None else entry.cy
     size = int(entry.width), int(entry.height)
     try:
-        return Camera(*size, entry.fx, entry.fy, cx, cy, matrix, name[: len(name) - len(ending)])
+        return Camera(*size, entry.fx, entry.fy, cx, cy, pose, name[: len(name) - len(ending)])
     except ValueError as error:  # what the camera itself refuses: fx of 0, for one
         raise malformed(what, f"{error}") from None
 

@@ -27,7 +27,7 @@ from urllib.parse import unquote
 import numpy as np
 from msgspec import Meta, Struct, ValidationError, convert, to_builtins
 
-from langsplat_core.arrays import Array, linear_light, logit, rotation_matrices, sigmoid, unit
+from langsplat_core.arrays import Array, affine, linear_light, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError, malformed, quoted, report_losses, unread
 from langsplat_core.io import hostile
 from langsplat_core.io.files import atomic_path
@@ -129,8 +129,8 @@ class Kept(Struct):
 
     def given(self, scene: Scene) -> Scene:
         """Return the scene, read without its matrix, with what is kept of it."""
-        scene = replace(scene, antialiased=self.antialiased, metres_per_unit=self.metres_per_unit)
-        return replace(scene, origin=np.array(self.origin, np.float64))
+        metres, origin = self.metres_per_unit, np.array(self.origin)
+        return replace(scene, antialiased=self.antialiased, metres_per_unit=metres, origin=origin)
 
 
 class _Scene(Struct):
@@ -254,10 +254,8 @@ def _matrix(node: _Node) -> Array:
     if node.matrix is not None:
         return np.array(node.matrix).reshape(4, 4).T
     x, y, z, w = unit(np.array(node.rotation, np.float64), 1e-300)
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrices(np.array([w, x, y, z])) * np.array(node.scale)
-    matrix[:3, 3] = node.translation
-    return matrix
+    linear = rotation_matrices(np.array([w, x, y, z])) * np.array(node.scale)
+    return affine(linear, np.array(node.translation))
 
 
 def _gaussians(file: "_File", attributes: dict[str, int]) -> Gaussians:

@@ -29,7 +29,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from threading import Lock
@@ -367,8 +367,7 @@ def read_ply_scene(path: Path | str) -> Scene:
             told += ply.losses(("vertex",))
     antialiased, metres = _said(ply.comments, told.append)
     report_losses(path, told)
-    about = Scene(gaussians, antialiased=antialiased, extras=extras, metres_per_unit=metres)
-    return replace(about, origin=origin)
+    return Scene(gaussians, antialiased=antialiased, extras=extras, metres_per_unit=metres, origin=origin)
 
 
 def _read_plain(ply: PlyFile, vertex: PlyElement, tell: Tell) -> tuple[Gaussians, Array, dict[str, Array]]:

@@ -171,11 +171,10 @@ class _Stages:
         def make() -> Arrays:
             self.progress("grouping masks", 0.0)
             groups = lift.group_masks(vectors)
-            return {"of_mask": np.concatenate(groups.of_mask), "vectors": groups.vectors}
+            return {"of_mask": groups.of_mask, "vectors": groups.vectors}
 
         made = self.processes.once(lambda: kept(folder / "groups.npz", make))
-        edges = np.cumsum([len(view) for view in vectors])[:-1]
-        return mask_weights, MaskGroups(tuple(np.split(made["of_mask"], edges)), made["vectors"])
+        return mask_weights, MaskGroups(made["of_mask"], list(map(len, vectors)), made["vectors"])
 
     def weights_in(self, folder: Path) -> MaskWeights:
         """Return the mask weights of all views, a file in `folder` each, which is read where it is needed."""

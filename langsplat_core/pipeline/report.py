@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from langsplat_core.arrays import Array, ViewScore
+from langsplat_core.arrays import Array, ViewScore, affine
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.workspace import Matches
 from langsplat_core.errors import FormatError, InputError, printable_line
@@ -280,9 +280,9 @@ def _from_above(scene: Scene, held_out: Container[str]) -> str:
     low, high = low - margin, high + margin
     scale = PLOT / float((high - low).max())
     width, height = np.maximum((high - low) * scale, 1).round().astype(int).tolist()
-    pose = np.eye(4)
-    pose[:3, :3] = axes[0], -axes[1], -up
-    pose[:3, 3] = -pose[:3, :3] @ ((low[0], high[1], (eyes @ up).max() + scene.near) @ np.vstack([axes, up]))
+    rotation = np.stack([axes[0], -axes[1], -up])
+    corner = (low[0], high[1], (eyes @ up).max() + scene.near) @ np.vstack([axes, up])
+    pose = affine(rotation, -rotation @ corner)
     plan = Camera(width, height, scale, scale, 0.0, 0.0, pose, orthographic=True)
     ground = render(scene, plan)
     shade = 1 - 0.75 * (ground.alpha[..., None] - ground.colours).clip(0, 1)  # faint, as a map's ground

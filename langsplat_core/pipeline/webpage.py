@@ -135,7 +135,7 @@ def make_page(
         "views": [
             {
                 "name": camera.name or f"view {number}",
-                **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
+                **vars(camera.intrinsics),
                 "rotation": camera.rotation.ravel().tolist(),
                 "position": (camera.position - centre).tolist(),
             }

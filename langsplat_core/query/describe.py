@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, pieces
 from langsplat_core.config import PictureConfig, RasterSettings
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
@@ -117,8 +117,7 @@ class WordScores:
         return words, shares
 
     def _blocks(self, count: int) -> list[slice]:
-        rows = max(1, CELLS // len(self.vectors))
-        return [slice(start, start + rows) for start in range(0, count, rows)]
+        return pieces(count, max(1, CELLS // len(self.vectors)))
 
 
 def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from langsplat_core.arrays import Array, unit
+from langsplat_core.arrays import Array, pieces, unit
 from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.display.displays import gated_mean
 from langsplat_core.errors import InputError
@@ -53,8 +53,7 @@ class Lookup:
         self.features = np.where(field.known, of.reshape(field.known.shape), count).astype(kind)
         self.count = count
         self._zero, self._rate = np.empty(count, np.float32), np.empty(count, np.float32)
-        for start in range(0, count, CHUNK):
-            part = slice(start, start + CHUNK)
+        for part in pieces(count, CHUNK):
             cosines = self._codec.cosines(self._latents[part], scale.texts)
             self._zero[part], self._rate[part] = scale.of(cosines)
 

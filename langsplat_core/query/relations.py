@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import Array, across
+from langsplat_core.arrays import Array, across, affine
 from langsplat_core.query.grammar import Extreme, Side
 from langsplat_core.query.instances import axis_aligned_box, told_apart
 from langsplat_core.scene import LEVELS, Camera
@@ -63,9 +63,7 @@ def upright(up: Array) -> Array:
 
 def viewpoint(camera: Camera, frame: Array) -> Array:
     """Return the (4, 4) matrix from the axes of `frame` (3, 3), see `upright`, to those of `camera`."""
-    turned = np.eye(4)
-    turned[:3, :3] = frame.T
-    return camera.world_to_camera @ turned
+    return camera.world_to_camera @ affine(frame.T, np.zeros(3))
 
 
 def _centre(what: Body, seen_by: Array) -> Array:

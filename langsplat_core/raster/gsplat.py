@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from langsplat_core.arrays import Array, check_array
+from langsplat_core.arrays import Array, affine, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster.protocol import LiftingView, dilation, farthest, mean_depth
@@ -121,8 +121,7 @@ class GsplatView(LiftingView):
         # Relative to the camera in float64 first: float32 has no digits left far from the origin.
         means = kept.means.astype(np.float64) - camera.position
         self._depths = (means @ camera.rotation[2]).astype(np.float32)
-        self._turn = np.eye(4)
-        self._turn[:3, :3] = camera.rotation
+        self._turn = affine(camera.rotation, np.zeros(3))
         arrays = {**vars(kept), "means": means}
         self._gaussians = {name: to_device(arrays[name]) for name in RAW}
 

@@ -13,7 +13,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from langsplat_core.arrays import Array, check_array, unit
+from langsplat_core.arrays import Array, check_array, pieces, unit
 from langsplat_core.errors import quoted
 
 SHORTEST = 1e-6  # a latent of numbers shorter than this has no meaning
@@ -99,8 +99,7 @@ class Codec(ABC):
         if len(directions) ** 2 <= len(first):
             return np.asarray((1 - directions @ directions.T)[first, second])
         found = np.empty(len(first), np.float32)
-        for start in range(0, len(first), PAIRS):  # the vectors may be as long as the encoder's
-            part = slice(start, start + PAIRS)
+        for part in pieces(len(first), PAIRS):  # the vectors may be as long as the encoder's
             found[part] = 1 - np.einsum("ed,ed->e", directions[first[part]], directions[second[part]])
         return found
 
@@ -266,8 +265,7 @@ class CodebookCodec(Codec):
 
     def encode(self, vectors: Array) -> Array:
         nearest = np.empty((len(vectors), 1), np.uint16)
-        for start in range(0, len(vectors), ROWS):
-            part = slice(start, start + ROWS)
+        for part in pieces(len(vectors), ROWS):
             nearest[part, 0] = (np.asarray(vectors[part], np.float32) @ self.vectors.T).argmax(1)
         return nearest
 

@@ -11,7 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     from scipy import sparse
 
-from langsplat_core.arrays import Array, check_array, logit, rotation_matrices, sigmoid
+from langsplat_core.arrays import Array, check_array, logit, pieces, rotation_matrices, sigmoid
 from langsplat_core.config import INRIA
 from langsplat_core.progress import Progress, silent
 
@@ -77,8 +77,7 @@ class Gaussians:
     def _faults(self) -> Array:
         """The (N,) uint8 number, from 1, of the first of `FAULTS` that a row has; 0: none."""
         faults = np.zeros(len(self), np.uint8)
-        for start in range(0, len(self), 8192):  # what is compared is not held of all at once
-            rows = slice(start, start + 8192)
+        for rows in pieces(len(self), 8192):
             with np.errstate(over="ignore", invalid="ignore"):
                 quats = self.quats_wxyz[rows].astype(np.float64)
                 length_squared = np.einsum("ij,ij->i", quats, quats)

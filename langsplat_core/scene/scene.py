@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import langsplat_core
-from langsplat_core.arrays import Array, across, check_array, unit
+from langsplat_core.arrays import Array, across, affine, check_array, unit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene.gaussians import Gaussians
 from langsplat_core.scene.language import LanguageField
@@ -161,12 +161,10 @@ def look_at(
     if np.linalg.norm(right) < 1e-9:
         right = across(forward)
     right = right / np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    matrix[:3, 3] = -matrix[:3, :3] @ eye
+    rotation = np.stack([right, np.cross(forward, right), forward])
     width, height = size
     focal = 0.5 * height / np.tan(np.radians(fov_y_degrees) / 2)
-    return Camera(width, height, focal, focal, width / 2, height / 2, matrix)
+    return Camera(width, height, focal, focal, width / 2, height / 2, affine(rotation, -rotation @ eye))
 
 
 NEAR = 0.05  # of the depth of the middle of what is seen, or of the radius of what no camera sees

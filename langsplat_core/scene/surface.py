@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.arrays import Array, pieces, sigmoid
 from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.scene.codec import Codec
 from langsplat_core.scene.gaussians import Gaussians
@@ -87,8 +87,7 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
     tree = cKDTree(positions)
     neighbours, near = np.empty((len(rows), k), np.int32), np.empty((len(rows), k), bool)
     reach, middle = np.empty(len(rows)), slice((k - 1) // 2, k // 2 + 1)
-    for start in range(0, len(rows), SOME):
-        part = slice(start, start + SOME)
+    for part in pieces(len(rows), SOME):
         distances, found = (of.reshape(-1, k) for of in tree.query(positions[part], k=k, workers=-1))
         neighbours[part] = found
         reach[part] = REACH * distances[:, middle].mean(1) + 1e-12  # the median: they ascend

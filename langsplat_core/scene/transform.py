@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from langsplat_core.arrays import Array, across, unit
+from langsplat_core.arrays import Array, across, affine, pieces, unit
 from langsplat_core.errors import InputError
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
 from langsplat_core.scene.scene import FARTHEST, Camera, Scene, origin_of
@@ -32,9 +32,7 @@ class Similarity:
     @property
     def matrix(self) -> Array:
         """The (4, 4) float64 homogeneous matrix of the map."""
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
-        return matrix
+        return affine(self.scale * self.rotation, self.translation)
 
     @property
     def is_identity(self) -> bool:
@@ -73,9 +71,8 @@ class Similarity:
         position = self.points(camera.position)
         if np.abs(position).max() > FARTHEST:
             raise InputError(f"a camera would lie more than {FARTHEST:g} units from the origin; move by less")
-        pose = np.eye(4)
-        pose[:3, :3] = camera.rotation @ self.rotation.T
-        pose[:3, 3] = -pose[:3, :3] @ position
+        rotation = camera.rotation @ self.rotation.T
+        pose = affine(rotation, -rotation @ position)
         zoom = 1 / self.scale if camera.orthographic else 1.0  # whose focal lengths are pixels per unit
         return replace(camera, world_to_camera=pose, fx=camera.fx * zoom, fy=camera.fy * zoom)
 
@@ -268,8 +265,7 @@ def rotated_harmonics(sh: Array, rotation: Array) -> Array:
     turned = sh.copy()
     for order, matrix in enumerate(sh_rotations(rotation, degree)[1:], 1):
         span = slice(order**2, (order + 1) ** 2)
-        for first in range(0, len(sh), BLOCK):
-            part = slice(first, first + BLOCK)
+        for part in pieces(len(sh), BLOCK):
             by_channel = sh[part, span].swapaxes(1, 2).astype(np.float64)
             turned[part, span] = (by_channel @ matrix.T).swapaxes(1, 2)
     return turned

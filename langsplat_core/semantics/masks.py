@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, pieces
 from langsplat_core.config import MaskConfig
 from langsplat_core.progress import Progress
 
@@ -135,9 +135,9 @@ def common_pixels(masks: Array) -> Array:
     """Return (M, M) int64: pixels in both of two masks; areas on the diagonal."""
     flat = masks.reshape(len(masks), -1)
     total = np.zeros((len(masks), len(masks)), np.int64)
-    for start in range(0, flat.shape[1], PIXELS_PER_PRODUCT):
-        part = flat[:, start : start + PIXELS_PER_PRODUCT].astype(np.float32)
-        total += (part @ part.T).astype(np.int64)  # exact: counts stay below 2**24
+    for part in pieces(flat.shape[1], PIXELS_PER_PRODUCT):
+        pixels = flat[:, part].astype(np.float32)
+        total += (pixels @ pixels.T).astype(np.int64)  # exact: counts stay below 2**24
     return total
 
 

@@ -24,7 +24,7 @@ from typing import Protocol
 
 import numpy as np
 
-from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.arrays import Array, pieces, sigmoid
 from langsplat_core.errors import InputError, quoted
 from langsplat_core.io.hostile import read_text
 from langsplat_core.scene import Codec, LanguageField
@@ -61,8 +61,8 @@ def latent_relevancy(
     out = np.zeros((len(latents), len(phrases)), np.float32)
     known = np.flatnonzero(codec.known(latents))
     texts = np.concatenate([phrases, canonical])
-    for start in range(0, len(known), CHUNK):
-        rows = known[start : start + CHUNK]
+    for part in pieces(len(known), CHUNK):
+        rows = known[part]
         cosines = codec.cosines(latents[rows], texts)
         nearest = cosines[:, len(phrases) :].max(1, keepdims=True)
         out[rows] = relevancy_of(cosines[:, : len(phrases)], nearest, temperature)

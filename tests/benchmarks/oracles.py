@@ -148,8 +148,7 @@ def true_labels(
         columns.append(numbers)
     members = find_mask_weights(rasterizer, gaussians, described)
     known, group = np.unique(np.concatenate(columns), return_inverse=True)
-    edges = np.cumsum([len(numbers) for numbers in columns])[:-1]
-    groups = MaskGroups(tuple(np.split(group.astype(np.int32), edges)), np.zeros((len(known), 1), np.float32))
+    groups = MaskGroups(group, list(map(len, columns)), np.zeros((len(known), 1), np.float32))
     result = np.full((len(LEVELS), len(gaussians)), -1, np.int64)
     for number, (first, last) in enumerate(members.blocks):
         weights = members.block(number, groups)

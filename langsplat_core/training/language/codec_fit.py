@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from langsplat_core.arrays import Array, unit
+from langsplat_core.arrays import Array, pieces, unit
 from langsplat_core.config import CodecConfig, check_settings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import CANONICAL_PHRASES, NO_NODE, LanguageField, Tree
@@ -49,8 +49,7 @@ def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> tupl
     if not len(vectors):
         return 0.0, 0.0
     errors = np.empty((len(vectors), len(vocabulary.phrases)), np.float32)
-    for start in range(0, len(vectors), 4_096):
-        part = slice(start, start + 4_096)
+    for part in pieces(len(vectors), 4_096):
         errors[part] = np.abs(vocabulary.relevancy(made[part]) - vocabulary.relevancy(vectors[part]))
     return float(errors.mean(dtype=np.float64)), float(np.quantile(errors, 0.99))
 
@@ -256,8 +255,7 @@ def _assigned(vectors: Array, centres: Array, gains: bool = False) -> tuple[Arra
     """Return (M,) nearest centre of each vector, its cosine, and, if asked, how much further the next is."""
     nearest, cosines = np.empty(len(vectors), np.int64), np.empty(len(vectors), np.float32)
     gain = np.zeros(len(vectors), np.float32)
-    for start in range(0, len(vectors), CHUNK):
-        part = slice(start, start + CHUNK)
+    for part in pieces(len(vectors), CHUNK):
         products = vectors[part] @ centres.T
         nearest[part] = products.argmax(1)
         cosines[part] = np.take_along_axis(products, nearest[part, None], 1)[:, 0]

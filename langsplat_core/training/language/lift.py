@@ -36,7 +36,8 @@ class MaskGroups:
     Most of the hundred masks that show a Gaussian say one of a few things: its median is taken over these.
     """
 
-    of_mask: tuple[Array, ...]  # of each view, (M,) int32
+    of_mask: Array  # of all masks, one view after the other
+    counts: Sequence[int]  # number of masks of each view
     vectors: Array  # (G, D) float32 unit vectors
 
 
@@ -50,8 +51,7 @@ def group_masks(vectors: Sequence[Array], groups: int = 2_048) -> MaskGroups:
         sample = joined[np.sort(generator.permutation(len(joined))[:16_384])]
         centres = spherical_kmeans(sample, groups, rounds=6, generator=generator)
         of_mask = nearest_centres(joined, centres)[0]
-    edges = np.cumsum([len(view) for view in vectors])[:-1]
-    return MaskGroups(tuple(np.split(of_mask.astype(np.int32), edges)), centres)
+    return MaskGroups(of_mask.astype(np.int32), [len(view) for view in vectors], centres)
 
 
 PAIR = np.dtype([("row", "<u4"), ("mask", "<u2"), ("level", "<u2"), ("weight", "<f4")])
@@ -81,14 +81,13 @@ class MaskWeights:
         """Return the (n, 3 G) weights, in pixels, of a block's Gaussians in the groups, level after level."""
         first, last = self.blocks[number]
         rows, columns, weights = [], [], []
-        for pairs, edges, group in zip(self.pairs, self._edges, groups.of_mask, strict=True):
+        of_mask = np.split(groups.of_mask, np.cumsum(groups.counts)[:-1])
+        for pairs, edges, group in zip(self.pairs, self._edges, of_mask, strict=True):
             part = pairs[edges[number] : edges[number + 1]]
             rows.append(part["row"].astype(np.int32) - first)
             columns.append(part["level"].astype(np.int32) * len(groups.vectors) + group[part["mask"]])
             weights.append(part["weight"])
         shape = (last - first, len(LEVELS) * len(groups.vectors))
-        if not rows:
-            return sparse.csr_matrix(shape, dtype=np.float32)
         entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
         return sparse.coo_matrix(entries, shape).tocsr()  # which adds up what falls on one place
 
@@ -163,8 +162,7 @@ def find_instances(
     size = len(names)
     of_mask = np.full(len(view_of), size, np.int32)  # masks of other levels, and those that claim nothing
     of_mask[claiming] = numbers
-    by_view = np.split(of_mask, np.cumsum(counts)[:-1])
-    groups = MaskGroups(tuple(by_view), np.zeros((size + 1, 1), np.float32))
+    groups = MaskGroups(of_mask, counts, np.zeros((size + 1, 1), np.float32))
     instances = np.full(mask_weights.count, size, np.int64)
     for number, (first, last) in enumerate(mask_weights.blocks):
         weights = mask_weights.block(number, groups)[:, level * (size + 1) : (level + 1) * (size + 1)].tocsr()
@@ -395,7 +393,7 @@ def lift_by_gradient(
     check_settings(config, "--lift.")
     published = config.start == "zeros-as-published"
     x = np.zeros_like(start) if published else start.copy()
-    features = torch.from_numpy(x)  # the same memory
+    features = torch.from_numpy(x).requires_grad_()  # the same memory
     adam = torch.optim.Adam([features], config.lr, (0.9, 0.999), 1e-15, fused=True)  # as in the INRIA code
     targets = [
         (camera, seen.labels, np.pad(codec.encode(seen.vectors), ((0, 1), (0, 0)))) for camera, seen in views
@@ -413,24 +411,14 @@ def lift_by_gradient(
             view = rasterizer.view(gaussians, camera, settings)
             if sum(one.nbytes for one in (view, *kept.values())) <= KEPT_BYTES:
                 kept[index] = view
-        loss, gradient = _loss_and_gradient(view, labels, latents, blended(x) if published else x)
-        features.grad = torch.from_numpy(plain(by_features(x, gradient) if published else gradient))
+        y = features / (features.norm(dim=-1, keepdim=True) + 1e-9) if published else features
+        loss, gradient = _loss_and_gradient(view, labels, latents, y.detach().numpy())
+        y.backward(torch.from_numpy(plain(gradient)))
         adam.step()
+        adam.zero_grad()
         if (step + 1) % 20 == 0 or step + 1 == config.steps:
             progress("training language features", (step + 1) / config.steps, loss=loss)
     return np.where(confidence[..., None] > 0, unit(x), 0).astype(np.float32), confidence
-
-
-def blended(x: Array) -> Array:
-    """Return the values that are blended as published, x / (|x| + 1e-9) of (..., d) features."""
-    return x / (np.linalg.norm(x, axis=-1, keepdims=True) + 1e-9)
-
-
-def by_features(x: Array, by_y: Array) -> Array:
-    """Return the gradient by x from that by y = `blended` x; at zero the norm's own counts as zero."""
-    length = np.linalg.norm(x, axis=-1, keepdims=True)
-    along = (x * by_y).sum(-1, keepdims=True) / np.maximum(length, 1e-30)
-    return by_y / (length + 1e-9) - x * along / (length + 1e-9) ** 2
 
 
 def _loss_and_gradient(view: LiftingView, labels: Array, latents: Array, y: Array) -> tuple[float, Array]:

@@ -27,7 +27,7 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, pieces
 from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import Progress, silent
@@ -202,13 +202,13 @@ def link_concavity(surface: Surface, eyes: Array) -> Array:
 def _normals(surface: Surface) -> Array:
     """Return (M, 3) unit normals of the planes through the neighbourhoods, of either sign."""
     normals = np.empty((len(surface.rows), 3))
-    for start in range(0, len(normals), 65_536):
-        near = surface.neighbours[start : start + 65_536]
+    for part in pieces(len(normals), 65_536):
+        near = surface.neighbours[part]
         weights = surface.weights[near].astype(np.float64)[..., None]
         points = surface.positions[near]
         middles = (points * weights).sum(1, keepdims=True) / weights.sum(1, keepdims=True)
         spread = (points - middles) * np.sqrt(weights)
-        normals[start : start + 65_536] = np.linalg.eigh(spread.swapaxes(1, 2) @ spread)[1][..., 0]
+        normals[part] = np.linalg.eigh(spread.swapaxes(1, 2) @ spread)[1][..., 0]
     return normals
 
 
