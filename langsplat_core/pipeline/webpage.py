@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from urllib.parse import urlencode
 
 import numpy as np
@@ -26,7 +26,7 @@ from PIL import Image
 from safetensors.numpy import save
 
 from langsplat_core.arrays import Array, sigmoid, unit
-from langsplat_core.config import PictureConfig
+from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import (
     COLOUR_MAPS,
@@ -43,6 +43,7 @@ from langsplat_core.io.quantised import to_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query import grammar, taught
 from langsplat_core.query.answers import place_of
+from langsplat_core.query.compose import HALF
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.query.instances import BOXED, oriented_box
 from langsplat_core.query.inventory import suggest
@@ -59,8 +60,8 @@ from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary
 # In an order in which each imports only those before it, so that their code can stand in one script.
 MODULES = ("words", "rule", "encoder", "camera", "space", "language", "data", "draw", "headset", "page")
 BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, without its imports and exports
-WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL", "MEASURES")
-WORD_TABLES = ("SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")
+LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL", "MEASURES", "OWNERS")
+TABLES = ("SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")  # beside the lists of words, in query/grammar.py
 STILL = 1280  # pixels of the longer side of the picture in the page
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
 TOUCHING: tuple[grammar.Side, ...] = ("near", "on", "in")  # relations that follow from points
@@ -241,13 +242,14 @@ def language_tables(
     scale = engine.scale
     zero, rate = scale.of(codebook @ scale.texts.T)
     codes = np.where(field.known, field.latents[..., 0], len(codebook))
+    inside, first = regions.everywhere[:, rows], np.cumsum([0, *map(len, regions.nodes[:-1])], dtype=np.int32)
     palette = field.codec.colours(np.arange(len(codebook), dtype=np.uint16)[:, None], np.ones(len(codebook)))
     tensors: dict[str, Array] = {
         "codebook": codebook.astype(np.float16),
         "zero": zero,
         "rate": rate,
         "codes": codes[:, rows].astype(np.uint16),
-        "regions": regions.everywhere[:, rows],
+        "regions": np.where(inside < 0, -1, inside + first[:, None]),
         "palette": to_bytes(255 * palette),
         **_region_tables(engine, codes),
     }
@@ -262,11 +264,11 @@ def language_tables(
         "guess": engine.basis.short if engine.basis.guesses else "",
         "bars": bars,
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
-        "rule": asdict(RULE) | {"found": found, "least_likeness": taught.LEAST},
+        "rule": asdict(RULE) | {"found": found, "half": HALF},
         "grammar": {
-            **{name.lower(): sorted(getattr(grammar, name)) for name in WORD_LISTS},
+            **{name.lower(): sorted(getattr(grammar, name)) for name in LISTS},
             "prepositions": {" ".join(words): kind for words, kind in grammar.PREPOSITIONS.items()},
-            **{name.lower(): getattr(grammar, name) for name in WORD_TABLES},
+            **{name.lower(): getattr(grammar, name) for name in TABLES},
         },
         "space": {
             "kinds": TOUCHING,
@@ -277,14 +279,22 @@ def language_tables(
         "examples": suggested.examples,
         "phrases": suggested.phrases,
     }
-    numbers["taught"] = [{"name": word.name, "level": word.level} for word in engine.taught.values()]
-    fits = [taught.likeness(word, engine.word_space) for word in engine.taught.values()]
-    for place, name in enumerate(("taught_fits", "taught_above")):
-        each = [np.concatenate(pair[place]) for pair in fits]
-        tensors[name] = np.array(each, np.float32).reshape(len(each), sum(numbers["counts"]))
+    names = [word.name for word in engine.taught.values()]
+    fits = [np.concatenate(taught.likeness(word, engine.word_space)[0]) for word in engine.taught.values()]
+    tensors["taught_fits"] = np.reshape(fits, (len(fits), sum(numbers["counts"]))).astype(np.float32)
+    each = [[_shown(engine, name, level, first) for level in get_args(LevelChoice)] for name in names]
+    numbers["taught"] = [{"name": name, "answers": own} for name, own in zip(names, each, strict=True)]
     progress("encoding words", 0.6)
     words, own = _words(engine, suggested.phrases)
     return numbers | words, tensors | own
+
+
+def _shown(engine: QueryEngine, name: str, level: LevelChoice, first: Array) -> dict[str, Any]:
+    """Return the answer to a taught word, with the numbers of its regions; first: those of the levels."""
+    answer = engine.run(name, level)
+    inside = np.unique(engine.regions.everywhere[answer.level, answer.members]) + first[answer.level]
+    numbers = {"level": answer.level, "scores": answer.scores, "fits": answer.fits}
+    return numbers | {"inside": inside.tolist(), "margin": answer.judgement.margin}
 
 
 def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
@@ -326,14 +336,9 @@ def _touching(bodies: Sequence[Body]) -> list[tuple[int, int, int]]:
     for number, one in enumerate(bodies):
         apart = np.linalg.norm(np.maximum(0, np.maximum(low - one.high, one.low - high)), axis=1)
         for other in np.flatnonzero(apart[:number] <= NEAR * one.size).tolist():
-            ways, near = ((number, other), (other, number)), stands("near", one, bodies[other], None)
-            found += [(0, *way) for way in ways if near]
-            found += [
-                (kind, a, b)
-                for kind, name in enumerate(TOUCHING)
-                for a, b in ways
-                if kind > 0 and stands(name, bodies[a], bodies[b], None)
-            ]
+            for a, b in ((number, other), (other, number)):
+                holds = (stands(kind, bodies[a], bodies[b], None) for kind in TOUCHING)
+                found += [(kind, a, b) for kind, there in enumerate(holds) if there]
     return found
 
 

@@ -41,10 +41,11 @@ const SPEED = 0.6; // radii a second
 const TURN = 60; // pixels of a drag a second, of the turntable
 
 class Controls {
-  // changed(): called when the camera has another pose. free(): left, top, width and height of what no panel
-  // covers, pixels of CSS.
-  constructor(element, { radius, up }, free, changed) {
-    Object.assign(this, { element, radius, up, free, changed, moving: 0, pointers: new Map() });
+  // page.moved() is called when the camera has another pose; page.free() has left, top, width and height of what
+  // no panel covers, pixels of CSS.
+  constructor(element, page) {
+    const { radius, up } = page.meta;
+    Object.assign(this, { element, page, radius, up, moving: 0, pointers: new Map() });
     this.held = new Set(); // keys that fly, while they are pressed
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
     element.addEventListener("pointerdown", (event) => this.down(event));
@@ -52,14 +53,11 @@ class Controls {
     for (const name of ["pointerup", "pointercancel"]) {
       element.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
     }
-    element.addEventListener(
-      "wheel",
-      (event) => {
-        event.preventDefault();
-        this.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)));
-      },
-      { passive: false },
-    );
+    const wheel = (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)));
+    };
+    element.addEventListener("wheel", wheel, { passive: false });
     element.addEventListener("contextmenu", (event) => event.preventDefault());
     element.addEventListener("keydown", (event) => this.key(event));
     addEventListener("keyup", (event) => this.held.delete(event.key));
@@ -70,7 +68,7 @@ class Controls {
   // the middle of what is free.
   camera(dots) {
     const { view } = this;
-    const [left, top, across, along] = this.free().map((length) => length * dots);
+    const [left, top, across, along] = this.page.free().map((length) => length * dots);
     const scale = Math.min(across / view.width, along / view.height);
     return {
       width: Math.max(Math.round(innerWidth * dots), 1),
@@ -163,7 +161,7 @@ class Controls {
 
   pose(rotation, position) {
     this.view = { ...this.view, rotation, position };
-    this.changed();
+    this.page.moved();
   }
 
   // Turn around the pivot, `distance` ahead, by a drag in pixels; never over the pole.
@@ -212,11 +210,8 @@ class Controls {
   // pivot, which else is as far ahead as the middle of the scene.
   go(view, moved = null) {
     if (moved) {
-      const rotation = upright(moved.slice(3, 9));
-      return this.fly(
-        { ...view, rotation, position: moved.slice(0, 3) },
-        Math.max(moved[9], 0.05 * this.radius),
-      );
+      const pose = { rotation: upright(moved.slice(3, 9)), position: moved.slice(0, 3) };
+      return this.fly({ ...view, ...pose }, Math.max(moved[9], 0.05 * this.radius));
     }
     const ahead = view.rotation.slice(6, 9);
     this.fly(view, Math.max(-inner(view.position, ahead), 0.3 * this.radius));
@@ -227,7 +222,7 @@ class Controls {
     const points = cornersOf(corners);
     const middle = points.reduce((sum, point) => add(sum, point, 1 / 8), [0, 0, 0]);
     const reach = Math.max(...points.map((point) => Math.hypot(...add(point, middle, -1))));
-    const [, , width, height] = this.free();
+    const [, , width, height] = this.page.free();
     const { fx } = this.camera(1);
     const distance = Math.max((4 * reach * fx) / Math.min(width, height), 0.1 * this.radius);
     const [, , ahead] = axes(this.view);
@@ -241,7 +236,7 @@ class Controls {
     this.distance = distance;
     if (!from || this.calm.matches) {
       this.view = view;
-      return this.changed();
+      return this.page.moved();
     }
     const step = (now) => {
       if (turn !== this.moving) {
@@ -253,7 +248,7 @@ class Controls {
       const rotation = upright(mixed.slice(3));
       const position = add(from.position, add(view.position, from.position, -1), share);
       this.view = time === 1 ? view : { ...view, rotation, position };
-      this.changed();
+      this.page.moved();
       if (time < 1) {
         requestAnimationFrame(step);
       }

@@ -155,12 +155,7 @@ class Painter {
     const { gl } = this;
     const { program, uniforms } = this.programs[name];
     gl.useProgram(program);
-    const set = {
-      [gl.FLOAT]: "uniform1fv",
-      [gl.FLOAT_VEC2]: "uniform2fv",
-      [gl.FLOAT_VEC3]: "uniform3fv",
-      [gl.FLOAT_VEC4]: "uniform4fv",
-    };
+    const floats = [gl.FLOAT, gl.FLOAT_VEC2, gl.FLOAT_VEC3, gl.FLOAT_VEC4]; // by their number, less one
     for (const [key, value] of Object.entries(values)) {
       if (!uniforms[key]) {
         continue;
@@ -170,7 +165,7 @@ class Painter {
       if (type === gl.FLOAT_MAT3) {
         gl.uniformMatrix3fv(at, false, list);
       } else {
-        gl[set[type] || "uniform1iv"](at, list);
+        gl[floats.includes(type) ? `uniform${floats.indexOf(type) + 1}fv` : "uniform1iv"](at, list);
       }
     }
   }
@@ -392,15 +387,9 @@ class Painter {
     gl.disable(gl.BLEND);
   }
 
-  // Wait until the image is drawn.
-  wait() {
-    this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
-  }
-
-  // (height, width, 4) bytes of what `paint` drew in this very task, its bottom row first.
-  pixels() {
+  // (height, width, 4) bytes of what `paint` drew in this very task, its bottom row first, once it is drawn.
+  pixels({ width, height } = this.canvas) {
     const { gl } = this;
-    const { width, height } = this.canvas;
     const bytes = new Uint8Array(4 * width * height);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     return bytes;

@@ -72,13 +72,10 @@ class ClipText {
   embedded(ids) {
     const token = this.weight("text_model.embeddings.token_embedding.weight");
     const position = this.weight("text_model.embeddings.position_embedding.weight");
-    const states = new Float32Array(ids.length * this.width);
-    ids.forEach((id, row) => {
-      for (let i = 0; i < this.width; ++i) {
-        states[row * this.width + i] = token[id * this.width + i] + position[row * this.width + i];
-      }
-    });
-    return states;
+    const { width } = this;
+    const one = (id, row) =>
+      Array.from({ length: width }, (_, i) => token[id * width + i] + position[row * width + i]);
+    return Float32Array.from(ids.flatMap(one));
   }
 
   linear(name, states, width) {

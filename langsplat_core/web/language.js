@@ -7,36 +7,36 @@ import {
   decide,
   fitOf,
   heatRange,
+  isWithin,
   leastFit,
+  mean,
+  onThings,
   regionRelevancies,
   regionsAt,
   sigmoid,
   strongest,
   verdict,
+  wholeOf,
 } from "./rule.js";
-import { Space, wholeOf } from "./space.js";
+import { Space } from "./space.js";
 import { namedBy, nearest, parse, phraseKey, splitPhrases, thingAndPart, tidy } from "./words.js";
 
 // [page]
 const GRID = { neighbours: 16, most: 64, side: 5 }; // as of query/answers.py, smoothed
 
-// Means of values (K) around points (3 K), smoothed on a grid that grows with them.
-function smoothed(points, values) {
+// Means of values (K) around points, by number and axis, smoothed on a grid that grows with them.
+function smoothed(point, values) {
   const count = values.length;
   const axes = [0, 1, 2];
-  const middle = axes.map((axis) => values.reduce((sum, _, i) => sum + points[3 * i + axis], 0) / count);
-  const spreads = axes.map((axis) => {
-    const squares = values.reduce((sum, _, i) => sum + (points[3 * i + axis] - middle[axis]) ** 2, 0);
-    return Math.sqrt(squares / count);
-  });
+  const average = (of) => values.reduce((sum, _, i) => sum + of(i), 0) / count;
+  const middle = axes.map((axis) => average((i) => point(i, axis)));
+  const spreads = axes.map((axis) => Math.sqrt(average((i) => (point(i, axis) - middle[axis]) ** 2)));
   const side = Math.trunc(Math.min(Math.max(Math.sqrt(count / GRID.neighbours), 2), GRID.most));
   const step = Math.max((GRID.side * Math.max(...spreads)) / side, 1e-30);
   const weights = new Float64Array((side + 1) ** 3);
   const totals = new Float64Array((side + 1) ** 3);
   const eachCorner = (i, visit) => {
-    const at = axes.map((k) =>
-      Math.min(Math.max((points[3 * i + k] - middle[k]) / step + side / 2, 0), side),
-    );
+    const at = axes.map((k) => Math.min(Math.max((point(i, k) - middle[k]) / step + side / 2, 0), side));
     const low = at.map((place) => Math.min(Math.trunc(place), side - 1));
     for (let corner = 0; corner < 8; ++corner) {
       const bits = axes.map((k) => (corner >> k) & 1);
@@ -88,15 +88,15 @@ class Language {
   // Answers to the phrases of a line, in their order, three at most. camera: from where left, right, nearest and
   // so on are said. PhraseError where one of them cannot be asked.
   answers(line, levelName, camera) {
-    return splitPhrases(line, this.lists)
+    return splitPhrases(line)
       .slice(0, 3)
       .map((phrase) => {
         try {
           const tree = this.taught.has(phraseKey(phrase)) ? { text: phrase } : parse(phrase, this.lists);
-          return { ...this.follow(tree, levelName, camera), phrase };
+          return this.drawn({ ...this.follow(tree, levelName, camera), phrase });
         } catch (error) {
           if (error instanceof PhraseError && this.keys.has(phraseKey(phrase))) {
-            return this.ask(phrase, levelName);
+            return this.drawn(this.ask(phrase, levelName));
           }
           throw error;
         }
@@ -105,31 +105,34 @@ class Language {
 
   // The answer to a tree of phrases (words.js, parse): of what is asked for, the regions in whose wholes the
   // relation holds.
-  follow({ text, kind, what, anchor, count }, levelName, camera, most = 1) {
+  follow({ text, kind, what, anchor, items, count }, levelName, camera, most = 1) {
     if (!kind) {
       return this.ask(text, levelName);
     }
+    if (items) {
+      const answers = items.map((item) => this.thing(item, levelName, camera));
+      return this.joined(answers, kind === "both");
+    }
     const other = anchor && this.thing(anchor, "auto", camera);
-    const others = other ? this.wholesOf(other) : [];
     if (kind === "inside") {
-      const part = what.text ? this.part(what.text, anchor, others, levelName) : this.follow(what, levelName);
-      return this.restricted(part, what.text ? this.wholesOf(part) : others, other);
+      const part = what.text && this.part(what.text, anchor, other, levelName);
+      const asked = part || this.follow(what, levelName, camera);
+      return this.restricted(asked, (part || other).inside, other);
     }
     const asked = this.thing(what, levelName, camera, count);
     if (kind === "counted") {
       const { found, reached, margin, probability } = asked.verdict;
       const enough = found && this.count(asked) >= count;
-      const judged = verdict(this.meta.rule, enough, reached, margin, probability);
-      return this.answer(asked.phrase, { ...asked, verdict: judged }, asked.codes);
+      return { ...asked, verdict: verdict(this.meta.rule, enough, reached, margin, probability) };
     }
-    const things = this.wholesOf(asked);
     if (kind === "without") {
-      const isPart = other.level + 1 < this.meta.levels.length;
-      const left = things.filter((thing) => isPart || !others.includes(thing));
-      const less = isPart ? this.spread(other).members.map((is, row) => is | asked.less?.[row]) : asked.less;
-      return other.verdict.found ? this.restricted({ ...asked, less }, left, asked) : asked;
+      const least = anchor.text ? this.reached(other, this.meta.rule.half) : -Infinity;
+      const unwanted = other.inside.filter((region) => other.regionFits[region] >= least);
+      return other.verdict.found ? this.restricted(asked, unwanted, asked, true) : asked;
     }
-    return this.restricted(asked, this.space.chosen(kind, things, others, camera, most), other ?? asked);
+    const [things, others] = [asked, other].map((answer) => (answer ? this.wholesOf(answer) : []));
+    const chosen = this.space.chosen(kind, things, others, camera, most);
+    return this.restricted(asked, chosen, other ?? asked);
   }
 
   // The wholes that the regions of an answer are parts of, or are.
@@ -137,33 +140,45 @@ class Language {
     return [...new Set(inside.map((region) => wholeOf(this.regions, region)))];
   }
 
-  // The number of wholes that an answer has parts of or is, if it reached further down: a count needs as many.
-  count({ inside, level, regionFits }) {
-    const { rule, space } = this.meta;
-    const least = leastFit(rule, Math.max(...inside.map((region) => regionFits[region])), rule.wide);
-    const sizes = {};
-    for (const region of regionsAt(this.regions, level)) {
-      const whole = wholeOf(this.regions, region);
-      sizes[whole] = (sizes[whole] ?? 0) + (regionFits[region] >= least ? this.regions.sizes[region] : 0);
-    }
-    const [fewest, share] = space.specks;
-    const solid = Math.max(fewest, share * Math.max(...Object.values(sizes)));
-    return Object.values(sizes).filter((size) => size >= solid).length;
+  // The fit from which a region belongs to an answer, if it reached another `share` of the way down.
+  reached({ inside, regionFits }, share) {
+    return leastFit(this.meta.rule, Math.max(...inside.map((region) => regionFits[region])), share);
   }
 
-  // The answer to a part of a thing, or on the wholes of a thing with structure.
-  part(name, thing, wholes, levelName) {
+  // The number of wholes that an answer has parts of or is, if it reached further down: a count needs as many.
+  count(answer) {
+    const { level, regionFits } = answer;
+    const { rule, space } = this.meta;
+    const least = this.reached(answer, rule.wide);
+    const all = regionsAt(this.regions, level).filter((region) => regionFits[region] >= least);
+    const things = Map.groupBy(all, (region) => wholeOf(this.regions, region)).values();
+    const sizes = Array.from(things, (own) =>
+      own.reduce((sum, region) => sum + this.regions.sizes[region], 0),
+    );
+    const [fewest, share] = space.specks;
+    const solid = Math.max(fewest, share * Math.max(...sizes));
+    return sizes.filter((size) => size >= solid).length;
+  }
+
+  // The answer to a part of a thing, on what answers to it; on what fits a plain name nearly as well, too.
+  part(name, thing, other, levelName) {
     const { rule, levels, calibration } = this.meta;
-    const phrase = thing.kind ? name : `${thing.text} ${name}`;
-    const whole = (_, region) => (wholes.includes(wholeOf(this.regions, region)) ? 1 : rule.nothing);
-    const on = thing.kind ? Array.from(this.regions.sizes, whole) : this.knownFits(thing.text);
-    const [own, both] = [name, phrase].map((text) => this.knownFits(text));
-    if (!own || !on || !calibration) {
+    const own = thing.text && !this.taught.has(phraseKey(thing.text));
+    const phrase = own ? `${thing.text} ${name}` : name;
+    const asked = [name, phrase].map((text) => this.known(text));
+    if (!asked[0] || !calibration) {
       return this.ask(phrase, levelName);
     }
-    const level = levels.indexOf(levelName);
-    const decision = decide(rule, this.regions, own, "inside", level, this.meta, on, both);
-    return this.answer(phrase, decision, this.relevancies(this.vector(phraseKey(both ? phrase : name))));
+    const words = own ? thing.text.toLowerCase().split(" ") : [];
+    const plain = own && words.every((word) => !this.lists.adjectives.has(word));
+    const least = plain ? this.reached(other, rule.around) : Infinity;
+    const near = regionsAt(this.regions, other.level).filter((region) => other.regionFits[region] >= least);
+    const among = new Set([...other.inside, ...near]);
+    const on = Array.from(this.regions.sizes, (_, region) => isWithin(this.regions, region, among));
+    const known = asked.filter(Boolean);
+    const fits = known.map((one) => this.ownFits(one));
+    const decision = decide(rule, this.regions, fits, "inside", levels.indexOf(levelName), this.meta, on);
+    return this.answer(phrase, decision, mean(known));
   }
 
   // As `follow`, but a thing is looked for among wholes, unless it fits none.
@@ -173,15 +188,37 @@ class Language {
     return free && whole.peak < this.meta.rule.floor ? this.follow(tree, levelName, camera) : whole;
   }
 
-  // An answer within some wholes; nothing is found where `needed` is not.
-  restricted(answer, wholes, needed) {
+  // An answer in some regions, or outside of them; nothing is found where `needed` is not.
+  restricted(answer, regions, needed, outside = false) {
     const { rule } = this.meta;
-    const inside = answer.inside.filter((region) => wholes.includes(wholeOf(this.regions, region)));
+    const [among, there] = [new Set(regions), this.covered(regions)];
+    const inside = answer.inside.filter((region) => isWithin(this.regions, region, among) !== outside);
     const within = new Set(inside);
     const regionFits = answer.regionFits.map((fit, region) => (within.has(region) ? fit : rule.nothing));
     const best = strongest(inside, regionFits);
-    const verdict = combined(rule, answer.verdict, needed.verdict, best < 0);
-    return this.answer(answer.phrase, { ...answer, inside, best, regionFits, verdict }, answer.codes);
+    const members = answer.members.map((is, row) => is & (there[row] ^ outside));
+    const kept = (value, row) => members[row] * value;
+    const [values, even] = [answer.values.map(kept), answer.even.map(kept)];
+    const peak = best < 0 ? 0 : answer.peak;
+    const verdict = combined(rule, [answer.verdict, needed.verdict], true, best < 0);
+    return { ...answer, inside, regionFits, best, members, values, even, peak, verdict };
+  }
+
+  // The union of answers, found if all are or any is; alternatives that are not found do not count.
+  joined(answers, all) {
+    const found = answers.filter(({ verdict }) => all || verdict.found);
+    const counting = (found.length ? found : answers).map((one) => this.restricted(one, one.inside, one));
+    const most = (name) => counting[0][name].map((_, i) => Math.max(...counting.map((one) => one[name][i])));
+    const [regionFits, members, values, even] = ["regionFits", "members", "values", "even"].map(most);
+    const inside = [...new Set(counting.flatMap((one) => one.inside))];
+    const peak = (all ? Math.min : Math.max)(...counting.map((one) => one.peak));
+    const best = strongest(inside, regionFits);
+    const verdict = combined(
+      this.meta.rule,
+      Array.from(counting, (one) => one.verdict),
+      all,
+    );
+    return { ...counting[0], inside, regionFits, best, members, values, even, peak, verdict };
   }
 
   // The answer to a phrase at "auto" or a level's name. PhraseError where it cannot be asked.
@@ -194,14 +231,21 @@ class Language {
     const level = this.meta.levels.indexOf(levelName); // -1: free
     const word = this.taught.get(key);
     if (word) {
-      return this.answerByExamples(word, level);
+      const { margin, inside, ...decision } = word.answers[level + 1];
+      const count = this.regions.sizes.length;
+      const regionFits = this.tensors.taught_fits.subarray(word.row * count, (word.row + 1) * count);
+      const judged = verdict(this.meta.rule, margin >= 0, "example", margin);
+      const best = strongest(inside, regionFits);
+      return this.answer(word.name, { ...decision, inside, regionFits, best, verdict: judged }, null);
     }
     const phrase = tidy(text);
     const relevancies = this.relevancies(this.vector(key));
     const named = namedBy(phrase, this.lists);
-    const others = thingAndPart(phrase, this.lists).map((name) => this.knownFits(name));
-    const own = this.ownFits(relevancies);
-    const decision = decide(this.meta.rule, this.regions, own, named, level, this.meta, ...others);
+    const others = thingAndPart(phrase, this.lists).map((name) => this.known(name));
+    const [own, thing, part] = [relevancies, ...others].map((one) => one && this.ownFits(one));
+    const on = thing && onThings(this.meta.rule, this.regions, thing);
+    const fits = thing && part ? [own, part] : [own];
+    const decision = decide(this.meta.rule, this.regions, fits, named, level, this.meta, on);
     return this.answer(phrase, decision, relevancies);
   }
 
@@ -243,14 +287,14 @@ class Language {
     return means.map((mean) => fitOf(this.meta.rule, mean));
   }
 
-  // Fits of the regions with a thing or part that a phrase names; null where it cannot be asked.
-  knownFits(name) {
+  // Relevancies of a thing or part that a phrase names; null where it cannot be asked.
+  known(name) {
     const key = phraseKey(name);
     if (!key || this.taught.has(key)) {
       return null;
     }
     try {
-      return this.ownFits(this.relevancies(this.vector(key)));
+      return this.relevancies(this.vector(key));
     } catch (error) {
       if (error instanceof PhraseError) {
         return null;
@@ -259,87 +303,53 @@ class Language {
     }
   }
 
-  // The answer to a taught word: its fits were computed when the page was made (query/taught.py, by_showing).
-  answerByExamples(word, level) {
-    const { rule } = this.meta;
-    const { sizes } = this.regions;
-    const row = (tensor) => tensor.subarray(word.row * sizes.length, (word.row + 1) * sizes.length);
-    const every = row(this.tensors.taught_fits);
-    const margins = row(this.tensors.taught_above);
-    const solid = this.meta.levels.map((_, at) => {
-      const numbers = regionsAt(this.regions, at);
-      const least = Math.min(rule.smallest, Math.max(0, ...numbers.map((region) => sizes[region])));
-      return numbers.filter((region) => sizes[region] >= least);
-    });
-    const chosen = level < 0 ? word.level : level;
-    const regions = solid[chosen];
-    const least = Math.min(0, Math.max(...regions.map((region) => every[region])));
-    const margin = Math.max(rule.least_likeness, ...regions.map((region) => margins[region]));
-    const decision = {
-      level: chosen,
-      scores: solid.map((some) => Math.max(0, ...some.map((region) => sigmoid(every[region])))),
-      fits: solid.map((some) => Math.max(rule.least_likeness, ...some.map((region) => every[region]))),
-      regionFits: every,
-      inside: regions.filter((region) => every[region] >= least),
-      best: strongest(regions, every),
-      verdict: verdict(rule, margin >= 0, "example", margin),
-    };
-    return this.answer(word.name, decision, null);
-  }
-
   // codes: relevancies of the codewords; null for a taught word.
   answer(phrase, decision, codes) {
+    const { level, inside, regionFits, scores } = decision;
+    const row = (tensor) => tensor.subarray(level * this.gaussians, (level + 1) * this.gaussians);
+    const relevancies = regionRelevancies(this.meta.rule, regionFits);
+    const even = Float32Array.from(row(this.tensors.regions), (region) => relevancies[region] ?? 0);
+    const values = codes ? Float32Array.from(row(this.tensors.codes), (code) => codes[code]) : even;
+    return { ...decision, phrase, peak: scores[level], values, even, members: this.covered(inside) };
+  }
+
+  // An answer with what is drawn of its members and said of its best region.
+  drawn(answer) {
     const { places, boxes } = this.tensors;
-    const { best } = decision;
-    const peak = decision.scores[decision.level];
-    const { values, members } = this.spread({ ...decision, codes });
+    const { best, members, peak, values } = answer;
     const rows = Uint32Array.from(members.keys()).filter((row) => members[row]);
-    const part = (_, i) => this.places[4 * rows[Math.trunc(i / 3)] + (i % 3)];
-    const points = Float32Array.from({ length: 3 * rows.length }, part);
     const own = Float32Array.from(rows, (row) => values[row]);
-    const smooth = smoothed(points, own);
+    const smooth = smoothed((i, axis) => this.places[4 * rows[i] + axis], own);
     const hottest = smooth.reduce((most, value) => Math.max(most, value), 0);
     return {
-      ...decision,
-      phrase,
-      codes,
-      peak,
+      ...answer,
       rows,
       smooth,
-      heat: heatRange(this.meta.rule, peak, decision.verdict.found, hottest),
+      heat: heatRange(this.meta.rule, peak, answer.verdict.found, hottest),
       place: best < 0 ? null : Array.from(places.subarray(3 * best, 3 * best + 3)),
       box: best < 0 ? null : Array.from(boxes.subarray(6 * best, 6 * best + 6)),
     };
   }
 
-  // The relevancy of every Gaussian at the level of an answer, its region there (-1: none), and whether it is a
-  // member: in the answer's regions and not in `less`, if there is that.
-  spread({ level, inside, codes, regionFits, less }) {
-    const [first] = regionsAt(this.regions, level);
-    const row = (tensor) => tensor.subarray(level * this.gaussians, (level + 1) * this.gaussians);
-    const owners = Int32Array.from(row(this.tensors.regions), (own) => (own < 0 ? -1 : first + own));
-    const fit = (region) => (region < 0 ? 0 : sigmoid(regionFits[region]));
-    const values = codes
-      ? Float32Array.from(row(this.tensors.codes), (code) => codes[code])
-      : Float32Array.from(owners, fit);
-    const among = new Set(inside);
-    const members = Uint8Array.from(owners, (region, row) => +(among.has(region) && !less?.[row]));
-    return { values, owners, members };
+  // Whether each Gaussian is in one of some regions.
+  covered(regions) {
+    const [among, { regions: own }] = [new Set(regions), this.tensors];
+    const isIn = (_, row) =>
+      this.meta.levels.some((_, level) => among.has(own[level * this.gaussians + row]));
+    return Uint8Array.from({ length: this.gaussians }, isIn);
   }
 
   // Values of the Gaussians as display/displays.py has them (heats): of an answer from `base` to 1 by what heat is
   // of, and 0 for all others; "everywhere" minus the relevancy of each.
   heats(answer, of, base) {
-    const { values, owners } = this.spread(answer);
+    const { values, even } = answer;
     if (of === "everywhere") {
       return values.map((value) => -value);
     }
     const [low, high] = answer.heat;
-    const even = of === "node" ? regionRelevancies(this.meta.rule, answer.regionFits) : null;
     const heats = new Float32Array(this.gaussians);
     answer.rows.forEach((row, i) => {
-      const node = even ? even[owners[row]] : values[row];
-      const value = of === "smooth" ? answer.smooth[i] : node;
+      const value = of === "smooth" ? answer.smooth[i] : (of === "node" ? even : values)[row];
       heats[row] = base + (1 - base) * Math.min(Math.max((value - low) / (high - low), 0), 1);
     });
     return heats;
@@ -347,8 +357,7 @@ class Language {
 
   // The least relevancy of what is in an answer.
   cut(answer) {
-    const even = regionRelevancies(this.meta.rule, answer.regionFits);
-    return answer.inside.reduce((least, region) => Math.min(least, even[region]), answer.peak);
+    return answer.rows.reduce((least, row) => Math.min(least, answer.even[row]), answer.peak);
   }
 
   // Red, green and blue in [0, 1] of the language features at a level; grey where nothing was observed.

@@ -5,7 +5,7 @@ import { Language, PhraseError } from "./language.js";
 import { Controls, cornersOf, project } from "./camera.js";
 import { Painter } from "./draw.js";
 import { Headset } from "./headset.js";
-import { wholeOf } from "./space.js";
+import { wholeOf } from "./rule.js";
 
 // [page]
 const byId = (id) => document.getElementById(id);
@@ -42,13 +42,7 @@ class Page {
     this.painter = new Painter(byId("scene"), meta, tensors);
     this.painter.onorder = () => this.redraw();
     this.language = meta.language && new Language(meta.language, tensors, this.painter.places);
-    const canvas = byId("scene");
-    this.controls = new Controls(
-      canvas,
-      meta,
-      () => this.free(),
-      () => this.moved(),
-    );
+    this.controls = new Controls(byId("scene"), this);
     this.headset = new Headset(this);
     byId("panel").hidden = false;
     this.fill();
@@ -342,7 +336,7 @@ class Page {
       this.painter.show(this.language.latents(this.level === "auto" ? 2 : levels.indexOf(this.level)));
     } else if (this.display !== "rgb") {
       const heats = (answer) => this.language.heats(answer, byId("heat").value, this.meta.picture.heat_base);
-      const members = (answer) => this.language.spread(answer).members;
+      const members = (answer) => answer.members;
       this.painter.show(hot.map(this.display === "segmentation" ? members : heats));
     }
     this.redraw();
@@ -425,11 +419,7 @@ class Page {
     const solid = answer.inside.filter((region) => sizes[region] >= this.meta.language.rule.smallest);
     const regions = solid.length ? solid : answer.inside;
     const byFit = regions.toSorted((a, b) => answer.regionFits[b] - answer.regionFits[a]);
-    const things = new Map();
-    for (const region of byFit) {
-      const whole = wholeOf(this.language.regions, region);
-      things.set(whole, [...(things.get(whole) ?? []), region]);
-    }
+    const things = Map.groupBy(byFit, (region) => wholeOf(this.language.regions, region));
     const { corners } = this.language.tensors;
     const shown = [...things].slice(0, MOST_BOXES).map(([whole, own]) => (own.length > 1 ? whole : own[0]));
     return shown.map((region) => corners.subarray(24 * region, 24 * region + 24));
@@ -491,21 +481,19 @@ class Page {
 
   // Fewer pixels next time where an image took long, and fewer Gaussians where it took very long, until none was asked for twice as long as that.
   keepUp(began) {
-    this.painter.wait();
+    this.painter.pixels({ width: 1, height: 1 }); // waits for the image
     const taken = performance.now() - began;
     if (taken > SLOW) {
       this.share = Math.max(this.share * Math.sqrt(SLOW / taken), COARSEST);
       this.coarse ||= taken > 4 * SLOW;
     }
     clearTimeout(this.rest);
-    this.rest = setTimeout(
-      () => {
-        Object.assign(this, { share: 1, coarse: false, moving: false });
-        this.remember(false);
-        this.redraw();
-      },
-      Math.max(REST, 2 * taken),
-    );
+    const finish = () => {
+      Object.assign(this, { share: 1, coarse: false, moving: false });
+      this.remember(false);
+      this.redraw();
+    };
+    this.rest = setTimeout(finish, Math.max(REST, 2 * taken));
   }
 
   // Boxes over the image, in pixels of the screen.

@@ -13,6 +13,11 @@ function fitOf(rule, relevancy) {
   return logit(Math.min(Math.max(relevancy, rule.narrowest), 1 - rule.narrowest));
 }
 
+// Means of arrays of the same length.
+function mean(arrays) {
+  return arrays[0].map((_, i) => arrays.reduce((sum, values) => sum + values[i], 0) / arrays.length);
+}
+
 // Fits of regions, each mixed with that of its best part. own: fits of the mean relevancy of each.
 function regionFits(rule, regions, own) {
   const { parents, sizes } = regions;
@@ -53,17 +58,24 @@ function bestRelevancy(rule, regions, relevancies, level) {
   return Math.max(0, relevancies[strongest(solid.length ? solid : every, relevancies)] ?? 0);
 }
 
+// The whole that a region is a part of, or is.
+function wholeOf(regions, region) {
+  const above = regions.parents[region];
+  return above < 0 ? region : wholeOf(regions, above);
+}
+
+// Whether a region is one of a Set of others, or a part of one.
+function isWithin(regions, region, others) {
+  return region >= 0 && (others.has(region) || isWithin(regions, regions.parents[region], others));
+}
+
 // Where parts of a thing may be: in and below the wholes that fit it nearly as well as the best one does.
-function onThings(rule, regions, thing) {
+function onThings(rule, regions, own) {
+  const thing = regionFits(rule, regions, own);
   const level = regions.counts.length - 1;
   const best = bestRelevancy(rule, regions, regionRelevancies(rule, thing), level);
   const least = leastFit(rule, fitOf(rule, best), rule.around);
-  const [first] = regionsAt(regions, level);
-  const on = Array.from(thing, (fit, region) => region >= first && fit >= least);
-  for (let region = first - 1; region >= 0; --region) {
-    on[region] = regions.parents[region] >= 0 && on[regions.parents[region]];
-  }
-  return on;
+  return Array.from(thing, (_, region) => thing[wholeOf(regions, region)] >= least);
 }
 
 // The fit from which a region belongs to an answer; `share`: of the way that it reaches.
@@ -88,25 +100,30 @@ function excess(rule, fits, named, level, bars) {
   return Math.max(above(bars[2], fits[2], whole), above(bars[3], Math.max(fits[0], fits[1]), finer));
 }
 
+const IN_SPREADS = ["chance", "example"]; // ways of reaching a verdict whose margins can be compared
+
 // A verdict: `outcome` in words, how it was `reached`, `margin` above what counts as found, `probability`, and the
 // share of phrases for nothing here that fit as well `byChance`.
 function verdict(rule, found, reached, margin, probability = null) {
-  const weak = probability === null ? margin >= rule.weak_excess : probability >= rule.weak_probability;
+  const near = IN_SPREADS.includes(reached) && margin >= rule.weak_excess;
+  const weak = probability === null ? near : probability >= rule.weak_probability;
   const outcome = found ? "found" : weak ? "weak match" : "not here";
   const [atBar, slope] = rule.by_chance;
   const byChance = reached === "chance" ? sigmoid(logit(atBar) - slope * margin) : null;
   return { outcome, found, reached, margin, probability, byChance };
 }
 
-// The verdict on two things that are both needed, the weaker one; absent: nothing is both.
-function combined(rule, one, other, absent) {
-  const [probability, margin] = ["probability", "margin"].map((name) => {
-    const unknown = one[name] === null || other[name] === null;
-    const least = name === "margin" ? -Infinity : 0;
-    return unknown ? null : absent ? least : Math.min(one[name], other[name]);
-  });
-  const reached = one.reached === other.reached ? one.reached : "several";
-  return verdict(rule, !absent && one.found && other.found, reached, margin, probability);
+// One verdict of several: the weakest where all are needed, else the strongest; absent: nothing is there.
+function combined(rule, verdicts, all, absent = false) {
+  const score = (name) => (all ? Math.min : Math.max)(...verdicts.map((one) => one[name]));
+  const every = (holds) => verdicts.every(holds);
+  const [{ reached }] = verdicts;
+  const several = every((one) => IN_SPREADS.includes(one.reached)) ? "chance" : "several";
+  const way = every((one) => one.reached === reached) ? reached : several;
+  const known = every((one) => one.probability !== null);
+  const probability = !known ? null : absent ? 0 : score("probability");
+  const found = !absent && (all ? every((one) => one.found) : verdicts.some((one) => one.found));
+  return verdict(rule, found, way, absent ? -Infinity : score("margin"), probability);
 }
 
 // The verdict that the best fits of the levels stand for. level: number, or -1 where it is free. common: the
@@ -127,17 +144,13 @@ function judge(rule, fits, named, level, { bars, calibration }, common) {
 
 // The answer of the whole regions that fit nearly as well as the best one: its level, `scores` and `fits` of
 // all levels, the regions that are `inside`, the `best` one that the place is of (-1: none), and the verdict.
-// evidence: { bars, calibration }. thing, part: the same as `own` for the thing that the phrase names a part of,
-// and for that part alone.
-function decide(rule, regions, own, named, level, evidence, thing = null, part = null) {
-  const anywhere = regionFits(rule, regions, own);
-  const both = thing && part ? own.map((fit, region) => (fit + part[region]) / 2) : own;
-  const on = thing && onThings(rule, regions, regionFits(rule, regions, thing));
-  const every = regionFits(rule, regions, both).map((fit, region) =>
-    !on || on[region] ? fit : rule.nothing,
-  );
-  const heard =
-    named === "inside" ? anywhere.map((fit, region) => (on[region] ? fit : rule.nothing)) : anywhere;
+// evidence: { bars, calibration }. own: of every name of what is sought. on: whether each region is on the thing
+// that it is a part of, if it is.
+function decide(rule, regions, own, named, level, evidence, on = null) {
+  const anywhere = regionFits(rule, regions, own[0]);
+  const there = (fits) => (on ? fits.map((fit, region) => (on[region] ? fit : rule.nothing)) : fits);
+  const every = there(regionFits(rule, regions, mean(own)));
+  const heard = named === "inside" ? there(anywhere) : anywhere;
   const bestOf = (relevancies) =>
     regions.counts.map((_, at) => bestRelevancy(rule, regions, relevancies, at));
   const fits = bestOf(regionRelevancies(rule, heard)).map((score) => fitOf(rule, score));
@@ -147,7 +160,7 @@ function decide(rule, regions, own, named, level, evidence, thing = null, part =
   const given = bests.map(
     (fit, at) => fit + rule.advantage[named === "inside" ? "part of a thing" : named][at],
   );
-  if (thing) {
+  if (on) {
     given[given.length - 1] = rule.nothing;
   }
   const chosen = level < 0 ? given.lastIndexOf(Math.max(...given)) : level; // of equal levels the coarsest
@@ -180,10 +193,14 @@ export {
   decide,
   fitOf,
   heatRange,
+  isWithin,
   leastFit,
+  mean,
+  onThings,
   regionRelevancies,
   regionsAt,
   sigmoid,
   strongest,
   verdict,
+  wholeOf,
 };

@@ -4,14 +4,6 @@
 import { add, axes, inner } from "./camera.js";
 
 // [page]
-// The whole that a region is a part of, or is.
-function wholeOf({ parents }, region) {
-  while (parents[region] >= 0) {
-    region = parents[region];
-  }
-  return region;
-}
-
 class Space {
   // frame: rotation of the world into those axes, by rows; aside: of the mean size, what is closer is level.
   constructor({ counts, space }, { bodies, pairs }) {
@@ -95,4 +87,4 @@ class Space {
 }
 // [/page]
 
-export { Space, wholeOf };
+export { Space };

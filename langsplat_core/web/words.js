@@ -78,7 +78,8 @@ function thingAndPart(phrase, lists) {
   return [words.slice(0, -1).join(" "), words[words.length - 1]];
 }
 
-const JOIN = /\s(?:and|or|&|as well as)\s(?!not\b)/iu;
+const AND = /\s(?:and|&|as well as)\s/iu;
+const OR = /\sor\s/iu;
 const EXCLUDE = /,?\s(?:(?:but|and)\s)?(?:not|without|except|other than)\s/iu;
 const SEPARATE = /[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)/iu;
 
@@ -88,10 +89,10 @@ function names(text, { stop_words: stops, adjectives, also_nouns: nouns }) {
   return words.some((word) => !stops.has(word) && !adjectives.has(word)) || nouns.has(words.at(-1));
 }
 
-// The phrases of a line; what "and" and "or" join are phrases of their own.
-function splitPhrases(line, lists) {
-  const parts = line.split(SEPARATE).map(tidy).filter(Boolean);
-  return (parts.length ? parts : [""]).flatMap((part) => named(part, JOIN, lists));
+// The phrases of a line; "" where it has no word.
+function splitPhrases(line) {
+  const phrases = line.split(SEPARATE).map(tidy).filter(Boolean);
+  return phrases.length ? phrases : [""];
 }
 
 // A text between joints, or whole where one side would name nothing.
@@ -100,16 +101,18 @@ function named(text, joint, lists) {
   return sides.every((side) => names(side, lists)) ? sides : [text];
 }
 
-// What a phrase asks for: { text }, or { kind, what, anchor } of such, of a count { count, what }. The rules, in
-// their order and by their names, are those of query/grammar.py.
+// What a phrase asks for: { text }, { kind, what, anchor } of such, of a count { count, what }, of several { kind,
+// items }. The rules, in their order and by their names, are those of query/grammar.py.
 function parse(text, lists) {
+  const group = (kind, items) => (items.length > 1 ? { kind, items } : items[0]);
+  const one = (side) => clause(side, lists);
+  const both = (side) => group("both", named(side, AND, lists).map(one));
+  const either = (side) => group("either", named(side, OR, lists).map(both));
   const isPart = (tree) => tree.text && namedBy(tree.text, lists) !== "thing";
-  const ofIt = (what, anchor) => ({ kind: "inside", what: anchor, anchor: what }); // "mug without handle"
-  const trees = named(text, EXCLUDE, lists).map((side) => clause(side, lists));
-  return trees.reduce((what, other) => {
-    const anchor = isPart(other) && what.text && !isPart(what) ? ofIt(what, other) : other;
-    return { kind: "without", what, anchor };
-  });
+  const [what, ...others] = named(text, EXCLUDE, lists).map(either);
+  const own = what.text && !isPart(what); // "mug without handle"
+  const ofIt = (tree) => (own && isPart(tree) ? { kind: "inside", what: tree, anchor: what } : tree);
+  return others.length ? { kind: "without", what, anchor: group("either", others.map(ofIt)) } : what;
 }
 
 function clause(text, lists) {
@@ -177,9 +180,17 @@ function related(text, lists) {
 
 function thing(text, lists) {
   const bare = text.replace(lists.leading, "");
+  const inside = (what, anchor) => ({ kind: "inside", what, anchor });
+  for (const { index, 0: mark } of bare.matchAll(/(?:'s|(?<=s)') /g)) {
+    const [owner, rest] = [bare.slice(0, index), bare.slice(index + mark.length)];
+    const who = owner.toLowerCase().split(" ").at(-1);
+    const owns = !lists.owners.has(who) && names(owner, lists);
+    if (owns && rest.split(" ").some((word) => !lists.stop_words.has(word.toLowerCase()))) {
+      return inside(thing(rest, lists), thing(owner, lists));
+    }
+  }
   const [whole, part] = thingAndPart(bare, lists);
-  const anchor = { text: whole.replace(/'s$|(?<=s)'$/, "") };
-  return whole ? { kind: "inside", what: { text: part }, anchor } : { text: bare };
+  return whole ? inside({ text: part }, { text: whole }) : { text: bare };
 }
 
 // Letters to insert, delete, replace or swap with the next, to make a word another.

@@ -205,13 +205,13 @@ class Tab:
         """The page's answer to a phrase, asked whole or as typed, and the number of its members."""
         found: dict[str, Any] = self.run(
             """async ([phrase, level, whole]) => {
-              const { page, ask } = await langsplat;
-              const answer = whole ? page.language.ask(phrase, level) : ask(phrase, level);
-              const { values, members } = page.language.spread(answer, answer.level);
+              const { page: { language }, ask } = await langsplat;
+              const answer = whole ? language.drawn(language.ask(phrase, level)) : ask(phrase, level);
+              const { values, members } = answer;
               const sum = (numbers) => numbers.reduce((a, b) => a + b, 0);
               return { ...answer, ...answer.verdict, verdict: answer.verdict.outcome,
                        by_chance: answer.verdict.byChance, regionFits: null,
-                       codes: null, rows: null, smooth: null, members: sum(members),
+                       even: null, values: null, rows: null, smooth: null, members: sum(members),
                        mean: sum(values) / values.length };
             }""",
             [phrase, level, whole],
