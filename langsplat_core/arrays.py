@@ -108,7 +108,7 @@ class ViewScore:
 
 
 def rotation_matrices(quats_wxyz: Array) -> Array:
-    """Map (N, 4) quaternions in order w, x, y, z, any non-zero length to (N, 3, 3) rotations."""
+    """Return (..., 3, 3) rotations of (..., 4) quaternions in order w, x, y, z, of any length but zero."""
     w, x, y, z = np.moveaxis(unit(quats_wxyz, 1e-30), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -123,6 +123,21 @@ def affine(linear: Array, offset: Array) -> Array:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, offset
     return matrix
+
+
+def quaternions(rotations: Array) -> Array:
+    """Return (..., 4) float64 unit quaternions wxyz, w >= 0, of (..., 3, 3) rotations."""
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(np.asarray(rotations, np.float64), (-2, -1), (0, 1))
+    rows = [  # 4 q q^T: each row is the quaternion times one of its numbers; the longest loses the least
+        [1 + a + e + i, h - f, c - g, d - b],
+        [h - f, 1 + a - e - i, b + d, c + g],
+        [c - g, b + d, 1 - a + e - i, f + h],
+        [d - b, c + g, f + h, 1 - a - e + i],
+    ]
+    products = np.stack([np.stack(row, -1) for row in rows], -2)
+    largest = np.diagonal(products, axis1=-2, axis2=-1).argmax(-1)[..., None, None]
+    found = unit(np.take_along_axis(products, largest, -2)[..., 0, :])
+    return np.where(found[..., :1] < 0, -found, found)
 
 
 def linear_light(display: Array) -> Array:

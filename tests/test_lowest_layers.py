@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from langsplat_core import compiled, config, errors, registry
-from langsplat_core.arrays import psnr
+from langsplat_core.arrays import psnr, quaternions, rotation_matrices, unit
 from langsplat_core.cli.app import command_names, parse
 from langsplat_core.cli.train import Train
 from langsplat_core.compiled import Workers, is_compiled
@@ -28,6 +28,19 @@ from langsplat_core.progress import Progress, Report, TerminalProgress, TimeLeft
 from langsplat_core.scene import Scene
 from tests.support.processes import files_of_at_most, python, refusal
 from tests.support.scenes import random_gaussians
+
+
+def test_quaternions_of_rotations() -> None:
+    """Any turn, half turns about axes and diagonals, turns too small to be seen."""
+    given = np.random.default_rng(0).normal(size=(300, 4))
+    given[:100] *= (1e-9, 1, 1, 1)
+    given[100:200] *= (1, 1e-9, 1e-9, 1e-9)
+    given[200:215] = list(product((0, 1), repeat=4))[1:]
+    turns = rotation_matrices(given)
+    got = quaternions(turns.reshape(3, 100, 3, 3)).reshape(-1, 4)
+    assert (got[:, 0] >= 0).all()
+    np.testing.assert_allclose(np.abs((got * unit(given)).sum(1)), 1, rtol=1e-14)
+    np.testing.assert_allclose(rotation_matrices(got), turns, atol=1e-14)
 
 
 def test_psnr() -> None:

@@ -13,8 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy
 from PIL import Image
-from scipy.spatial.distance import pdist
 
 from langsplat_core.arrays import Array, check_array, near_power
 from langsplat_core.config import DatasetConfig
@@ -377,7 +377,7 @@ def with_taken(capture: Capture) -> Capture:
     if dates:
         said.append(f"{dates[0]:%Y-%m-%d %H:%M} to {dates[-1]:%Y-%m-%d %H:%M}")
     if named.any():
-        span = pdist(on_ground(places[named])).max(initial=0)
+        span = scipy.spatial.distance.pdist(on_ground(places[named])).max(initial=0)
         said.append(f"places (GPS) within {span:.0f} m")
     if said:
         log.info("taken: %s", ", ".join(said))
@@ -399,11 +399,12 @@ def metres_per_unit(eyes: Array, places: Array) -> float | None:
     spans more than a fifth of the median. Heights are left out, as most cameras know them badly: for a climb
     as steep as a stair that is an eighth too little.
     """
-    apart = pdist(eyes)
+    apart = scipy.spatial.distance.pdist(eyes)
     if not apart.any():
         return None
     far = apart >= apart.max() / 2
-    low, middle, high = np.quantile(pdist(on_ground(places))[far] / apart[far], [0.25, 0.5, 0.75])
+    ratios = scipy.spatial.distance.pdist(on_ground(places))[far] / apart[far]
+    low, middle, high = np.quantile(ratios, [0.25, 0.5, 0.75])
     return float(middle) if middle > 0 and high - low <= middle / 5 else None
 
 

@@ -9,8 +9,8 @@ Everything here is float64; it is the reference that resampling follows.
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from PIL import Image
-from scipy.ndimage import map_coordinates
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
@@ -217,7 +217,7 @@ def resample(
     columns = positions[..., 0] * (pixels.shape[1] / intrinsics.width) - 0.5
     out = np.empty((camera.height, camera.width, 3), np.uint8)
     for channel in range(3):
-        values = map_coordinates(
+        values = scipy.ndimage.map_coordinates(
             pixels[..., channel], [rows, columns], output=np.float32, order=3, mode="nearest"
         )
         out[..., channel] = np.clip(np.rint(values), 0, 255)

@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import scipy
 from PIL import Image
-from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
@@ -201,7 +201,7 @@ def pairs_to_match(names: Sequence[str], places: Array) -> list[workspaces.Pair]
     pairs = {(i, i + step) for i in range(count) for step in steps if i + step < count}
     if count > 80 and len(named) > 1:
         at = on_ground(places[named])
-        rows = cKDTree(at).query(at, min(len(named), NEIGHBOURS + 1))[1]
+        rows = scipy.spatial.cKDTree(at).query(at, min(len(named), NEIGHBOURS + 1))[1]
         near = zip(np.repeat(named, rows.shape[1]).tolist(), named[rows].ravel().tolist(), strict=True)
         pairs |= {(min(ends), max(ends)) for ends in near if ends[0] != ends[1]}
     return [(names[i], names[j]) for i, j in sorted(pairs)]

@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from langsplat_core.datasets.photos import ExifFacts, exif_facts
 from langsplat_core.errors import FormatError, printable_line, shortened
@@ -110,8 +109,8 @@ class Matches:
         count = len(self.names)
         joins = [(a, b) for a, b, n in self.pairs if n >= FEWEST_MATCHES and not self.located & {a, b}]
         rows, columns = np.array(joins, int).reshape(-1, 2).T
-        graph = coo_array((np.ones(len(rows), bool), (rows, columns)), (count, count))
-        _, labels = connected_components(graph, directed=False)
+        graph = scipy.sparse.coo_array((np.ones(len(rows), bool), (rows, columns)), (count, count))
+        _, labels = scipy.sparse.csgraph.connected_components(graph, directed=False)
         found: dict[int, list[int]] = {}
         for row in range(count):
             if row not in self.located:

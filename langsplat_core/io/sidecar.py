@@ -66,6 +66,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import scipy
 from msgspec import Meta
 from numpy.typing import DTypeLike
 from safetensors import SafetensorError, safe_open
@@ -408,13 +409,11 @@ def rematch_language(sidecar: Path | str, new_means: Array) -> LanguageField:
     positions may have been rounded (a compressed PLY does) but what was added or moved far gets no meaning.
     A Gaussian without a partner has confidence 0 and zero latents.
     """
-    from scipy.spatial import cKDTree  # 0.2 s to import, and only this function needs it
-
     stored = read_stored(Path(sidecar))
     field, old_rows = stored.field, np.flatnonzero(np.isfinite(stored.means).all(1))
     partner = np.full(len(new_means), -1)  # the row that is padded
     if len(old_rows):
-        points = cKDTree(stored.means[old_rows])
+        points = scipy.spatial.cKDTree(stored.means[old_rows])
         spacing = points.query(points.data[:: max(1, len(old_rows) // 10_000)], k=2)[0][:, 1]
         spacing[~np.isfinite(spacing)] = 0  # there is no second one
         new_rows = np.flatnonzero(np.isfinite(new_means).all(1))

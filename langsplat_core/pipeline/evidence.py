@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 from PIL import Image, ImageDraw, ImageFont, ImageOps
-from scipy import ndimage
-from scipy.special import betaincinv
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
@@ -73,7 +72,7 @@ class Evidence:
     @property
     def interval(self) -> tuple[float, float]:
         """The 5 % and 95 % quantiles of the same distribution."""
-        low, high = betaincinv(1 + len(self.votes), 1 + len(self.others), (0.05, 0.95))
+        low, high = scipy.special.betaincinv(1 + len(self.votes), 1 + len(self.others), (0.05, 0.95))
         return float(low), float(high)
 
     def __str__(self) -> str:
@@ -277,5 +276,5 @@ def _thumbnail(photograph: Array, mask: Array, shown: Array) -> Image.Image:
     for region, colour in ((shown, ANSWER), (mask, MASK)):
         cut = ImageOps.pad(Image.fromarray(region[part]), (SIDE, SIDE), Image.Resampling.NEAREST)
         inside = np.asarray(cut)
-        image[inside & ~ndimage.binary_erosion(inside, iterations=2, border_value=1)] = colour
+        image[inside & ~scipy.ndimage.binary_erosion(inside, iterations=2, border_value=1)] = colour
     return Image.fromarray(image)

@@ -7,7 +7,7 @@ from itertools import product
 from typing import Any, Literal
 
 import numpy as np
-from scipy.sparse import csr_matrix, vstack
+import scipy
 
 import langsplat_core
 from langsplat_core.arrays import Array
@@ -161,7 +161,7 @@ class Regions:
         """The (M,) numbers of the Gaussians that count: they are in a region at every level."""
         return np.flatnonzero(self.weights > 0)
 
-    def mixtures(self, features: Array, count: int) -> csr_matrix:
+    def mixtures(self, features: Array, count: int) -> "scipy.sparse.csr_matrix":
         """Return (R, `count`) float64 shares of each of (3, N) features in the regions of all levels."""
         counts, parts = self.counts, []
         weights = self.weights[counts].astype(np.float64)
@@ -169,10 +169,10 @@ class Regions:
             shape = len(total), count
             if len(total) * count < 8 * len(counts):  # much faster, where the table is small
                 table = np.bincount(of * np.int64(count) + own, weights, len(total) * count).reshape(shape)
-                parts.append(csr_matrix(table / total[:, None]))
+                parts.append(scipy.sparse.csr_matrix(table / total[:, None]))
             else:
-                parts.append(csr_matrix((weights / total[of], (of, own)), shape))
-        return vstack(parts, format="csr")
+                parts.append(scipy.sparse.csr_matrix((weights / total[of], (of, own)), shape))
+        return scipy.sparse.vstack(parts, format="csr")
 
     def spread(self, level: int, values: Array, others: Array) -> Array:
         """Return the (N,) of the (R,) `values` of a level's regions; in none, its own of `others` (N,)."""
@@ -240,12 +240,12 @@ def feature_sums(
     """Return (count, V) sums, over sets `of` (N,), -1: none, of `read` features (M, V), by `weights` (N,)."""
     rows = np.flatnonzero(field.known[level] & (of >= 0) & (weights > 0))
     latents, kinds = field.codec.unique(field.latents[level, rows])
-    shares = csr_matrix((weights[rows], (of[rows], kinds)), shape=(count, len(latents))).tocsc()
+    shares = scipy.sparse.csr_matrix((weights[rows], (of[rows], kinds)), shape=(count, len(latents))).tocsc()
     parts = [slice(start, start + CHUNK) for start in range(0, max(len(latents), 1), CHUNK)]
     return sum((shares[:, part] @ read(latents[part])).astype(np.float64) for part in parts)
 
 
-def chance_in(table: RegionTable, mixtures: csr_matrix, lookup: Lookup, scale: Scale) -> Array:
+def chance_in(table: RegionTable, mixtures: "scipy.sparse.csr_matrix", lookup: Lookup, scale: Scale) -> Array:
     """Return the (R, V) float32 fits of everyday phrases in the regions of all levels; see `mixtures`."""
     assert scale.everyday is not None
     means = [

@@ -11,7 +11,7 @@ from pathlib import Path
 from threading import RLock
 
 import numpy as np
-from scipy.sparse import csr_matrix
+import scipy
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
@@ -243,7 +243,7 @@ class QueryEngine:
         return Lookup(self.field if self.exact else through_cells(self.field), self.scale)
 
     @cached_property
-    def _mixtures(self) -> csr_matrix:
+    def _mixtures(self) -> "scipy.sparse.csr_matrix":
         return self.regions.mixtures(self._lookup.features, self._lookup.count + 1)
 
     @cached_property

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import scipy
 
 from langsplat_core.arrays import Array, pieces, unit
 from langsplat_core.compiled import kernel, shared_workers
@@ -161,10 +162,8 @@ def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
 
     Of those as high the middle one: which is higher by its last digits follows from the unit of lengths.
     """
-    from scipy.ndimage import uniform_filter  # here, since the window, which needs none, imports this module
-
     size = max(1, min(window, *relevancy.shape))
-    means = uniform_filter(np.asarray(relevancy, np.float64), size=size, mode="nearest")
+    means = scipy.ndimage.uniform_filter(np.asarray(relevancy, np.float64), size=size, mode="nearest")
     rows, columns = np.nonzero(means >= means.max() - TIED)
     away = (rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2
     middle = np.lexsort((columns, rows, away))[0]

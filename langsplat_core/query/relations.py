@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from langsplat_core.arrays import Array, across, affine
 from langsplat_core.query.grammar import Extreme, Side
@@ -44,9 +44,9 @@ class Body:
         return float(np.linalg.norm(self.high - self.low))
 
     @cached_property
-    def tree(self) -> cKDTree:
+    def tree(self) -> "scipy.spatial.cKDTree":
         """A k-d tree of its points."""
-        return cKDTree(self.points)
+        return scipy.spatial.cKDTree(self.points)
 
     @cached_property
     def spacing(self) -> float:

@@ -8,9 +8,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from PIL import Image, ImageDraw
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import InputError
@@ -67,9 +66,10 @@ def grow(surface: Surface, selected: Array, distance: float) -> Array:
     source = np.repeat(np.arange(len(surface.rows)), np.diff(links.indptr))
     gaps = np.linalg.norm(surface.positions[source] - surface.positions[links.indices], axis=1)
     # A stored zero is no link to the sparse format's walkers: coincident points are at the least distance.
-    lengths = csr_matrix((np.maximum(gaps, 1e-12), links.indices, links.indptr), shape=links.shape)
+    lengths = scipy.sparse.csr_matrix((np.maximum(gaps, 1e-12), links.indices, links.indptr), links.shape)
     seeds = np.flatnonzero(reached)
-    away = dijkstra(lengths, directed=False, indices=seeds, limit=distance, min_only=True)
+    walk = scipy.sparse.csgraph.dijkstra
+    away = walk(lengths, directed=False, indices=seeds, limit=distance, min_only=True)
     return _with_reached(surface, selected, np.isfinite(away))
 
 

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from scipy import sparse
+import scipy
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
@@ -74,13 +74,13 @@ class LiftingView(View):
         """Return (N,) blending weight of each Gaussian summed over the image, in pixels: ``W^T 1``."""
         return self.gather(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
 
-    def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> sparse.csr_matrix:
+    def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> "scipy.sparse.csr_matrix":
         """Sum (L, H, W) int32 labels below `count`, -1 for none, into (N, count) ``W^T onehot``, pixels.
 
         A pixel counts once for every label that it has in any map. Entries of at most `least` are left out.
         """
         self.check_labels(maps, count)
-        columns = [sparse.csr_matrix((self.count, 0), dtype=np.float32)]
+        columns = [scipy.sparse.csr_matrix((self.count, 0), dtype=np.float32)]
         for start in range(0, count, CHANNELS_AT_ONCE):
             size = min(CHANNELS_AT_ONCE, count - start)
             image = np.zeros((self.camera.height * self.camera.width, size), np.float32)
@@ -88,8 +88,8 @@ class LiftingView(View):
                 inside = np.flatnonzero((labels >= start) & (labels < start + size))
                 image[inside, labels[inside] - start] = 1
             weights = self.gather(image.reshape(self.camera.height, self.camera.width, size))
-            columns.append(sparse.csr_matrix(np.where(weights > least, weights, 0).astype(np.float32)))
-        return sparse.hstack(columns, format="csr")
+            columns.append(scipy.sparse.csr_matrix(np.where(weights > least, weights, 0).astype(np.float32)))
+        return scipy.sparse.hstack(columns, format="csr")
 
     def check_labels(self, maps: Array, count: int) -> None:
         """ValueError for maps that `gather_labels` cannot take."""

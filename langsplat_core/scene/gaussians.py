@@ -4,14 +4,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from math import isqrt
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from scipy import sparse
-
-from langsplat_core.arrays import Array, check_array, logit, pieces, rotation_matrices, sigmoid
+from langsplat_core.arrays import Array, check_array, logit, pieces, quaternions, rotation_matrices, sigmoid
 from langsplat_core.config import INRIA
 from langsplat_core.progress import Progress, silent
 
@@ -132,11 +128,14 @@ class Merged:
     """M Gaussians that stand for N, and the weights of the N in each."""
 
     gaussians: Gaussians
-    weights: "sparse.csr_matrix"  # (M, N) float32: what each is made of; rows sum to 1
+    sources: Array  # (M, GROUP) rows of the N that each is made of
+    weights: Array  # (M, GROUP) float32 weights of these; rows sum to 1
 
     def values(self, values: Array | None) -> Array | None:
         """Return (M, C) float32 means of the original Gaussians' (N, C) values."""
-        return None if values is None else self.weights @ np.asarray(values, np.float32)
+        if values is None:
+            return None
+        return np.einsum("mg,mgc->mc", self.weights, np.asarray(values, np.float32)[self.sources])
 
 
 # Gaussians, (m, GROUP) rows of the original that each is made of, and (m, GROUP) weights of these.
@@ -153,12 +152,8 @@ def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
         progress("merging", start / len(grouped))
         parts += _merge(gaussians, grouped[start : start + BLOCK])
     found, sources, weights = zip(*parts, strict=True)
-    entries = np.concatenate(weights).astype(np.float32).ravel(), np.concatenate(sources).ravel()
-    starts = np.arange(0, len(entries[0]) + 1, GROUP)
-    from scipy import sparse  # here, since every program that opens a scene imports this module
-
-    matrix = sparse.csr_matrix((*entries, starts), shape=(len(starts) - 1, len(gaussians)))
-    return Merged(join_gaussians(found), matrix)
+    shares = np.concatenate(weights).astype(np.float32)
+    return Merged(join_gaussians(found), np.concatenate(sources), shares)
 
 
 def along_curve(points: Array) -> Array:
@@ -217,8 +212,5 @@ def _ellipsoids(covariances: Array) -> tuple[Array, Array, Array]:
     """Return (G, 3) logarithms of scales, (G, 4) quaternions wxyz and (G,) `_area` of covariances."""
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, no reflection
-    from scipy.spatial.transform import Rotation
-
-    quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1) if len(axes) else np.zeros((0, 4))
     scales = np.sqrt(np.maximum(variances, _TINY))
-    return np.minimum(np.log(scales), 80.0), quats, _area(scales)
+    return np.minimum(np.log(scales), 80.0), quaternions(axes), _area(scales)

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
+import scipy
 
 from langsplat_core.arrays import Array, pieces, sigmoid
 from langsplat_core.compiled import kernel, plain, shared_workers
@@ -31,7 +30,7 @@ class Surface:
     positions: Array  # (M, 3) float64 their means, world units
     neighbours: Array  # (M, k) int32 numbers in [0, M)
     weights: Array  # (M,) float32 opacity
-    links: csr_matrix  # (M, M) who is next to whom on one surface; symmetric
+    links: "scipy.sparse.csr_matrix"  # (M, M) who is next to whom on one surface; symmetric
     anchors: Array  # (N,) int32 number of every Gaussian, if it is too faint of the nearest; -1: none is near
 
     @cached_property
@@ -80,11 +79,12 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
     rows = np.flatnonzero(every)
     k = min(NEIGHBOURS, len(rows))
     if k == 0:
-        nothing = np.zeros((0, 1), np.int32), np.zeros(0, np.float32), csr_matrix((0, 0), dtype=bool)
-        return Surface(rows, np.zeros((0, 3)), *nothing, np.full(len(valid), -1, np.int32))
-    rows = rows[cKDTree(gaussians.means[rows].astype(np.float64)).indices]  # leaf by leaf: near ones meet
+        nothing = scipy.sparse.csr_matrix((0, 0), dtype=bool), np.full(len(valid), -1, np.int32)
+        return Surface(rows, np.zeros((0, 3)), np.zeros((0, 1), np.int32), np.zeros(0, np.float32), *nothing)
+    # Leaf by leaf of a tree: near ones meet.
+    rows = rows[scipy.spatial.cKDTree(gaussians.means[rows].astype(np.float64)).indices]
     positions = gaussians.means[rows].astype(np.float64)
-    tree = cKDTree(positions)
+    tree = scipy.spatial.cKDTree(positions)
     neighbours, near = np.empty((len(rows), k), np.int32), np.empty((len(rows), k), bool)
     reach, middle = np.empty(len(rows)), slice((k - 1) // 2, k // 2 + 1)
     for part in pieces(len(rows), SOME):
@@ -110,13 +110,13 @@ def surface_areas(gaussians: Gaussians) -> Array:
     return np.minimum(areas, np.quantile(areas, 0.99)) if len(areas) else areas
 
 
-def _links(neighbours: Array, near: Array) -> csr_matrix:
+def _links(neighbours: Array, near: Array) -> "scipy.sparse.csr_matrix":
     starts = np.zeros(len(neighbours) + 1, np.int32)
     np.cumsum(near.sum(1), out=starts[1:])
     ends = neighbours[near]
-    one_way = csr_matrix((np.ones(len(ends), bool), ends, starts), shape=2 * (len(neighbours),))
+    one_way = scipy.sparse.csr_matrix((np.ones(len(ends), bool), ends, starts), shape=2 * (len(neighbours),))
     one_way.sort_indices()
-    return (one_way + one_way.T).tocsr()
+    return (one_way + one_way.T).copy()  # a sum keeps room for twice as much
 
 
 @partial(kernel, shapes="chosen K, neighbours M k, rows M, weights M, values N, smoothed K")

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from langsplat_core.arrays import Array, across, affine, pieces, unit
+from langsplat_core.arrays import Array, across, affine, pieces, quaternions, unit
 from langsplat_core.errors import InputError
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
 from langsplat_core.scene.scene import FARTHEST, Camera, Scene, origin_of
@@ -60,7 +60,7 @@ class Similarity:
 
     def quaternions(self, quats_wxyz: Array) -> Array:
         """Return (N, 4) rotations followed by this one, float64, of the same lengths; zero stays zero."""
-        w, x, y, z = rotation_quaternion(self.rotation)
+        w, x, y, z = quaternions(self.rotation)
         left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
         with np.errstate(invalid="ignore"):
             turned: Array = np.asarray(quats_wxyz, np.float64) @ left.T
@@ -147,14 +147,6 @@ def turned_origin(rotation: Array, origin: Array) -> Array:
     """
     near = np.rint(rotation)
     return np.asarray((near if np.abs(rotation - near).max() < 0.1 else rotation) @ origin)
-
-
-def rotation_quaternion(rotation: Array) -> Array:
-    """Return the (4,) unit quaternion wxyz, w >= 0, of a (3, 3) rotation."""
-    from scipy.spatial.transform import Rotation  # here, since every program that opens a scene comes by
-
-    quat: Array = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
-    return quat
 
 
 def transform_gaussians(gaussians: Gaussians, to: Similarity) -> Gaussians:

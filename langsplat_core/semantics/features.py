@@ -15,8 +15,8 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 from urllib.parse import quote
 
 import numpy as np
+import scipy
 from PIL import Image
-from scipy import ndimage
 
 from langsplat_core.arrays import Array, check_array, unit
 from langsplat_core.errors import FormatError, InputError
@@ -186,7 +186,7 @@ def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Arr
         return encoder.encode_regions(image, label_maps)
     crops = np.zeros((int(label_maps.max()) + 1, encoder.image_size, encoder.image_size, 3), np.uint8)
     for labels in label_maps:
-        for row, box in enumerate(ndimage.find_objects(labels + 1)):
+        for row, box in enumerate(scipy.ndimage.find_objects(labels + 1)):
             if box is not None:  # a row of another level
                 crops[row] = masked_crop(image[box], labels[box] == row, encoder.image_size)
     number = dict[bytes, int]()  # of each picture: many a part is a whole, too

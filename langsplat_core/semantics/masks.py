@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
+import scipy
 from PIL import Image
-from scipy import ndimage
 
 from langsplat_core.arrays import Array, pieces
 from langsplat_core.config import MaskConfig
@@ -114,13 +114,13 @@ def clean_regions(mask: Array, min_region: int) -> tuple[Array, bool]:
     window = np.s_[max(top - 1, 0) : bottom + 1, max(left - 1, 0) : right + 1]
     if ((beyond > 0) & (beyond < min_region)).any():  # what lies beyond the box may itself be a small hole
         window, beyond = np.s_[0:height, 0:width], np.zeros(4, int)
-    holes, count = ndimage.label(~mask[window], EIGHT)
+    holes, count = scipy.ndimage.label(~mask[window], EIGHT)
     small = np.bincount(holes.ravel(), minlength=count + 1) < min_region
     for side, goes_on in zip((holes[0], holes[-1], holes[:, 0], holes[:, -1]), beyond > 0, strict=True):
         if goes_on:
             small[side] = False
     small[0] = False  # the mask itself
-    islands, count = ndimage.label(mask[window] | small[holes], EIGHT)
+    islands, count = scipy.ndimage.label(mask[window] | small[holes], EIGHT)
     sizes = np.bincount(islands.ravel(), minlength=count + 1)
     keep = sizes >= min_region
     if not keep[1:].any():

@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.arrays import Array, quaternions, rotation_matrices, sigmoid
 from langsplat_core.scene import Camera, Gaussians, Intrinsics, Scene, look_at
 
 
@@ -186,7 +185,7 @@ class OrbitCamera:
 
 def _about(axis: Array, angle: float) -> Array:
     """Return (3, 3) right-handed rotation by `angle` radians about a unit axis."""
-    return Rotation.from_rotvec(np.asarray(axis) * angle).as_matrix()
+    return rotation_matrices(np.append(math.cos(angle / 2), math.sin(angle / 2) * np.asarray(axis)))
 
 
 def orbit(view: OrbitCamera, yaw: float, pitch: float) -> OrbitCamera:
@@ -298,10 +297,12 @@ def between(start: OrbitCamera, end: OrbitCamera, t: float) -> OrbitCamera:
     if t >= 1:
         return end
     ease = t * t * (3 - 2 * t)
-    turn = Rotation.from_matrix(end.rotation @ start.rotation.T).as_rotvec() * ease
+    w, *axis = quaternions(end.rotation @ start.rotation.T)
+    length = float(np.linalg.norm(axis))
+    turn = _about(np.array(axis) / max(length, 1e-30), 2 * math.atan2(length, w) * ease)
     return replace(
         end,
-        rotation=Rotation.from_rotvec(turn).as_matrix() @ start.rotation,
+        rotation=turn @ start.rotation,
         target=start.target + ease * (end.target - start.target),
         distance=start.distance * (end.distance / start.distance) ** ease,
     )

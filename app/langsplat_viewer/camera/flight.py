@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
@@ -172,40 +172,39 @@ class _Curve:
     """The curve through two or more keyframes."""
 
     def __init__(self, keyframes: tuple[Keyframe, ...], closed: bool) -> None:
-        # 12 MB of modules, for those who record a path.
-        from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
-
         self._times = np.array([key.seconds for key in keyframes], np.float64)
         positions = np.array([key.pose.position for key in keyframes], np.float64)
         least = SAME * np.abs(positions).max()
         slopes = tangents(self._times, np.diff(positions, axis=0), least, closed)
-        self._positions = CubicHermiteSpline(self._times, positions, slopes)
+        self._positions = scipy.interpolate.CubicHermiteSpline(self._times, positions, slopes)
         # Camera to world: a product from the right is then a turn as the camera feels it.
-        self._rotations = Rotation.from_matrix(np.array([key.pose.rotation.T for key in keyframes]))
+        rotation = scipy.spatial.transform.Rotation
+        self._rotations = rotation.from_matrix(np.array([key.pose.rotation.T for key in keyframes]))
         steps = (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
         rates = tangents(self._times, steps, SAME, closed)
         thirds = np.diff(self._times)[:, None] / 3
         self._first, self._last = rates[:-1] * thirds, rates[1:] * thirds
-        ends = Rotation.from_rotvec(-self._first), Rotation.from_rotvec(-self._last)
-        self._middle = (ends[0] * Rotation.from_rotvec(steps) * ends[1]).as_rotvec()
+        ends = rotation.from_rotvec(-self._first), rotation.from_rotvec(-self._last)
+        self._middle = (ends[0] * rotation.from_rotvec(steps) * ends[1]).as_rotvec()
         # The focal length, which grows evenly when one zooms; its curve stays within the keyframes.
         focal = [-math.log(math.tan(math.radians(key.pose.fov_degrees) / 2)) for key in keyframes]
-        self._focal = PchipInterpolator(self._times, focal)
+        self._focal = scipy.interpolate.PchipInterpolator(self._times, focal)
         spans = np.array([key.pose.span or np.nan for key in keyframes], np.float64)
         self._parallel = flat = np.isfinite(spans)
         if flat.any():  # a gap has the last one before it, at the start the next one
             spans = spans[np.flatnonzero(flat)[np.maximum(np.cumsum(flat) - 1, 0)]]
-        self._span = PchipInterpolator(self._times, np.log(np.nan_to_num(spans, nan=1.0)))
+        self._span = scipy.interpolate.PchipInterpolator(self._times, np.log(np.nan_to_num(spans, nan=1.0)))
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
         times = np.clip(seconds, self._times[0], self._times[-1])
         row = np.clip(np.searchsorted(self._times, times, "right") - 1, 0, len(self._times) - 2)
         u = ((times - self._times[row]) / np.diff(self._times)[row])[:, None]
+        turn = scipy.spatial.transform.Rotation.from_rotvec
         turned = (
             self._rotations[row]
-            * Rotation.from_rotvec((1 - (1 - u) ** 3) * self._first[row])
-            * Rotation.from_rotvec((3 * u**2 - 2 * u**3) * self._middle[row])
-            * Rotation.from_rotvec(u**3 * self._last[row])
+            * turn((1 - (1 - u) ** 3) * self._first[row])
+            * turn((3 * u**2 - 2 * u**3) * self._middle[row])
+            * turn(u**3 * self._last[row])
         )
         fov = np.degrees(2 * np.arctan(np.exp(-self._focal(times))))
         parallel = self._parallel[np.searchsorted(self._times, times, "right") - 1]  # till the next keyframe

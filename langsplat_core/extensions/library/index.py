@@ -24,9 +24,9 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 import numpy as np
 import platformdirs
+import scipy
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
-from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
@@ -246,8 +246,8 @@ def _columns(engine: QueryEngine) -> Columns:
     mixtures = []
     for level, (totals, first) in enumerate(zip(regions.totals, firsts, strict=False)):
         rows = np.flatnonzero((number[level] >= 0) & (regions.weights > 0))
-        where = regions.everywhere[level, rows], number[level, rows]
-        shares = csr_matrix((regions.weights[rows], where), shape=(len(totals), len(latents))).tocoo()
+        entries = regions.weights[rows], (regions.everywhere[level, rows], number[level, rows])
+        shares = scipy.sparse.csr_matrix(entries, (len(totals), len(latents))).tocoo()
         mixtures.append((shares.data / totals[shares.row], shares.col, shares.row + first))
     shares, words, rows = (np.concatenate(part) for part in zip(*mixtures, strict=True))
     codewords = np.rint(vectors / steps[:, None])

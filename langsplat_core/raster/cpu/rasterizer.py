@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from weakref import finalize
 
 import numpy as np
-from scipy import sparse
+import scipy
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import Workers, helper, kernel, plain, shared_workers
@@ -197,7 +197,7 @@ def _gather_regions(
 
 def label_weights(
     tiles: Tiles, order: Array, workers: Workers, maps: Array, shape: tuple[int, int], least: float
-) -> sparse.csr_matrix:
+) -> "scipy.sparse.csr_matrix":
     """Map (L, H, W) int32 maps, labels -1 for none to float32 weights, pixels, of `shape` (N, labels).
 
     `order`: (M,) rows of the drawn Gaussians. Entries of at most `least` are left out.
@@ -212,11 +212,12 @@ def label_weights(
     # Sums of each intersection by label, added up in float64 in the order of a Gaussian's intersections.
     columns = [np.tile(met.labels[t, : lines[t]], here[t]) for t in range(number)]
     ends = np.concatenate([[0], np.cumsum(np.repeat(lines, here))])
-    by_intersection = sparse.csr_matrix((sums, np.concatenate(columns), ends), (len(tiles.met), shape[1]))
+    entries = sums, np.concatenate(columns), ends
+    by_intersection = scipy.sparse.csr_matrix(entries, (len(tiles.met), shape[1]))
     by_intersection.eliminate_zeros()
     drawn, ones = len(order), np.ones(len(tiles.slots))
-    met_by = sparse.csr_matrix((ones, tiles.slots, tiles.firsts), (drawn, len(ones)))
-    rows = sparse.csr_matrix((np.ones(drawn), (order, np.arange(drawn))), (shape[0], drawn))
+    met_by = scipy.sparse.csr_matrix((ones, tiles.slots, tiles.firsts), (drawn, len(ones)))
+    rows = scipy.sparse.csr_matrix((np.ones(drawn), (order, np.arange(drawn))), (shape[0], drawn))
     weights = rows @ (met_by @ by_intersection)
     weights.data[weights.data <= least] = 0
     weights.eliminate_zeros()
@@ -333,7 +334,7 @@ class CpuView(LiftingView):
             values[:, start : start + CHANNELS_AT_ONCE] = out
         return values
 
-    def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> sparse.csr_matrix:
+    def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> "scipy.sparse.csr_matrix":
         self.check_labels(maps, count)
         labels = np.require(maps, np.int32, ["C", "W"])
         return label_weights(self.tiles, self.order, self.workers, labels, (self.count, count), least)

@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_matrix
+import scipy
 
 from langsplat_core.arrays import Array, pieces, unit
 from langsplat_core.config import CodecConfig, check_settings
@@ -331,8 +331,8 @@ def _badly_fitted(distance: Array, count: int, generator: np.random.Generator) -
 
 def _means(vectors: Array, nearest: Array, count: int) -> Array:
     """Return (K, D) float32 directions of the sums over each centre's vectors."""
-    places = nearest, np.arange(len(vectors))
-    return unit(csr_matrix((np.ones(len(vectors), np.float32), places), (count, len(vectors))) @ vectors)
+    entries = np.ones(len(vectors), np.float32), (nearest, np.arange(len(vectors)))
+    return unit(scipy.sparse.csr_matrix(entries, (count, len(vectors))) @ vectors)
 
 
 # Colours of codewords by which neighbouring things are told apart.
@@ -360,7 +360,7 @@ def contrasting_colours(field: LanguageField, tree: Tree, surface: Surface) -> A
         has_say = sizes[number] >= LEAST
         weights += np.bincount(codes[counted][has_say], 1 / sizes[number][has_say], len(vectors))
         shape = (len(names), len(vectors))
-        shares = csr_matrix((1 / sizes[number], (number, codes[counted])), shape=shape)
+        shares = scipy.sparse.csr_matrix((1 / sizes[number], (number, codes[counted])), shape=shape)
         place = np.full(int(node.max(initial=0)) + 1, -1)
         place[names] = np.arange(len(names))
         beside = np.sort(np.where(node[ends] == NO_NODE, -1, place[node[ends]]), axis=0)

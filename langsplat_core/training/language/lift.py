@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
@@ -77,7 +76,7 @@ class MaskWeights:
         firsts = np.arange(0, self.count + self.block_size, self.block_size)
         return [np.searchsorted(view["row"], firsts) for view in self.pairs]
 
-    def block(self, number: int, groups: MaskGroups) -> sparse.csr_matrix:
+    def block(self, number: int, groups: MaskGroups) -> "scipy.sparse.csr_matrix":
         """Return the (n, 3 G) weights, in pixels, of a block's Gaussians in the groups, level after level."""
         first, last = self.blocks[number]
         rows, columns, weights = [], [], []
@@ -89,23 +88,23 @@ class MaskWeights:
             weights.append(part["weight"])
         shape = (last - first, len(LEVELS) * len(groups.vectors))
         entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
-        return sparse.coo_matrix(entries, shape).tocsr()  # which adds up what falls on one place
+        return scipy.sparse.coo_matrix(entries, shape).tocsr()  # which adds up what falls on one place
 
-    def sums(self, sets: Array, size: int, counts: Sequence[int]) -> tuple[sparse.csr_matrix, Array]:
+    def sums(self, sets: Array, size: int, counts: Sequence[int]) -> "tuple[scipy.sparse.csr_matrix, Array]":
         """Return the (size, masks of all views) float32 pixels that each set of Gaussians paints.
 
         And the int32 view and level of each mask as one number, 3 view + level. sets: (N,) set of each
         Gaussian, -1 for those of none; counts: number of masks of each view.
         """
-        views, labelling = [sparse.csr_matrix((size, 0))], [np.zeros(0, np.int32)]
+        views, labelling = [scipy.sparse.csr_matrix((size, 0))], [np.zeros(0, np.int32)]
         for view, (pairs, count) in enumerate(zip(self.pairs, counts, strict=True)):
             within = pairs[sets[pairs["row"]] >= 0]
             place = sets[within["row"]], within["mask"]
-            painted = sparse.coo_matrix((within["weight"].astype(np.float64), place), (size, count))
+            painted = scipy.sparse.coo_matrix((within["weight"].astype(np.float64), place), (size, count))
             views.append(painted.tocsr())  # which adds up what falls on one place
             labelling.append(np.zeros(count, np.int32))
             labelling[-1][within["mask"]] = len(LEVELS) * view + within["level"]
-        sums = sparse.hstack(views, "csr", np.float32)
+        sums = scipy.sparse.hstack(views, "csr", np.float32)
         sums.sort_indices()
         return sums, np.concatenate(labelling)
 
@@ -156,7 +155,7 @@ def find_instances(
     """
     view_of = np.repeat(np.arange(len(counts)), counts)
     claims = _claims(mask_weights, np.cumsum([0, *counts]), level, sample)
-    _, found = connected_components(_overlapping(claims, view_of), directed=False)
+    _, found = scipy.sparse.csgraph.connected_components(_overlapping(claims, view_of), directed=False)
     claiming = np.flatnonzero(np.diff(claims.tocsc().indptr) > 0)
     names, numbers = np.unique(found[claiming], return_inverse=True)
     size = len(names)
@@ -177,7 +176,7 @@ def find_instances(
     return np.asarray(rank[instances])
 
 
-def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> sparse.csr_matrix:
+def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> "scipy.sparse.csr_matrix":
     """(n, M) ones where a mask holds more than half of a sampled Gaussian's weight in its view and level."""
     chosen = np.full(mask_weights.count, -1)
     sample = np.random.default_rng(0).permutation(mask_weights.count)[:most]
@@ -192,22 +191,23 @@ def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> 
         columns.append(first + here["mask"][strong].astype(np.int64))
     places = np.concatenate(rows), np.concatenate(columns)
     ones = np.ones(len(places[0]), np.float32)
-    return sparse.csr_matrix((ones, places), (len(sample), int(firsts[-1])))
+    return scipy.sparse.csr_matrix((ones, places), (len(sample), int(firsts[-1])))
 
 
-def _overlapping(claims: sparse.csr_matrix, view_of: Array) -> sparse.csr_matrix:
+def _overlapping(claims: "scipy.sparse.csr_matrix", view_of: Array) -> "scipy.sparse.csr_matrix":
     """Return (M, M) links between masks of different views whose overlap over union is large."""
     count, views = len(view_of), int(view_of.max(initial=-1)) + 1
     both = (claims.T @ claims).tocoo()
     a, b = both.row, both.col
-    of_view = sparse.csr_matrix((np.ones(count, np.float32), (np.arange(count), view_of)), (count, views))
+    entries = np.ones(count, np.float32), (np.arange(count), view_of)
+    of_view = scipy.sparse.csr_matrix(entries, (count, views))
     seen = claims @ of_view  # (n, V): is the Gaussian claimed in the view at all
     visible = (claims.T @ seen).tocsr()  # (M, V): Gaussians of the mask that the view sees
     union = -both.data
     for mask, other in ((a, b), (b, a)):
         union = union + np.asarray(visible[mask, view_of[other]]).ravel()
     same = (view_of[a] != view_of[b]) & (both.data > SAME * union)
-    return sparse.csr_matrix((np.ones(int(same.sum()), bool), (a[same], b[same])), (count, count))
+    return scipy.sparse.csr_matrix((np.ones(int(same.sum()), bool), (a[same], b[same])), (count, count))
 
 
 # Votes of photographs for the nodes of a scene's tree.
@@ -237,7 +237,7 @@ def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) ->
     return votes
 
 
-def _descendants(tree: Tree) -> sparse.csr_matrix:
+def _descendants(tree: Tree) -> "scipy.sparse.csr_matrix":
     """Return (K, K) float32, 1 where the column's node is the row's or a descendant of it."""
     rows, columns = [np.arange(tree.count)], [np.arange(tree.count)]
     while len(rows[-1]):
@@ -245,7 +245,7 @@ def _descendants(tree: Tree) -> sparse.csr_matrix:
         rows.append(above[above != NO_NODE])
         columns.append(columns[-1][above != NO_NODE])
     places = np.concatenate(rows), np.concatenate(columns)
-    return sparse.csr_matrix((np.ones(len(places[0]), np.float32), places), (tree.count, tree.count))
+    return scipy.sparse.csr_matrix((np.ones(len(places[0]), np.float32), places), (tree.count, tree.count))
 
 
 # Lifting by mask weights.
@@ -255,16 +255,16 @@ def lift_sample(
     mask_weights: MaskWeights, groups: MaskGroups, rows: Array, robust: bool, progress: Progress = silent
 ) -> tuple[Array, Array]:
     """Lift onto the Gaussians at `rows`, which ascend; see `lift_weights`."""
-    parts = [sparse.csr_matrix((0, len(LEVELS) * len(groups.vectors)), dtype=np.float32)]
+    parts = [scipy.sparse.csr_matrix((0, len(LEVELS) * len(groups.vectors)), dtype=np.float32)]
     for number, (first, last) in enumerate(mask_weights.blocks):
         inside = rows[(rows >= first) & (rows < last)] - first
         if len(inside):
             parts.append(mask_weights.block(number, groups)[inside])
         progress("averaging the masks of a sample", last / mask_weights.count)
-    return lift_weights(sparse.vstack(parts, "csr"), groups.vectors, robust)
+    return lift_weights(scipy.sparse.vstack(parts, "csr"), groups.vectors, robust)
 
 
-def lift_weights(weights: sparse.csr_matrix, vectors: Array, robust: bool) -> tuple[Array, Array]:
+def lift_weights(weights: "scipy.sparse.csr_matrix", vectors: Array, robust: bool) -> tuple[Array, Array]:
     """Return (3, n, D) float32 unit vectors, zero where unobserved, and (3, n) float32 confidence.
 
     Confidence is the total blending weight, in pixels. weights: (n, 3 G) of n Gaussians in G groups of masks,

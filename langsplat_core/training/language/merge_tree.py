@@ -24,8 +24,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.spatial import cKDTree
+import scipy
 
 from langsplat_core.arrays import Array, pieces
 from langsplat_core.compiled import kernel, shared_workers
@@ -103,7 +102,7 @@ class MergeTree:
 class Patches:
     """The masks, colours, areas and borders of P patches, from which they are merged."""
 
-    masses: sparse.csr_matrix  # (P, masks of all views) float32 pixels, columns sorted
+    masses: "scipy.sparse.csr_matrix"  # (P, masks of all views) float32 pixels, columns sorted
     labelling: Array  # (masks of all views,) int32 view and level of each mask, counted through
     colours: Array  # (P, 3) mean chromaticity
     areas: Array  # (P,) > 0
@@ -191,7 +190,7 @@ def _compare(
 def link_concavity(surface: Surface, eyes: Array) -> Array:
     """Return (E,) in [0, 1], how far normals at ends lean together; eyes: (V, 3), which tell the outside."""
     normals = _normals(surface)
-    away = surface.positions - eyes[cKDTree(eyes).query(surface.positions)[1]]
+    away = surface.positions - eyes[scipy.spatial.cKDTree(eyes).query(surface.positions)[1]]
     normals[(normals * away).sum(1) > 0] *= -1
     a, b = surface.ends
     along = surface.positions[b] - surface.positions[a]
@@ -239,7 +238,7 @@ class _Merger:
         self._columns, self._values = np.split(masses.indices, ends), np.split(masses.data, ends)
         shape = len(patches.areas), int(labelling.max(initial=-1)) + 1
         entries = masses.data, labelling[masses.indices], masses.indptr
-        self._pixels: list[Any] = list(sparse.csr_matrix(entries, shape).toarray())
+        self._pixels: list[Any] = list(scipy.sparse.csr_matrix(entries, shape).toarray())
         self._areas: list[Any] = patches.areas.tolist()
         self._colours: list[Any] = list(patches.colours * patches.areas[:, None])
         self._plain = PLAIN * float(patches.areas.sum())

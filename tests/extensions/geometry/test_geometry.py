@@ -19,7 +19,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from langsplat_core.arrays import Array, rotation_matrices, unit
+from langsplat_core.arrays import Array, quaternions, rotation_matrices, unit
 from langsplat_core.cli.app import parse
 from langsplat_core.errors import BackendError, FormatError, InputError
 from langsplat_core.extensions.geometry.commands import read_transform
@@ -55,7 +55,6 @@ from langsplat_core.scene.transform import (
     Similarity,
     moving,
     place_scene,
-    rotation_quaternion,
     transform_scene,
     turning,
 )
@@ -74,7 +73,7 @@ def ball(radius: float = 1.0, count: int = 3000) -> Scene:
     index = np.arange(count) + 0.5
     z, turn = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
     normals = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], 1)
-    quats = [rotation_quaternion(turning(AXES["z"], normal).rotation) for normal in normals]
+    quats = [quaternions(turning(AXES["z"], normal).rotation) for normal in normals]
     log_scales = np.tile(np.log(radius * np.array([0.04, 0.04, 0.0004])), (count, 1))
     sh = np.tile([1.0, -1.0, 0.0], (count, 1, 1))
     return Scene(Gaussians(radius * normals, log_scales, np.array(quats), np.full(count, 5.0), sh))
