@@ -20,6 +20,7 @@ from langsplat_core.compiled import helper, kernel
 from langsplat_core.raster.cpu import lanes as ln
 from langsplat_core.raster.cpu import projection as cp
 from langsplat_core.raster.cpu import tiles as tiling
+from langsplat_core.raster.cpu.lanes import Lanes
 from langsplat_core.raster.cpu.tiles import PIXELS, TILE, Tiles
 
 # Columns of the partial sums (two are unused); the gradient by the values follows them.
@@ -193,20 +194,28 @@ def _clear(i: int, out: GaussianGradients) -> None:
     out.means_px[i] = 0
 
 
+# From here on eight Gaussians at once: numbers are lanes, vectors tuples of three.
+
+
 @helper
-def _footprint_gradient(g: Array, moments: Array) -> tuple[float, float, cp.Point]:
-    """Gradient by the 2D mean, and by the 2D covariance (a symmetric matrix's xx, xy, yy).
+def _footprint_gradient(g: Array, ranks: Array, added: Array, each: Array) -> Any:
+    """Gradients by opacity * d/d opacity, the 2D mean, and the 2D covariance (symmetric: xx, xy, yy).
 
     With M = [[a, -a k], [0, c]] and u = (w, v) = M (pixel - mean):
     ln alpha = const - ln2 |u|^2, so d/d mean = 2 ln2 M^T u and d/d cov = 2 ln2^2 M^T u u^T M.
     """
-    a, b, c = g[cp.FACTOR_A], -g[cp.FACTOR_A] * g[cp.FACTOR_K], g[cp.FACTOR_C]
-    ww, wv, vv = moments[QWW], moments[QWV], moments[QVV]
-    twice = 2 * cp.LN2
+    a, c = ln.gathered(g, ranks, 0, cp.FACTOR_A), ln.gathered(g, ranks, 0, cp.FACTOR_C)
+    b, twice = -a * ln.gathered(g, ranks, 0, cp.FACTOR_K), 2 * cp.LN2
+    w, v, ww = (
+        ln.gathered(added, each, 0, QW),
+        ln.gathered(added, each, 0, QV),
+        ln.gathered(added, each, 0, QWW),
+    )
+    wv, vv = ln.gathered(added, each, 0, QWV), ln.gathered(added, each, 0, QVV)
     scale = twice * cp.LN2
     return (
-        twice * a * moments[QW],
-        twice * (b * moments[QW] + c * moments[QV]),
+        ln.gathered(added, each, 0, Q),
+        (twice * a * w, twice * (b * w + c * v)),
         (
             scale * a * a * ww,
             scale * a * (b * ww + c * wv),
@@ -216,13 +225,14 @@ def _footprint_gradient(g: Array, moments: Array) -> tuple[float, float, cp.Poin
 
 
 @helper
-def _with_compensation(by_covariance: cp.Point, a: Array, camera: cp.KernelCamera, q: float) -> cp.Point:
+def _with_compensation(by_covariance: cp.Point, a: Any, camera: cp.KernelCamera, q: Lanes) -> cp.Point:
     """Add the gradient of the factor sqrt(det fitted / det dilated) to that by the covariance."""
-    xx, xy, yy, det, fitted = cp.covariance(a, camera.dilation, camera.fitted)
-    if camera.fitted >= camera.dilation or fitted / det <= cp.COMPENSATION_MIN:
+    if camera.fitted >= camera.dilation:
         return by_covariance
+    xx, xy, yy, det, fitted = cp.covariance(a, camera.dilation, camera.fitted)
+    least = cp.COMPENSATION_MIN * det
+    half, fitted = ln.where_at_least(least, fitted, 0.0, 0.5 * q), max(least, fitted)
     gxx, gxy, gyy = by_covariance
-    half = 0.5 * q
     more = camera.dilation - camera.fitted
     return (
         gxx + half * ((yy - more) / fitted - yy / det),
@@ -232,68 +242,98 @@ def _with_compensation(by_covariance: cp.Point, a: Array, camera: cp.KernelCamer
 
 
 @helper
-def _quat_gradient(quat: Array, inverse: float, d: Array, out: Array) -> None:
-    """Fill `out`, the gradient by the raw quaternion, from `d`, that by its rotation matrix."""
+def _quat_gradient(quat: Any, inverse: Lanes, d: Any) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """Return the gradient by the raw quaternion from `d`, that by its rotation matrix (rows)."""
+    (d00, d01, d02), (d10, d11, d12), (d20, d21, d22) = d
     w, x, y, z = quat[0] * inverse, quat[1] * inverse, quat[2] * inverse, quat[3] * inverse
-    xy, xz, yz = d[0, 1] + d[1, 0], d[0, 2] + d[2, 0], d[1, 2] + d[2, 1]
-    by_x, by_y, by_z = d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]  # by the axis of the turn
+    xy, xz, yz = d01 + d10, d02 + d20, d12 + d21
+    by_x, by_y, by_z = d21 - d12, d02 - d20, d10 - d01  # by the axis of the turn
     gw = 2 * (z * by_z + y * by_y + x * by_x)
-    gx = 2 * (y * xy + z * xz + w * by_x - 2 * x * (d[1, 1] + d[2, 2]))
-    gy = 2 * (x * xy + z * yz + w * by_y - 2 * y * (d[0, 0] + d[2, 2]))
-    gz = 2 * (x * xz + y * yz + w * by_z - 2 * z * (d[0, 0] + d[1, 1]))
+    gx = 2 * (y * xy + z * xz + w * by_x - 2 * x * (d11 + d22))
+    gy = 2 * (x * xy + z * yz + w * by_y - 2 * y * (d00 + d22))
+    gz = 2 * (x * xz + y * yz + w * by_z - 2 * z * (d00 + d11))
     along = gw * w + gx * x + gy * y + gz * z
-    out[0], out[1] = (gw - along * w) * inverse, (gx - along * x) * inverse
-    out[2], out[3] = (gy - along * y) * inverse, (gz - along * z) * inverse
+    gw, gx, gy, gz = gw - along * w, gx - along * x, gy - along * y, gz - along * z
+    return gw * inverse, gx * inverse, gy * inverse, gz * inverse
 
 
 @helper
-def _point_gradient(point: cp.Point, camera: cp.KernelCamera, du: float, dv: float, db: Array) -> cp.Point:
+def _point_gradient(
+    point: cp.Point, camera: cp.KernelCamera, by_mean: tuple[Lanes, Lanes], db: Any
+) -> cp.Point:
     """Gradient by the camera-space point from those by its pixel and by B = J R (two rows).
 
     A clamped coordinate is a constant multiple of z in the Jacobian, so it gets no gradient there.
     """
+    (x, y, z), (du, dv), r = point, by_mean, camera.rotation
     if camera.orthographic:
-        return du * camera.fx, dv * camera.fy, 0.0
-    x, y, z = point
-    r = camera.rotation
-    j00 = db[0, 0] * r[0, 0] + db[0, 1] * r[0, 1] + db[0, 2] * r[0, 2]
-    j02 = db[0, 0] * r[2, 0] + db[0, 1] * r[2, 1] + db[0, 2] * r[2, 2]
-    j11 = db[1, 0] * r[1, 0] + db[1, 1] * r[1, 1] + db[1, 2] * r[1, 2]
-    j12 = db[1, 0] * r[2, 0] + db[1, 1] * r[2, 1] + db[1, 2] * r[2, 2]
-    sx, sy = camera.fx / (z * z), camera.fy / (z * z)
-    tx, ty = min(max(x / z, -camera.left), camera.right), min(max(y / z, -camera.top), camera.bottom)
-    dx, dy = du * camera.fx / z, dv * camera.fy / z
-    dz = -du * sx * x - dv * sy * y - j00 * sx - j11 * sy + j02 * sx * tx + j12 * sy * ty
-    if tx == x / z:
-        dx -= j02 * sx
-        dz += j02 * sx * tx
-    if ty == y / z:
-        dy -= j12 * sy
-        dz += j12 * sy * ty
-    return dx, dy, dz
+        return du * camera.fx, dv * camera.fy, z * 0.0
+    over = 1.0 / z
+    sx, sy, u, v = camera.fx * over * over, camera.fy * over * over, x * over, y * over
+    tx, ty = min(max(u, -camera.left), camera.right), min(max(v, -camera.top), camera.bottom)
+    across, down = _dot(db[0], r[2]) * sx, _dot(db[1], r[2]) * sy
+    dz = across * tx + down * ty - du * sx * x - dv * sy * y - _dot(db[0], r[0]) * sx - _dot(db[1], r[1]) * sy
+    across, down = _within(u, camera.left, camera.right, across), _within(v, camera.top, camera.bottom, down)
+    return du * camera.fx * over - across, dv * camera.fy * over - down, dz + across * tx + down * ty
 
 
 @helper
-def _doubles(row: Array) -> cp.Point:
-    return np.float64(row[0]), np.float64(row[1]), np.float64(row[2])
+def _within(x: Lanes, below: float, above: float, value: Lanes) -> Lanes:
+    """Return `value` where -below <= x <= above, else 0."""
+    return ln.where_at_least(x, -below, ln.where_at_least(above, x, value, 0.0), 0.0)
 
 
 @helper
-def _axes_gradient(
-    matrices: Any, scales: cp.Point, by_covariance: cp.Point, by_turn: Array, by_b: Array, by_log_scale: Array
+def _dot(x: Any, y: Any) -> Lanes:
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+@helper
+def _times(x: cp.Point, y: cp.Point) -> cp.Point:
+    return x[0] * y[0], x[1] * y[1], x[2] * y[2]
+
+
+@helper
+def _mixed(p: Any, x: cp.Point, q: Any, y: cp.Point) -> cp.Point:
+    """Return p x + q y."""
+    return p * x[0] + q * y[0], p * x[1] + q * y[1], p * x[2] + q * y[2]
+
+
+@helper
+def _axes_gradient(matrices: Any, scales: cp.Point, by_covariance: cp.Point) -> Any:
+    """Pull the covariance's gradient G back: A = B turn diag(s) gets 2 G A, then log(s), turn and B."""
+    ((t0, t1, t2), (b0, b1), (a0, a1)), (gxx, gxy, gyy) = matrices, by_covariance
+    d0, d1 = _mixed(2 * gxx, a0, 2 * gxy, a1), _mixed(2 * gxy, a0, 2 * gyy, a1)
+    e0, e1 = _times(d0, scales), _times(d1, scales)
+    by_turn = _mixed(b0[0], e0, b1[0], e1), _mixed(b0[1], e0, b1[1], e1), _mixed(b0[2], e0, b1[2], e1)
+    by_b = (_dot(e0, t0), _dot(e0, t1), _dot(e0, t2)), (_dot(e1, t0), _dot(e1, t1), _dot(e1, t2))
+    return _mixed(1.0, _times(d0, a0), 1.0, _times(d1, a1)), by_turn, by_b
+
+
+@helper
+def _put(array: Array, rows: Array, values: Any) -> None:
+    """Write numbers, one a column, into eight rows."""
+    for column in range(len(values)):
+        ln.scatter(array, rows, 0, column, values[column])
+
+
+@helper
+def _pull_back(
+    which: Array, footprints: Any, rows: cp.Rows, camera: cp.KernelCamera, out: GaussianGradients
 ) -> None:
-    """Pull the covariance's gradient G back: A = B turn diag(s) gets 2 G A, then B, turn and log(s)."""
-    turn, b, a = matrices
-    gxx, gxy, gyy = by_covariance
-    by_b[:] = 0
-    for k in range(3):
-        d0, d1 = 2 * (gxx * a[0][k] + gxy * a[1][k]), 2 * (gxy * a[0][k] + gyy * a[1][k])
-        by_log_scale[k] = d0 * a[0][k] + d1 * a[1][k]
-        d0, d1 = d0 * scales[k], d1 * scales[k]
-        for m in range(3):
-            by_turn[m, k] = b[0][m] * d0 + b[1][m] * d1
-            by_b[0, m] += d0 * turn[m][k]
-            by_b[1, m] += d1 * turn[m][k]
+    """Fill the gradients of the eight Gaussians `which`; footprints: as of `_footprint_gradient`."""
+    q, by_mean, by_covariance = _footprint_gradient(*footprints)
+    point, scales, quat = cp.parameters(rows, which, camera)
+    inverse, turn, b, a = cp.axes(point, scales, quat, camera)
+    by_covariance = _with_compensation(by_covariance, a, camera, q)
+    by_log_scales, by_turn, by_b = _axes_gradient((turn, b, a), scales, by_covariance)
+    d, r = _point_gradient(point, camera, by_mean, by_b), camera.rotation.T
+    _put(out.means, which, (_dot(d, r[0]), _dot(d, r[1]), _dot(d, r[2])))
+    _put(out.log_scales, which, by_log_scales)
+    _put(out.quats_wxyz, which, _quat_gradient(quat, inverse, by_turn))
+    logits = ln.gathered(rows.opacity_logits, which, 0, 0)
+    ln.scatter(out.opacity_logits, which, 0, 0, q / (1 + cp.exp(min(logits, 700.0))))
+    _put(out.means_px, which, by_mean)
 
 
 @kernel
@@ -310,28 +350,22 @@ def to_parameters(
 
     Sums what `backward` left, in the order of the tiles, and pulls the moments back through the projection.
     """
-    added = np.empty(sums.partial.shape[1])
-    moments = added[:MOMENTS]
-    by_b, by_turn = np.empty((2, 3)), np.empty((3, 3))
-    r = camera.rotation
+    tiles, sums, rows, camera, out = ln.borrowed((tiles, sums, rows, camera, out))
+    added, each = np.empty((8, sums.partial.shape[1])), np.arange(8)
+    which, ranks, number = np.empty(8, np.int64), np.empty(8, np.int64), 0
     for i in range(first, last):
         _fetch(i, last, tiles, sums)
         rank = sums.rank_of[i]
-        if rank < 0 or not _add_up(rank, tiles, sums, added):
+        if rank < 0 or not _add_up(rank, tiles, sums, added[number]):
             _clear(i, out)
-            continue
-        out.values[i] = added[MOMENTS : MOMENTS + out.values.shape[1]]
-        du, dv, by_covariance = _footprint_gradient(tiles.geometry[rank], moments)
-        out.means_px[i, 0], out.means_px[i, 1] = du, dv
-        out.opacity_logits[i] = moments[Q] / (1 + np.exp(np.float64(rows.opacity_logits[i])))
-        point = cp.camera_point(_doubles(rows.means[i]), camera)
-        s0, s1, s2 = _doubles(rows.log_scales[i])
-        scales, quat = (np.exp(s0), np.exp(s1), np.exp(s2)), rows.quats_wxyz[i]
-        q0, q1, q2 = _doubles(quat)
-        inverse, turn, b, a = cp.axes(point, scales, (q0, q1, q2, np.float64(quat[3])), camera)
-        by_covariance = _with_compensation(by_covariance, a, camera, moments[Q])
-        _axes_gradient((turn, b, a), scales, by_covariance, by_turn, by_b, out.log_scales[i])
-        dx, dy, dz = _point_gradient(point, camera, du, dv, by_b)
-        for n in range(3):
-            out.means[i, n] = dx * r[0, n] + dy * r[1, n] + dz * r[2, n]
-        _quat_gradient(rows.quats_wxyz[i], inverse, by_turn, out.quats_wxyz[i])
+        else:
+            out.values[i] = added[number, MOMENTS : MOMENTS + out.values.shape[1]]
+            which[number], ranks[number], number = i, rank, number + 1
+        if number == 8 or (number > 0 and i == last - 1):
+            which[number:], ranks[number:], added[number:] = (
+                which[0],
+                ranks[0],
+                added[0],
+            )  # the last are fewer
+            _pull_back(which, (tiles.geometry, ranks, added, each), rows, camera, out)
+            number = 0

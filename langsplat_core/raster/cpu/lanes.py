@@ -311,11 +311,13 @@ def gathered(typing: Any, array: Any, rows: Any, start: Any, column: Any) -> Any
 
 @intrinsic
 def scatter(typing: Any, array: Any, rows: Any, start: Any, column: Any, value: Any) -> Any:
-    """array[rows[start + j], column] = value[j] for eight j; a float64 array as `gathered` takes it."""
+    """array[rows[start + j], column] = value[j] for eight doubles; a float array as `gathered` takes it."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        kind, value = context.get_value_type(array.dtype), arguments[4]
+        value = value if kind == DOUBLE else builder.fptrunc(value, ir.VectorType(kind, EIGHT))
         for j, pointer in enumerate(_elements(context, builder, sig, arguments)):
-            builder.store(builder.extract_element(arguments[4], INT(j)), pointer)
+            builder.store(builder.extract_element(value, INT(j)), pointer)
         return context.get_dummy_value()
 
     return types.void(array, rows, types.intp, types.intp, value), lower

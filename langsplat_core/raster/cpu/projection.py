@@ -188,15 +188,23 @@ def rows_of(gaussians: Gaussians) -> Rows:
 
 
 @helper
-def _exp(x: Lanes) -> Lanes:
+def exp(x: Lanes) -> Lanes:
     """e^x of doubles up to 708, relative error 1e-15 for |x| < 10; as at -708 below that."""
     return exp2(max(x * (2 * HALF_LOG2_E), -1022.0))
 
 
 @helper
-def _three(array: Array, rows: Array, start: int) -> Point:
+def _three(array: Array, which: Array) -> Point:
     """Return the first three columns of eight rows."""
-    return gathered(array, rows, start, 0), gathered(array, rows, start, 1), gathered(array, rows, start, 2)
+    return gathered(array, which, 0, 0), gathered(array, which, 0, 1), gathered(array, which, 0, 2)
+
+
+@helper
+def parameters(rows: Rows, which: Array, camera: KernelCamera) -> Any:
+    """Return camera points, scales and raw quaternions of eight Gaussians; which: (8,) their rows."""
+    (s0, s1, s2), (q0, q1, q2) = _three(rows.log_scales, which), _three(rows.quats_wxyz, which)
+    quat = q0, q1, q2, gathered(rows.quats_wxyz, which, 0, 3)
+    return camera_point(_three(rows.means, which), camera), (exp(s0), exp(s1), exp(s2)), quat
 
 
 @helper
@@ -205,14 +213,11 @@ def _footprints(rows: Rows, which: Array, camera: KernelCamera, each: Array, out
 
     which: (8,) their rows; each: (8,) 0 to 7.
     """
-    x, y, z = point = camera_point(_three(rows.means, which, 0), camera)
-    logit, quats = gathered(rows.opacity_logits, which, 0, 0), rows.quats_wxyz
-    faint = _exp(min(logit, -logit))
+    point, scales, quat = parameters(rows, which, camera)
+    (x, y, z), (_, _, _, a) = point, axes(point, scales, quat, camera)
+    logit = gathered(rows.opacity_logits, which, 0, 0)
+    faint = exp(min(logit, -logit))
     opacity = where_at_least(logit, 0.0, 1.0, faint) / (1 + faint)
-    s0, s1, s2 = _three(rows.log_scales, which, 0)
-    q0, q1, q2 = _three(quats, which, 0)
-    quat = q0, q1, q2, gathered(quats, which, 0, 3)
-    _, _, _, a = axes(point, (_exp(s0), _exp(s1), _exp(s2)), quat, camera)
     xx, xy, yy, det, det_fitted = covariance(a, camera.dilation, camera.fitted)
     if camera.fitted < camera.dilation:
         opacity = opacity * np.sqrt(max(det_fitted / det, COMPENSATION_MIN))
