@@ -17,12 +17,13 @@ from torch import Tensor
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
+from langsplat_core.raster.cpu.lanes import LANES, lanes, load, store
 from langsplat_core.scene import Camera
 
 RADIUS, SIGMA = 5, 1.5  # of the window, pixels
 C1, C2 = 0.01**2, 0.03**2  # of SSIM, for a data range of 1
 _TWO = np.float32(2)  # a plain 2 would turn every product into float64 and halve the speed
-_ONE = np.float32(1)
+_ONE, _ZERO = np.float32(1), np.float32(0)
 
 
 def _window() -> list[float]:
@@ -31,10 +32,13 @@ def _window() -> list[float]:
     return [tap / sum(taps) for tap in taps]
 
 
+_TAPS = np.array(_window(), np.float32)
+
+
 # The loss and its gradient in three passes over the rows: pass 1 blurs the raw moments along rows; pass 2
 # blurs them across rows, forms SSIM and its derivatives by the moments, and blurs those along rows; pass 3
 # blurs the derivatives across rows and adds everything up. Rows are independent within a pass, so results do
-# not depend on the number of threads.
+# not depend on the number of threads. Rows of moments and derivatives are filled up to whole `LANES`.
 #
 # With S = a1 a2 / (b1 b2) and mx, xx, xy the blurred x, x^2, x y: dS/dmx = 2 my (a2 - a1) / (b1 b2)
 # - 2 mx S (1/b1 - 1/b2), dS/dxx = -S / b2, dS/dxy = 2 a1 / (b1 b2), and dS/dx = blur(dS/dmx)
@@ -42,35 +46,30 @@ def _window() -> list[float]:
 
 
 @helper
-def _add_scaled(out: Array, tap: float, source: Array) -> None:
-    """Add tap * source to `out`: a loop over two plain rows is one the compiler vectorises."""
-    for i in range(out.shape[0]):
-        out[i] += tap * source[i]
-
-
-@helper
-def _along(padded: Array, out: Array, taps: Array, channels: int) -> None:
+def _along(padded: Array, out: Array, channels: int) -> None:
     """Blur one row; `padded` has RADIUS pixels of zeros at both ends."""
-    out[:] = 0
-    for k in range(taps.shape[0]):
-        _add_scaled(out, taps[k], padded[k * channels : k * channels + out.shape[0]])
+    for i in range(0, out.shape[0], LANES):
+        total = _TAPS[0] * load(padded, i)
+        for k in range(1, 2 * RADIUS + 1):
+            total = total + _TAPS[k] * load(padded, i + k * channels)
+        store(out, i, total)
 
 
 @helper
-def _across(rows: Array, y: int, out: Array, taps: Array) -> None:
+def _across(rows: Array, y: int, out: Array) -> None:
     """Blur `rows` (H, n) at row y over the rows around it; zeros beyond the image."""
-    out[:] = 0
-    for k in range(max(RADIUS - y, 0), min(taps.shape[0], rows.shape[0] + RADIUS - y)):
-        _add_scaled(out, taps[k], rows[y + k - RADIUS])
+    for i in range(0, out.shape[0], LANES):
+        total = lanes(_ZERO)
+        for k in range(max(RADIUS - y, 0), min(2 * RADIUS + 1, rows.shape[0] + RADIUS - y)):
+            total = total + _TAPS[k] * load(rows, (y + k - RADIUS) * out.shape[0] + i)
+        store(out, i, total)
 
 
 @kernel
-def _blur_moments(
-    first: int, last: int, image: Array, target: Array, channels: int, taps: Array, moments: Array
-) -> None:
-    """Pass 1: (H, n) images -> `moments` (4, H, n), x, y, x^2 + y^2, x y blurred along rows."""
+def _blur_moments(first: int, last: int, image: Array, target: Array, channels: int, moments: Array) -> None:
+    """Pass 1: (H, n) images -> `moments` (4, H, m), x, y, x^2 + y^2, x y blurred along rows."""
     n, edge = image.shape[1], RADIUS * channels
-    padded = np.zeros((4, n + 2 * edge), np.float32)
+    padded = np.zeros((4, moments.shape[2] + 2 * edge), np.float32)
     squares, products = padded[2, edge : edge + n], padded[3, edge : edge + n]
     for row in range(first, last):
         x, y = image[row], target[row]
@@ -80,30 +79,23 @@ def _blur_moments(
             squares[i] = x[i] * x[i] + y[i] * y[i]
             products[i] = x[i] * y[i]
         for m in range(4):
-            _along(padded[m], moments[m, row], taps, channels)
+            _along(padded[m], moments[m, row], channels)
 
 
 @kernel
 def _compare(
-    first: int,
-    last: int,
-    moments: Array,
-    constants: Array,
-    channels: int,
-    taps: Array,
-    derivatives: Array,
-    row_ssim: Array,
+    first: int, last: int, moments: Array, n: int, channels: int, derivatives: Array, row_ssim: Array
 ) -> None:
-    """Pass 2: `derivatives` (3, H, n) by the blurred x, x^2, xy, blurred along rows; SSIM sums per row."""
-    n, edge = moments.shape[2], RADIUS * channels
-    c1, c2 = constants[0], constants[1]
-    m = np.empty((4, n), np.float32)
-    padded = np.zeros((3, n + 2 * edge), np.float32)
+    """Pass 2: `derivatives` (3, H, m) by the blurred x, x^2, xy, blurred along rows; SSIM sums per row."""
+    edge = RADIUS * channels
+    c1, c2 = np.float32(C1), np.float32(C2)
+    m = np.empty((4, moments.shape[2]), np.float32)
+    padded = np.zeros((3, moments.shape[2] + 2 * edge), np.float32)
     by_mx, by_xx, by_xy = padded[0, edge : edge + n], padded[1, edge : edge + n], padded[2, edge : edge + n]
     similarity = np.empty(n, np.float32)
     for row in range(first, last):
         for k in range(4):
-            _across(moments[k], row, m[k], taps)
+            _across(moments[k], row, m[k])
         for i in range(n):
             mx, my = m[0, i], m[1, i]
             product, squares = mx * my, mx * mx + my * my
@@ -118,7 +110,7 @@ def _compare(
             by_xy[i] = _TWO * a1 * inverse
         row_ssim[row] = similarity.sum()
         for k in range(3):
-            _along(padded[k], derivatives[k, row], taps, channels)
+            _along(padded[k], derivatives[k, row], channels)
 
 
 @kernel
@@ -129,18 +121,17 @@ def _gather_gradient(
     target: Array,
     derivatives: Array,
     weights: Array,
-    taps: Array,
     gradient: Array,
     row_l1: Array,
 ) -> None:
     """Pass 3: the gradient by the image, weights[0] sign(x - y) - weights[1] dSSIM/dx; L1 sums per row."""
     n = image.shape[1]
-    d = np.empty((3, n), np.float32)
+    d = np.empty((3, derivatives.shape[2]), np.float32)
     difference = np.empty(n, np.float32)
     l1, dssim, zero = weights[0], weights[1], np.float32(0)
     for row in range(first, last):
         for k in range(3):
-            _across(derivatives[k], row, d[k], taps)
+            _across(derivatives[k], row, d[k])
         x, y, out = image[row], target[row], gradient[row]
         for i in range(n):
             difference[i] = abs(x[i] - y[i])
@@ -154,15 +145,15 @@ def _loss_and_gradient(image: Array, target: Array, lambda_dssim: float) -> tupl
     height, width, channels = image.shape
     n = width * channels
     x, y = image.reshape(height, n), target.reshape(height, n)
-    taps, constants = np.array(_window(), np.float32), np.array((C1, C2), np.float32)
-    moments, derivatives = np.empty((4, height, n), np.float32), np.empty((3, height, n), np.float32)
+    blurred = np.empty((7, height, -(-n // LANES) * LANES), np.float32)
+    moments, derivatives = blurred[:4], blurred[4:]
     row_ssim, row_l1 = np.empty(height), np.empty(height)
     gradient = np.empty((height, n), np.float32)
     weights = np.array([1 - lambda_dssim, lambda_dssim], np.float32) / np.float32(x.size)
     run = shared_workers().run
-    run(_blur_moments, height, x, y, channels, taps, moments)
-    run(_compare, height, moments, constants, channels, taps, derivatives, row_ssim)
-    run(_gather_gradient, height, x, y, derivatives, weights, taps, gradient, row_l1)
+    run(_blur_moments, height, x, y, channels, moments)
+    run(_compare, height, moments, n, channels, derivatives, row_ssim)
+    run(_gather_gradient, height, x, y, derivatives, weights, gradient, row_l1)
     loss = (1 - lambda_dssim) * row_l1.sum() / x.size + lambda_dssim * (1 - row_ssim.sum() / x.size)
     return float(loss), gradient.reshape(image.shape)
 
