@@ -160,14 +160,6 @@ def is_plain_name(name: object) -> bool:
     return fits and name not in (".", "..") and not set(str(name)) & set("/\\:\0")
 
 
-def exists(path: Path) -> bool:
-    """Return `path.exists()`, where a name too long or a folder that may not be searched means no."""
-    try:
-        return path.exists()
-    except OSError:
-        return False
-
-
 def read_file(path: Path, limit: int) -> bytes:
     """Return the content of a file of at most `limit` bytes. Raises InputError and FormatError."""
     file, size = open_for_reading(path)

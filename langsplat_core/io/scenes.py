@@ -28,7 +28,7 @@ from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import sidecar as language_files
 from langsplat_core.io.files import atomic_path, check_output_file, locked, shown, write_json
 from langsplat_core.io.gltf import read_gltf_scene, write_gltf
-from langsplat_core.io.hostile import decode_json, exists, read_file
+from langsplat_core.io.hostile import decode_json, read_file
 from langsplat_core.io.ply import read_ply_scene, write_ply
 from langsplat_core.io.quantised import read_splat_scene, write_splat
 from langsplat_core.io.sog import META_NAME, read_sog_scene, write_sog
@@ -105,7 +105,7 @@ def format_of(path: Path) -> SceneFormat | None:
     for row in formats():
         if not folder and path.suffix.lower() == row.suffix:
             return row
-        if row.folder_file and (path.name == row.folder_file or exists(path / row.folder_file)):
+        if row.folder_file and (path.name == row.folder_file or os.path.exists(path / row.folder_file)):
             return row
     return None
 
@@ -131,7 +131,7 @@ def load_scene(path: Path | str, read: Reader | None = None) -> Scene:
     """
     scene = load_without_language(path, read)
     sidecar = companion_path(path, language_files.SUFFIX)
-    if not exists(sidecar):
+    if not os.path.exists(sidecar):
         return scene
     try:
         return replace(
@@ -147,7 +147,7 @@ def load_without_language(path: Path | str, read: Reader | None = None) -> Scene
     """Return a scene as `load_scene` does, but without the language field, which is not even looked at."""
     path = Path(path)
     scene, cameras = replace(_read(path, read), path=path), _cameras_path(path)
-    if not exists(cameras):
+    if not os.path.exists(cameras):
         return scene
     try:
         found = camera_files.read_cameras(cameras)
@@ -159,7 +159,7 @@ def load_without_language(path: Path | str, read: Reader | None = None) -> Scene
 
 def _read(path: Path, read: Reader | None = None) -> Scene:
     """Read the scene's own file; say what of it cannot be drawn."""
-    if not exists(path):
+    if not os.path.exists(path):
         raise InputError(f"{path}: no such file; check the spelling and the folder")
     row = format_of(path)
     if row is None and path.is_dir():
@@ -209,7 +209,7 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
 def read_origin(path: Path) -> PlacedOrigin | None:
     """Return the origin that the companion of a file names; None without one. InputError if damaged."""
     beside = companion_path(path, ORIGIN_SUFFIX)
-    return decode_json(read_file(beside, 1 << 16), PlacedOrigin, beside) if exists(beside) else None
+    return decode_json(read_file(beside, 1 << 16), PlacedOrigin, beside) if os.path.exists(beside) else None
 
 
 def write_origin(path: Path, origin: Array, metres_per_unit: float | None = None) -> None:
@@ -248,7 +248,7 @@ def check_keeps(out: Path, *sources: Path) -> None:
     read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
     companions = _companions(out) if out.suffix.lower() in writable_suffixes() else ()
     for path in (out, *companions):
-        if path.resolve() in read and (path == out or exists(path)):
+        if path.resolve() in read and (path == out or os.path.exists(path)):
             what = "would replace" if path == out else f"its {shown(Path(path.name))} would replace that of"
             raise InputError(f"{shown(out)}: {what} the original scene; choose another name")
 
@@ -333,8 +333,9 @@ def scene_files(path: Path | str) -> tuple[Path, ...]:
     if os.path.isdir(path) or path.name == META_NAME:  # which a name too long is not
         folder = path if os.path.isdir(path) else path.parent
         own = (folder / META_NAME, *sorted(folder.glob("*.webp")))
-    beside = (companion_path(path, ORIGIN_SUFFIX),) if exists(companion_path(path, ORIGIN_SUFFIX)) else ()
-    return (*own, companion_path(path, language_files.SUFFIX), _cameras_path(path), *beside)
+    sidecar, _, origin = _companions(path)
+    beside = (origin,) if os.path.exists(origin) else ()
+    return (*own, sidecar, _cameras_path(path), *beside)
 
 
 def _companions(path: Path) -> tuple[Path, Path, Path]:
@@ -346,7 +347,7 @@ def _companions(path: Path) -> tuple[Path, Path, Path]:
 
 def _cameras_path(scene: Path) -> Path:
     beside = companion_path(scene, camera_files.SUFFIX)
-    if not exists(beside) and scene.name == "point_cloud.ply":
+    if not os.path.exists(beside) and scene.name == "point_cloud.ply":
         return scene.parent.parent.parent / "cameras.json"
     return beside
 

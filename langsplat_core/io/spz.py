@@ -65,17 +65,11 @@ class _Header:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class _Packed:
-    """The content of a .spz file, unpacked but still quantised."""
+def _read(file: BinaryIO, size: int, path: Path, room: Allowance, axes: int, tell: Tell) -> tuple[Scene, int]:
+    """Return the scene of a file of `size` bytes, and the axes, 1 to 8, that it names, 0 for none.
 
-    header: _Header
-    axes: int  # 1 to 8, see above; 0 where the file does not say
-    blocks: dict[str, Array]  # attribute -> (N, bytes of one Gaussian) uint8
-
-
-def _read_packed(file: BinaryIO, size: int, path: Path, room: Allowance, tell: Tell) -> _Packed:
-    """Read a file of `size` bytes; what it can honestly hold is known before anything is unpacked."""
+    What it can honestly hold is known before anything is unpacked. axes: of a file that does not say.
+    """
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
     stream: Any = gzip.GzipFile(fileobj=file) if zipped else file
@@ -107,7 +101,8 @@ def _read_packed(file: BinaryIO, size: int, path: Path, room: Allowance, tell: T
         tell(f"flags {unknown:#x} not known")
     if records and not header.flags & EXTENDED:
         tell(f"{len(records)} bytes beside its Gaussians not read")
-    return _Packed(header, _axes(records if header.flags & EXTENDED else b"", path, tell), arrays)
+    stated = _axes(records if header.flags & EXTENDED else b"", path, tell)
+    return _scene(header, arrays, stated or axes, tell), stated
 
 
 def _read_streams(
@@ -202,13 +197,12 @@ def read_spz_scene(path: Path | str, axes: str = "", note: Tell = lambda line: N
     file, size = open_for_reading(path)
     with file:
         told, room = list[str](), Allowance(path, size, SMALL_RATIO)
-        packed = _read_packed(file, size, path, room, told.append)
-        scene = _scene(packed, AXES[axes or "rub"], told.append)
-    if packed.axes and axes and packed.axes != AXES[axes]:
+        scene, stated = _read(file, size, path, room, AXES[axes or "rub"], told.append)
+    if stated and axes and stated != AXES[axes]:
         told.append(f"its own record of its axes is followed, not --axes {axes}")
-    if not packed.axes:
+    if not stated:
         note(f"{path}: names no axes; read as {(axes or 'rub').upper()}")
-    if not packed.axes and not axes and _floor_is_above(path, scene):
+    if not stated and not axes and _floor_is_above(path, scene):
         told.append("taken for RUB, as no record names its axes, but its floor is above; try --axes rdf")
     report_losses(path, told)
     return scene
@@ -219,7 +213,7 @@ def decode_spz(data: bytes, path: Path, room: Allowance, tell: Tell) -> Scene:
 
     path: for messages; room: of the file that it is a part of. Raises FormatError.
     """
-    return _scene(_read_packed(io.BytesIO(data), len(data), path, room, tell), AXES["rub"], tell)
+    return _read(io.BytesIO(data), len(data), path, room, AXES["rub"], tell)[0]
 
 
 def _floor_is_above(path: Path, scene: Scene) -> bool:
@@ -244,23 +238,23 @@ def _floor_is_above(path: Path, scene: Scene) -> bool:
     return bool(counts[-10:].max() > max(2 * counts[:10].max(), 0.05 * counts.sum()))
 
 
-def _scene(packed: _Packed, axes: int, tell: Tell) -> Scene:
-    """axes: of a file that does not say."""
-    blocks, degree = packed.blocks, min(packed.header.sh_degree, 3)
-    if degree < packed.header.sh_degree:
-        tell(f"its spherical harmonics of degree {packed.header.sh_degree} are cut to {degree}")
+def _scene(header: _Header, blocks: dict[str, Array], axes: int, tell: Tell) -> Scene:
+    """blocks: attribute -> (N, bytes of one Gaussian) uint8."""
+    degree = min(header.sh_degree, 3)
+    if degree < header.sh_degree:
+        tell(f"its spherical harmonics of degree {header.sh_degree} are cut to {degree}")
     count, width = blocks["sh"].shape
     rest = blocks["sh"].reshape(count, width // 3, 3)[:, : SH_COUNTS[degree] - 1]
     base = (blocks["colours"] / 255 - 0.5) / COLOUR_SCALE
     gaussians = Gaussians(
-        means=_positions(packed),
+        means=_positions(header, blocks["positions"]),
         log_scales=blocks["scales"].astype(np.float32) / 16 - 10,
-        quats_wxyz=_rotations(packed, tell),
+        quats_wxyz=_rotations(header, blocks["rotations"], tell),
         opacity_logits=logit(blocks["alphas"][:, 0] / 255),
         sh=np.concatenate([base[:, None], (rest.astype(np.float32) - 128) / 128], axis=1),
     )
-    turned = mirrored(gaussians, _signs_to_rdf(packed.axes or axes))
-    return Scene(turned, antialiased=bool(packed.header.flags & ANTIALIASED))
+    turned = mirrored(gaussians, _signs_to_rdf(axes))
+    return Scene(turned, antialiased=bool(header.flags & ANTIALIASED))
 
 
 def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub") -> None:
@@ -332,20 +326,18 @@ def _fractional_bits(drawn: Gaussians, path: Path) -> int:
     return max(0, min(most, max(FRACTIONAL_BITS, least + 4), 30))
 
 
-def _positions(packed: _Packed) -> Array:
+def _positions(header: _Header, data: Array) -> Array:
     """Return (N, 3) positions along the axes of the file."""
-    data = packed.blocks["positions"]
-    if packed.header.version == 1:
+    if header.version == 1:
         return np.ascontiguousarray(data).view("<f2").astype(np.float32)
     # 24 bits each: with a byte of zeros below them they are 256 times as much, in 32
     codes = np.pad(data.reshape(len(data), 3, 3), ((0, 0), (0, 0), (1, 0))).view("<i4")[..., 0] >> 8
-    return codes / 2.0**packed.header.fractional_bits
+    return codes / 2.0**header.fractional_bits
 
 
-def _rotations(packed: _Packed, tell: Tell) -> Array:
+def _rotations(header: _Header, data: Array, tell: Tell) -> Array:
     """Return (N, 4) unit quaternions w x y z."""
-    data = packed.blocks["rotations"]
-    if packed.header.version < 3:
+    if header.version < 3:
         return smallest_three(data / 127.5 - 1, np.zeros(len(data), np.intp), tell)  # all but w
     words = np.ascontiguousarray(data).view("<u4")[:, 0]
     three = np.stack([words >> shift & 1023 for shift in (20, 10, 0)], axis=1)

@@ -8,6 +8,7 @@ each mask shows a wrong vote.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from os.path import exists
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,6 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io.hostile import exists
 from langsplat_core.pipeline.report import REPORT, stated_figures, work_folder
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult

@@ -21,7 +21,7 @@ from PIL import Image
 from langsplat_core.arrays import Array, check_array, unit
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import exists, read_npz
+from langsplat_core.io.hostile import read_npz
 from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps, within
 
@@ -72,7 +72,7 @@ class FeatureStore:
     def has(self, name: str, key: str | None = None) -> bool:
         """Return True for a whole file of `name`, with that `key` if given; damage is warned of once."""
         try:
-            return exists(self.path(name)) and key in (None, self._read(name)[1])
+            return os.path.exists(self.path(name)) and key in (None, self._read(name)[1])
         except InputError as error:
             if name not in self._warned:
                 log.warning("%s; made again", error)

@@ -29,7 +29,6 @@ from langsplat_core.cli.arguments import OutFolder
 from langsplat_core.config import INRIA, Count, Range, RasterSettings
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.extensions.benchmarks.report import markdown, write_report
-from langsplat_core.io.hostile import exists
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.raster import load_rasterizer
@@ -73,7 +72,7 @@ class BenchRaster:
 
     def run(self) -> None:
         for path in self.scenes:  # before the minutes that the others take
-            if not exists(path):
+            if not os.path.exists(path):
                 raise InputError(f"{path}: no such file; check the spelling and the folder")
         with TerminalProgress() as progress:
             machine, rows = run_plan(self, progress)

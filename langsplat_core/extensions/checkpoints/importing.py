@@ -9,6 +9,7 @@ than memory holds.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from os.path import exists
 from pathlib import Path
 from typing import TypeVar
 
@@ -37,7 +38,6 @@ from langsplat_core.extensions.checkpoints.features import (
 )
 from langsplat_core.io.cameras import SUFFIX as CAMERAS
 from langsplat_core.io.cameras import read_cameras
-from langsplat_core.io.hostile import exists
 from langsplat_core.io.scenes import warn_of_undrawable
 from langsplat_core.pipeline.language_field import field_of
 from langsplat_core.progress import Progress, silent

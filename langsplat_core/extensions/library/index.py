@@ -32,7 +32,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.errors import EncoderError, FormatError, InputError, LangSplatError, printable_line
 from langsplat_core.io.files import atomic_path, is_utf8, locked, shown
-from langsplat_core.io.hostile import FromFile, exists, open_for_reading
+from langsplat_core.io.hostile import FromFile, open_for_reading
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
 from langsplat_core.io.sidecar import SUFFIX, read_stored
 from langsplat_core.pipeline.notebook import draw
@@ -272,7 +272,7 @@ def update_library(
     if not paths:
         raise InputError(f"{folder}: no scene with a language field in it; `langsplat train` makes them")
     stamps = {name: stamp_of(path) for name, path in paths.items()}
-    before = index if exists(index) else folder / INDEX
+    before = index if os.path.exists(index) else folder / INDEX
     kept, listed = _kept(before, folder, stamps)
     fresh = [name for name in paths if name not in kept]
     try:
@@ -285,7 +285,7 @@ def update_library(
                 kept = _kept(index, folder, stamps, logging.DEBUG)[0] | kept
                 write_library(index, [kept[name] for name in paths if name in kept])
     progress("reading scenes", 1.0)
-    return read_library(index if exists(index) else before, folder)
+    return read_library(index if os.path.exists(index) else before, folder)
 
 
 def index_of(folder: Path) -> Path:
@@ -301,7 +301,7 @@ def _kept(
 ) -> tuple[dict[str, Digest], int]:
     """Return the entries of an index whose scenes are as they were, and how many there are in all."""
     try:
-        old = read_library(index, folder) if exists(index) else Library(folder, ())
+        old = read_library(index, folder) if os.path.exists(index) else Library(folder, ())
     except FormatError as error:
         log.log(level, "%s", error)
         return {}, 0
