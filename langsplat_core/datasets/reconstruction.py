@@ -25,7 +25,7 @@ import pycolmap
 from langsplat_core.datasets import workspace
 from langsplat_core.datasets.colmap import read_model
 from langsplat_core.errors import FormatError
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import write_whole
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
@@ -325,5 +325,4 @@ def keep_matches(folder: Path) -> None:
         pairs, inliers = database.read_two_view_geometry_num_inliers()
     ends = [[names[number] for number in pycolmap.pair_id_to_image_pair(pair)] for pair in pairs]
     kept = [[*end, int(count)] for end, count in zip(ends, inliers, strict=True) if count]
-    with atomic_path(folder / workspace.MATCHES) as temporary:
-        temporary.write_text(json.dumps({"features": features, "pairs": sorted(kept)}), encoding="utf-8")
+    write_whole(folder / workspace.MATCHES, json.dumps({"features": features, "pairs": sorted(kept)}))

@@ -21,7 +21,7 @@ from msgspec import Meta, Raw, Struct
 
 from langsplat_core.arrays import Array, affine
 from langsplat_core.errors import malformed, quoted, report_losses, unread
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import write_whole
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, decode_json, read_file
 from langsplat_core.scene import FARTHEST, Camera
 
@@ -74,8 +74,7 @@ def write_cameras(path: Path | str, cameras: tuple[Camera, ...]) -> None:
         for index, camera in enumerate(cameras)
     ]
     lines = ",\n".join(json.dumps(entry, ensure_ascii=False, default=float) for entry in entries)
-    with atomic_path(path) as temporary:
-        temporary.write_text(f"[\n{lines}\n]\n", encoding="utf-8")
+    write_whole(path, f"[\n{lines}\n]\n")
 
 
 def _camera(entry: _Entry, what: str) -> Camera:

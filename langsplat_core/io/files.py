@@ -109,10 +109,15 @@ def _filled(place: Path, temporary: Path) -> bool:
     return True
 
 
+def write_whole(path: Path | str, content: str | bytes) -> None:
+    """Write a file, text as UTF-8, whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 def write_json(path: Path, content: object) -> None:
     """Write a value as a JSON file, whole or not at all."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_whole(path, json.dumps(content, indent=1) + "\n")
 
 
 @contextmanager

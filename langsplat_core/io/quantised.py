@@ -19,7 +19,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, logit, sigmoid, unit
 from langsplat_core.errors import InputError, Tell, malformed
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import write_whole
 from langsplat_core.io.hostile import open_for_reading
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import C0
@@ -140,5 +140,4 @@ def write_splat(path: Path | str, scene: Scene) -> None:
     rows["colour"][valid, :3] = to_bytes((0.5 + C0 * drawn.sh[:, 0].astype(np.float64)) * 255)
     rows["colour"][valid, 3] = to_bytes(sigmoid(drawn.opacity_logits) * 255)
     rows["rotation"][valid] = to_bytes(unit(drawn.quats_wxyz.astype(np.float64)) * 128 + 128)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(rows.tobytes())
+    write_whole(path, rows.tobytes())

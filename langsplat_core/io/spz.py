@@ -26,7 +26,7 @@ import numpy as np
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid
 from langsplat_core.errors import InputError, Tell, malformed, report_loss, report_losses, unread
 from langsplat_core.io.cameras import SUFFIX, read_cameras
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import write_whole
 from langsplat_core.io.hostile import SMALL_RATIO, Allowance, open_for_reading
 from langsplat_core.io.quantised import check_steps, mirrored, smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
@@ -305,8 +305,7 @@ def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub
         sizes = [len(part) for pair in zip(frames, blocks, strict=True) for part in pair]
         head += struct.pack("<I12x", 32 + len(record)) + record
         content = b"".join([head, struct.pack(f"<{len(sizes)}Q", *sizes), *frames])
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+    write_whole(path, content)
 
 
 def _fractional_bits(drawn: Gaussians, path: Path) -> int:

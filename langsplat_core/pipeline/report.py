@@ -22,8 +22,9 @@ from langsplat_core.arrays import Array, ViewScore, affine
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.workspace import Matches
 from langsplat_core.errors import FormatError, InputError, printable_line
-from langsplat_core.io.files import atomic_path, write_json
+from langsplat_core.io.files import write_json, write_whole
 from langsplat_core.io.hostile import read_json_file
+from langsplat_core.io.quantised import to_bytes
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
 
@@ -183,8 +184,7 @@ def write_reports(
         f"trained on, come first{f'; {more} more are not shown' if more else ''}.</p>",
         "<div class=views>", *views, "</div>",
     ]  # fmt: skip
-    with atomic_path(work / PAGE) as temporary:
-        temporary.write_text("\n".join(parts), encoding="utf-8")
+    write_whole(work / PAGE, "\n".join(parts))
 
 
 def _text(text: object, limit: int = 120) -> str:
@@ -245,24 +245,20 @@ def _view(capture: Capture, scene: Scene, index: int, score: ViewScore, held: bo
     small = camera.within(SIDE)
     if mask is not None:  # what does not count is faint
         photo = np.where(mask[..., None], photo, 200 + photo // 5).astype(np.uint8)
-    drawn = render(scene, small).colours.clip(0, 1)
+    drawn = to_bytes(255 * render(scene, small).colours)
     photograph = Image.fromarray(np.ascontiguousarray(photo)).resize((small.width, small.height))
     badge = " <span class=badge>held out</span>" if held else ""
     return (
         f"<div class='card{' held' if held else ''}'><div class=name><span>{_text(camera.name)}{badge}</span>"
         f"<span class=soft>{score.psnr:.1f} dB, SSIM {score.ssim:.3f}</span></div>"
-        f"<div class=pair><img alt=photograph src='{_uri(photograph)}'><img alt=scene "
-        f"src='{_uri(_image(drawn))}'><input type=range aria-label='where the scene begins'></div></div>"
+        f"<div class=pair><img alt=photograph src='{_uri(np.asarray(photograph))}'><img alt=scene "
+        f"src='{_uri(drawn)}'><input type=range aria-label='where the scene begins'></div></div>"
     )
 
 
-def _image(colours: Array) -> Image.Image:
-    return Image.fromarray((colours * 255 + 0.5).astype(np.uint8))
-
-
-def _uri(image: Image.Image) -> str:
+def _uri(pixels: Array) -> str:
     packed = io.BytesIO()
-    image.save(packed, "JPEG", quality=80)
+    Image.fromarray(pixels).save(packed, "JPEG", quality=80)
     return f"data:image/jpeg;base64,{b64encode(packed.getvalue()).decode()}"
 
 
@@ -286,7 +282,7 @@ def _from_above(scene: Scene, held_out: Container[str]) -> str:
     plan = Camera(width, height, scale, scale, 0.0, 0.0, pose, orthographic=True)
     ground = render(scene, plan)
     shade = 1 - 0.75 * (ground.alpha[..., None] - ground.colours).clip(0, 1)  # faint, as a map's ground
-    drawn = [f"<image width='{width}' height='{height}' href='{_uri(_image(shade))}'/>"]
+    drawn = [f"<image width='{width}' height='{height}' href='{_uri(to_bytes(255 * shade))}'/>"]
     for camera, place in zip(scene.cameras, plan.project(eyes)[0], strict=True):
         # A wedge for what a camera looks towards; one that looks straight down is its dot alone.
         ahead = axes @ camera.rotation[2] * (1, -1)

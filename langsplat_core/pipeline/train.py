@@ -29,7 +29,7 @@ from langsplat_core.interrupts import raised
 from langsplat_core.io import apart
 from langsplat_core.io.cameras import SUFFIX as CAMERAS
 from langsplat_core.io.cameras import write_cameras
-from langsplat_core.io.files import atomic_path, check_output_folder, patiently, shown, write_json
+from langsplat_core.io.files import check_output_folder, patiently, shown, write_json, write_whole
 from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.pipeline import language_field
@@ -137,8 +137,7 @@ def _train(
         train, held_out = split_views(capture, config.dataset)
         cameras = tuple(capture.cameras[i] for i in train)
         if processes.is_main:  # for whoever looks at the Gaussians before their scene is written
-            with atomic_path((run.work / reports.PREVIEW).with_suffix(CAMERAS)) as file:
-                write_cameras(file, cameras)
+            write_cameras((run.work / reports.PREVIEW).with_suffix(CAMERAS), cameras)
 
     if encoder is not None:
         mask_source = named_source or masks_of(capture)  # type: ignore[misc]  # one of them is there
@@ -293,8 +292,7 @@ def trained_gaussians(
     stated.unlink(missing_ok=True)
     gaussians = trainer.train_radiance(capture, config, train, checkpoint, progress, held_out)
     write_ply(done, gaussians)
-    with atomic_path(stated) as temporary:
-        temporary.write_text(digest_of(read_ply(done)), encoding="utf-8")
+    write_whole(stated, digest_of(read_ply(done)))
     patiently(lambda: checkpoint.unlink(missing_ok=True))
     return gaussians
 

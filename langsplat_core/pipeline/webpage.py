@@ -38,7 +38,7 @@ from langsplat_core.display.displays import (
     shader_defines,
 )
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import write_whole
 from langsplat_core.io.quantised import to_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query import grammar, taught
@@ -83,8 +83,7 @@ class PageReport:
 def write_page(path: Path, page: tuple[str, PageReport]) -> PageReport:
     """Write what `make_page` returned as a file."""
     text, report = page
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_whole(path, text)
     return report
 
 

@@ -9,7 +9,7 @@ from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import plain
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.language import NO_NODE
-from langsplat_core.scene.surface import FAINTEST, Surface, surface_weights
+from langsplat_core.scene.surface import FAINTEST, Surface, cross_sections, surface_weights
 
 INNER = (0.02, 0.98)  # a box holds the points between these quantiles of each coordinate: strays do not count
 COARSE = np.radians(np.arange(0.0, 90.0, 10.0))  # beginning with 0: of equal areas the principal axes stay
@@ -97,7 +97,6 @@ CRUMB_COUNT = 8  # Gaussians, half of the neighbourhood that relevancy is smooth
 CRUMB_SHARE = 0.01  # and so is less than this of the largest instance's extent on the surface
 EQUAL_SCORES = 1e-3  # of relevancy: instances this close are as good, and the larger comes first
 BOXED = 2048  # members, at most, that a box is taken from
-_FLAT = -100.0  # logarithm of a scale, instead of -infinity
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +208,8 @@ def _ranked(
 
     every: (K,) rows of all members; labels: (K,) part of each, -1 for none; scores: (P,).
     """
-    sizes, counts = _extent(gaussians, every), np.array(list(map(len, parts)))
+    counts = np.array(list(map(len, parts)))
+    sizes = cross_sections(gaussians.log_scales[every], gaussians.opacity_logits[every])
     extents = np.bincount(labels + 1, sizes, len(parts) + 1)[1:]
     found = []
     kept = np.flatnonzero((counts >= CRUMB_COUNT) & (extents >= CRUMB_SHARE * extents.max()))
@@ -230,10 +230,3 @@ def _ranked(
         )
         found.append(thing)
     return tuple(found)
-
-
-def _extent(gaussians: Gaussians, rows: Array) -> Array:
-    """Return (K,) float64 opacity times the largest cross-section: flat Gaussians have no volume."""
-    x, y, z = np.maximum(gaussians.log_scales[rows].astype(np.float64), _FLAT).T
-    opacity = sigmoid(gaussians.opacity_logits[rows].astype(np.float64))
-    return opacity * np.exp(x + y + z - np.minimum(np.minimum(x, y), z))

@@ -101,12 +101,17 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
     return Surface(rows, positions, neighbours, weights, _links(neighbours, near), anchors)
 
 
+def cross_sections(log_scales: Array, opacity_logits: Array) -> Array:
+    """Return (N,) float64 opacity times the two longest axes, units^2: flat Gaussians have no volume."""
+    longest = np.sort(log_scales.astype(np.float64), axis=1)[:, 1:]
+    return np.asarray(sigmoid(opacity_logits.astype(np.float64)) * np.exp(longest.sum(1)))
+
+
 def surface_areas(gaussians: Gaussians) -> Array:
-    """Return (N,) float64 opacity times the two longest axes, units^2, cut at the 99 % quantile."""
+    """Return (N,) float64 `cross_sections`, cut at the 99 % quantile; 0 of what cannot be drawn."""
     valid = gaussians.valid()
-    scales = np.sort(np.where(valid[:, None], gaussians.log_scales, -np.inf).astype(np.float64), axis=1)
-    opacity = sigmoid(np.where(valid, gaussians.opacity_logits, -np.inf).astype(np.float64))
-    areas = opacity * np.exp(scales[:, 1:].sum(1))
+    scales = np.where(valid[:, None], gaussians.log_scales, -np.inf)
+    areas = cross_sections(scales, np.where(valid, gaussians.opacity_logits, -np.inf))
     return np.minimum(areas, np.quantile(areas, 0.99)) if len(areas) else areas
 
 

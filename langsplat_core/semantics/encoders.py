@@ -138,7 +138,7 @@ def same_vectors(canonical: Array, own: Array) -> bool:
 
 
 class PhraseEncoder:
-    """The text half of a model, in float32; it satisfies `vocabulary.TextEncoder`."""
+    """The text half of a model, in float32; it satisfies `relevancy.TextEncoder`."""
 
     def __init__(self, weights: Weights, tower: TextTower) -> None:
         self.id = weights.id  # hub id or folder as it was asked for; "demo" for the bundled encoder

@@ -316,24 +316,23 @@ class Proposal:
         return mask
 
 
+@dataclass(frozen=True)
 class SamMasks(MaskSource):
     """Masks of a segmenter's answers to a grid of points."""
 
-    def __init__(self, segmenter: Segmenter, config: MaskConfig, half_on: str | None = None) -> None:
-        """half_on: type of the device on which the model multiplies in float16; None: in float32."""
-        self._segmenter = segmenter
-        self._config = config
-        self._half_on = half_on
+    segmenter: Segmenter
+    config: MaskConfig
+    half_on: str | None = None  # type of device on which the model multiplies in float16; None: in float32
 
     @property
     def name(self) -> str:
-        return f"{self._segmenter.name} {self._config.sam}"
+        return f"{self.segmenter.name} {self.config.sam}"
 
     @property
     def key(self) -> str:
         """The settings that change the masks, as JSON; the size of batches does not."""
-        settings = asdict(self._config) | {"source": "sam", "points_per_batch": 0}
-        return json.dumps(["sam", VERSION, settings, *["float16"] * bool(self._half_on)], sort_keys=True)
+        settings = asdict(self.config) | {"source": "sam", "points_per_batch": 0}
+        return json.dumps(["sam", VERSION, settings, *["float16"] * bool(self.half_on)], sort_keys=True)
 
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
         """Masks of an image (H, W, 3) uint8, by falling predicted IoU; a level may have none."""
@@ -341,18 +340,18 @@ class SamMasks(MaskSource):
 
     def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
         """Ask the model; the function that is returned compares pixels and gives the masks."""
-        crops = crop_boxes(image.shape[:2], self._config.crop_layers)
+        crops = crop_boxes(image.shape[:2], self.config.crop_layers)
         levels: list[list[Proposal]] = [[] for _ in range(MASKS_PER_POINT)]
         for index, crop in enumerate(crops):
             part = progress.part(index, len(crops))
             try:
-                found = self._in_crop(image, crop, part, self._half_on)
+                found = self._in_crop(image, crop, part, self.half_on)
             except OverflowError:
                 found = self._in_crop(image, crop, part, None)
             for proposals, more in zip(levels, found, strict=True):
                 proposals += more
         progress("finding masks", 1.0)
-        subparts, parts, wholes = (partial(filter_level, of, image.shape[:2], self._config) for of in levels)
+        subparts, parts, wholes = (partial(filter_level, of, image.shape[:2], self.config) for of in levels)
         return lambda: (subparts(), parts(), wholes())
 
     def _in_crop(
@@ -363,14 +362,14 @@ class SamMasks(MaskSource):
 
         left, top, right, bottom = crop
         part = np.ascontiguousarray(image[top:bottom, left:right])
-        points = grid_points(self._config.points_per_side, part.shape[:2])
-        step = self._config.points_per_batch
+        points = grid_points(self.config.points_per_side, part.shape[:2])
+        step = self.config.points_per_batch
         half = partial(torch.autocast, half_on or "cpu", torch.float16, enabled=half_on is not None)
         found = []
         with torch.inference_mode():
             progress("finding masks", 0.0)
             with half():
-                encoded = self._segmenter.encode(part)
+                encoded = self.segmenter.encode(part)
             for start in range(0, len(points), step):
                 if start:
                     progress("finding masks", start / len(points))
@@ -390,14 +389,14 @@ class SamMasks(MaskSource):
         import torch
 
         ious, logits = (found.flatten(0, 1).float() for found in answer)
-        rows = torch.nonzero(ious > self._config.predicted_iou)[:, 0]
-        offset = self._config.stability_offset
+        rows = torch.nonzero(ious > self.config.predicted_iou)[:, 0]
+        offset = self.config.stability_offset
         measured = [measure(encoded.enlarge(logits[some]), offset) for some in rows.split(MASKS_AT_ONCE)]
         columns = [rows % MASKS_PER_POINT, ious[rows], *torch.cat(measured).unbind(1)]
         figures = torch.stack(columns, dim=1).cpu().numpy()  # the one transfer
         figures[:, 3:] += np.tile(crop[:2], 2)
         boxes = figures[:, 3:]
-        good = (figures[:, 2] >= self._config.stability) & (boxes[:, 0] < boxes[:, 2])
+        good = (figures[:, 2] >= self.config.stability) & (boxes[:, 0] < boxes[:, 2])
         good &= ~cut_by_crop(boxes, crop, shape)
         return figures[good], logits[rows[torch.from_numpy(good).to(rows.device)]]
 
@@ -406,7 +405,7 @@ class SamMasks(MaskSource):
     ) -> list[Proposal]:
         """Return the proposals of a level whose box no better one resembles; only they leave the device."""
         rows = np.flatnonzero(figures[:, 0] == level)
-        rows = rows[box_nms(figures[rows, 3:], figures[rows, 1], self._config.box_nms)]
+        rows = rows[box_nms(figures[rows, 3:], figures[rows, 1], self.config.box_nms)]
         area = int((crop[2] - crop[0]) * (crop[3] - crop[1]))
         proposals = []
         for start in range(0, len(rows), MASKS_AT_ONCE):
