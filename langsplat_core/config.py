@@ -36,31 +36,16 @@ class Range:
         return f"above {low} and at most {high}" if self.above else f"{low} to {high}"
 
 
-@dataclass(frozen=True)
-class Setting:
-    """A field with numbers in it, of a configuration or of one that it holds."""
-
-    option: str  # as typed on the command line
-    value: Any
-    range: Range | None
-    whole: bool  # whole numbers only
-
-
 def check_settings(settings: object, option: str = "--") -> None:
     """InputError for the first number out of its field's range; `option`: before names, as ``--codec.``."""
-    for setting in numeric_settings(settings, option):
-        problem = _problem(setting)
-        if problem:
-            raise InputError(f"{setting.option} {_shown(setting.value)}: {problem}")
-
-
-def numeric_settings(settings: object, option: str = "--") -> Iterator[Setting]:
-    """Fields of a dataclass that hold numbers, and those of dataclasses in it, in their order."""
     for name, value, hint in named_values(settings, option):
-        parts = list(annotations(hint))
-        if int in parts or float in parts:
-            bound = next((part for part in parts if isinstance(part, Range)), None)
-            yield Setting(name, value, bound, whole=float not in parts)
+        if problem := _problem(value, hint):
+            raise InputError(f"{name} {_shown(value)}: {problem}")
+
+
+def range_of(hint: Any) -> Range | None:
+    """Return the range of the numbers in a field of this type."""
+    return next((part for part in annotations(hint) if isinstance(part, Range)), None)
 
 
 def named_values(settings: object, option: str = "--") -> Iterator[tuple[str, Any, Any]]:
@@ -89,16 +74,16 @@ def annotations(hint: Any) -> Iterator[Any]:
             yield hint
 
 
-def _problem(setting: Setting) -> str | None:
-    """Fault of a setting's value; None where there is none."""
-    bound, numbers = setting.range, list(_flat(setting.value))
+def _problem(value: Any, hint: Any) -> str | None:
+    """Fault of the value of a field of this type; None where there is none."""
+    bound, numbers, whole = range_of(hint), list(_flat(value)), float not in annotations(hint)
     if bound is None:
         return None
     if bound.some and not numbers:
         return "give at least one number"
-    kind: Any = Integral if setting.whole else Real
+    kind: Any = Integral if whole else Real
     if any(isinstance(number, bool) or not isinstance(number, kind) for number in numbers):
-        return f"must be {'a whole number' if setting.whole else 'a number'}, {bound}"
+        return f"must be {'a whole number' if whole else 'a number'}, {bound}"
     return None if all(map(bound.holds, numbers)) else f"must be {bound}"
 
 

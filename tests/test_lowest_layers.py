@@ -21,11 +21,12 @@ from langsplat_core.arrays import psnr, quaternions, rotation_matrices, unit
 from langsplat_core.cli.app import command_names, parse
 from langsplat_core.cli.train import Train
 from langsplat_core.compiled import Workers, is_compiled
-from langsplat_core.config import PAPER, check_settings, numeric_settings
+from langsplat_core.config import PAPER, annotations, check_settings, range_of
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.progress import Progress, Report, TerminalProgress, TimeLeft
 from langsplat_core.scene import Scene
+from tests.support.fakes import numeric_settings
 from tests.support.processes import files_of_at_most, python, refusal
 from tests.support.scenes import random_gaussians
 
@@ -373,15 +374,13 @@ def test_help_shows_the_rest_with_an_extension_hidden(hidden, monkeypatch, capsy
 CONFIGS = {
     name: value
     for name, value in vars(config).items()
-    if dataclasses.is_dataclass(value)
-    and isinstance(value, type)
-    and value not in (config.Range, config.Setting)
+    if dataclasses.is_dataclass(value) and isinstance(value, type) and value is not config.Range
 }
 SETTINGS = [
-    (name, setting)
+    (name, *setting)
     for name, cls in sorted(CONFIGS.items())
     for setting in numeric_settings(cls())
-    if "." not in setting.option  # those of configurations inside are met in their own class
+    if "." not in setting[0]  # those of configurations inside are met in their own class
 ]
 COMMANDS = (
     "train d --out s.ply",
@@ -397,15 +396,13 @@ COMMANDS = (
 )
 
 
-def outside(setting: config.Setting) -> list[Any]:
-    """Values that its range excludes, in the shape of the setting's own value."""
-    bound = setting.range
-    assert bound is not None
+def outside(own: Any, bound: config.Range, hint: Any) -> list[Any]:
+    """Values that the range of a setting excludes, in the shape of its own value."""
     below = bound.low if bound.above else bound.low - 1
     values: list[Any] = [below, bound.high * 2 + 1, 10**400, math.nan, math.inf, -math.inf, "7"]
-    if setting.whole:
+    if float not in annotations(hint):
         values.append(bound.low + 0.5)
-    found: list[Any] = [shaped(setting.value, value) for value in values]
+    found: list[Any] = [shaped(own, value) for value in values]
     return found + ([()] if bound.some else [])
 
 
@@ -414,25 +411,26 @@ def shaped(like: Any, value: Any) -> Any:
     return (*like[:-1], shaped(like[-1], value)) if isinstance(like, tuple) and like else value
 
 
-@pytest.mark.parametrize(("name", "setting"), SETTINGS, ids=lambda part: getattr(part, "option", part))
-def test_numbers_outside_their_range_are_refused_by_name(name: str, setting: config.Setting) -> None:
-    assert setting.range is not None, f"{name}: write Annotated[..., Range(...)] beside {setting.option}"
-    assert np.isfinite([setting.range.low, setting.range.high]).all()
+@pytest.mark.parametrize(("name", "option", "own", "hint"), SETTINGS)
+def test_numbers_outside_their_range_are_refused_by_name(name: str, option: str, own: Any, hint: Any) -> None:
+    bound = range_of(hint)
+    assert bound is not None, f"{name}: write Annotated[..., Range(...)] beside {option}"
+    assert np.isfinite([bound.low, bound.high]).all()
     check_settings(CONFIGS[name]())
-    field = setting.option.removeprefix("--").replace("-", "_")
-    for value in outside(setting):
+    field = option.removeprefix("--").replace("-", "_")
+    for value in outside(own, bound, hint):
         wrong = dataclasses.replace(CONFIGS[name](), **{field: value})
         with pytest.raises(InputError) as caught:
             check_settings(wrong)
         message = str(caught.value)
-        assert message.startswith(f"{setting.option} "), message
+        assert message.startswith(f"{option} "), message
         assert len(message) < 200
 
 
 @pytest.mark.parametrize("line", COMMANDS)
 def test_every_number_of_every_command_has_a_range(line: str) -> None:
     command = parse(line.split())
-    assert [setting.option for setting in numeric_settings(command) if setting.range is None] == []
+    assert [option for option, _, hint in numeric_settings(command) if range_of(hint) is None] == []
     check_settings(command)
 
 

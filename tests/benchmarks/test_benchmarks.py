@@ -17,7 +17,7 @@ from assets.making.objects import EVERYTHING
 from assets.making.world import furnished
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.cli.run import main
-from langsplat_core.config import DatasetConfig, numeric_settings
+from langsplat_core.config import DatasetConfig, range_of
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.checkpoints.langsplat_files import autoencoder_from, write_autoencoder
@@ -75,7 +75,7 @@ from tests.benchmarks.phrases import (
 from tests.benchmarks.room import InRooms, RoomSettings, Variant
 from tests.benchmarks.scale import COARSE, errors
 from tests.benchmarks.scoring import Asked, evaluate_direct
-from tests.support.fakes import PER_BLOB, FakeEncoder, blobs, cameras
+from tests.support.fakes import PER_BLOB, FakeEncoder, blobs, cameras, numeric_settings
 from tests.support.scenes import random_camera, random_gaussians
 
 THINGS = [3 * letter for letter in "abcdefghijklmnopqrtuvwxyz"]
@@ -577,7 +577,7 @@ def test_counts_give_nothing_its_due():
 
 @pytest.mark.parametrize("name", ["rooms", "verdicts", "phrases", "counts", "lifting", "scale"])
 def test_every_number_of_a_report_has_a_range(name):
-    assert [setting.option for setting in numeric_settings(parse([name])) if setting.range is None] == []
+    assert [option for option, _, hint in numeric_settings(parse([name])) if range_of(hint) is None] == []
 
 
 @pytest.mark.long

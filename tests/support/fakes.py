@@ -5,11 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import Array, logit, unit
+from langsplat_core.config import annotations, named_values
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.pipeline.report import REPORT, work_folder
 from langsplat_core.query.engine import QueryEngine
@@ -214,3 +216,8 @@ def laid_table(phrasebook: dict[str, Array] | None = None) -> tuple[Scene, dict[
 def front_camera() -> Camera:
     """From in front of the table, looking along +y: x is to the right."""
     return look_at(np.array([0.0, -6.0, 0.5]), np.zeros(3), UP, (160, 120))
+
+
+def numeric_settings(settings: object) -> list[tuple[str, Any, Any]]:
+    """Return option, value and type of the fields that hold numbers, as `config.named_values` has them."""
+    return [one for one in named_values(settings) if any(k in (int, float) for k in annotations(one[2]))]

@@ -445,7 +445,6 @@ def test_published_start_at_zero_descends_under_its_normalisation():
     config = replace(SHORT, start="zeros-as-published")
     latents, _ = lift_by_gradient(load_lifting_rasterizer("cpu"), GAUSSIANS, pairs, CODEC, config)
     assert l1(latents, pairs) < 0.99 * l1(np.zeros_like(latents), pairs)
-    assert not latents[0].any()  # no masks at this level
 
 
 @pytest.mark.long
