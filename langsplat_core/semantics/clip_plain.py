@@ -219,16 +219,18 @@ def _attention(tensors: Tensors, name: str, x: Array, later: Array | None, heads
         for part in "qkv"
     )
     shares = (query * np.float32((wide // heads) ** -0.5)) @ key.transpose(0, 1, 3, 2)
-    shares += np.float32(0) if later is None else later
+    if later is not None:
+        shares += later
     shares -= shares.max(-1, keepdims=True)
     np.exp(shares, out=shares)
-    shares /= shares.sum(-1, keepdims=True)
-    return _linear(tensors, f"{name}out_proj", (shares @ value).transpose(0, 2, 1, 3).reshape(x.shape))
+    seen = (shares @ value) / shares.sum(-1, keepdims=True)
+    return _linear(tensors, f"{name}out_proj", seen.transpose(0, 2, 1, 3).reshape(x.shape))
 
 
 def _quick_gelu(x: Array) -> Array:
+    shares = np.float32(-1.702) * x
     with np.errstate(over="ignore"):  # of a large negative number: 0
-        shares = np.exp(np.float32(-1.702) * x)
+        np.exp(shares, out=shares)
     shares += 1
     return np.asarray(np.divide(x, shares, out=shares))
 
