@@ -23,7 +23,7 @@ from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
 from langsplat_core.raster.gsplat import DifferentiableImage
 from langsplat_core.scene import Camera, Gaussians, near_plane
 from langsplat_core.scene.transform import C0
-from langsplat_core.training.radiance.losses import fit_exposure, patch_means, ssim_map, with_exposure
+from langsplat_core.training.radiance.losses import fit_exposure, patch_means, radiance_loss, with_exposure
 
 PARAMETERS = (*gsplat.RAW, "sh_dc", "sh_rest")
 
@@ -190,7 +190,7 @@ def evaluate_views(
         counted = torch.tensor(True if mask is None else mask, device=renderer.device)
         counted = counted.expand(target.shape[:2])
         target = torch.where(counted[..., None], target, image)
-        unlike = 1 - float(ssim_map(image, target).mean())
+        unlike = float(radiance_loss(image, target, 1.0))  # 1 - SSIM
         scores.append(
             ViewScore(
                 camera.name,
