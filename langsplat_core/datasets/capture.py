@@ -179,8 +179,7 @@ def shrunk_view(camera: Camera, image: Array, mask: Array | None, size: tuple[in
 
 def _rounded(values: Array) -> Array:
     """Return float64 values rounded to `DECIMALS`, without a negative zero."""
-    rounded: Array = np.round(values.astype(np.float64), DECIMALS) + 0.0
-    return rounded
+    return np.asarray(np.round(values.astype(np.float64), DECIMALS) + 0.0)
 
 
 def report_lost_points(good: Array, source: str) -> None:

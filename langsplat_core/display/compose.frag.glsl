@@ -24,14 +24,6 @@ uniform bool transparent;       // no background, alpha as a fourth channel, col
 in vec2 uv;
 out vec4 picture;
 
-vec3 mapped(float t) {
-    float position = clamp(t, 0.0, 1.0) * float(MAP_NODES - 1);
-    int low = min(int(position), MAP_NODES - 2);
-    // Two fetches, not a filtered lookup: filters round the fraction to 8 bits.
-    return mix(texelFetch(colour_maps, ivec2(low, colour_map), 0).rgb,
-               texelFetch(colour_maps, ivec2(low + 1, colour_map), 0).rgb, position - float(low));
-}
-
 vec3 oklab(vec3 colour) {  // squares stand for sRGB's curve
     vec3 c = colour * colour;
     vec3 cones = vec3(dot(c, vec3(0.4122215, 0.5363325, 0.0514460)), dot(c, vec3(0.2119035, 0.6806995, 0.1073970)),
@@ -53,11 +45,13 @@ vec3 shaded(vec3 lab, vec3 base) {
                            dot(cones, vec3(-0.0041961, -0.7034186, 1.7076147))), 0.0, 1.0));
 }
 
-vec3 mapped_lab(float t) {
+vec3 mapped(float t, bool lab) {
     float position = clamp(t, 0.0, 1.0) * float(MAP_NODES - 1);
     int low = min(int(position), MAP_NODES - 2);
-    return mix(oklab(texelFetch(colour_maps, ivec2(low, colour_map), 0).rgb),
-               oklab(texelFetch(colour_maps, ivec2(low + 1, colour_map), 0).rgb), position - float(low));
+    // Two fetches, not a filtered lookup: filters round the fraction to 8 bits.
+    vec3 first = texelFetch(colour_maps, ivec2(low, colour_map), 0).rgb;
+    vec3 second = texelFetch(colour_maps, ivec2(low + 1, colour_map), 0).rgb;
+    return lab ? mix(oklab(first), oklab(second), position - float(low)) : mix(first, second, position - float(low));
 }
 
 // 1 for each component of a layer whose mean is at least so much.
@@ -96,7 +90,7 @@ vec3 heat_map(vec3 base, vec3 values, vec2 place) {
     float value = values[query];
     vec2 range = ranges[query];
     float heat = clamp((value - range.x) / (range.y - range.x), 0.0, 1.0);
-    vec3 hot = own_colours ? oklab(query_colours[query]) : mapped_lab(heat);
+    vec3 hot = own_colours ? oklab(query_colours[query]) : mapped(heat, true);
     float shown = smoothstep(0.0, 1.0, value < 0.0 ? heat / HEAT_FADE : value / HEAT_BASE);
     if (own_colours)
         shown *= 0.5 + 0.5 * heat;
@@ -114,7 +108,7 @@ vec4 depth_map(vec2 sums) {
     vec2 range = ranges[0];
     float t = (sums.r / max(sums.g, 1e-9) - range.x) / max(range.y - range.x, 1e-9);
     vec3 backdrop = transparent ? vec3(0.0) : background;
-    return sums.g > alpha_gate ? vec4(mapped(1.0 - clamp(t, 0.0, 1.0)), 1.0) : vec4(backdrop, 0.0);
+    return sums.g > alpha_gate ? vec4(mapped(1.0 - clamp(t, 0.0, 1.0), false), 1.0) : vec4(backdrop, 0.0);
 }
 
 void main() {

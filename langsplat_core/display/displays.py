@@ -191,8 +191,7 @@ def latents(subject: Subject) -> Array | None:
     """Return (N, 3) colours of the latents at a level; None without a language field or level."""
     if subject.language is None or subject.level is None:
         return None
-    colours: Array = latent_colours(subject.language)[subject.level]
-    return colours
+    return np.asarray(latent_colours(subject.language)[subject.level])
 
 
 def latent_colours(field: LanguageField) -> Array:
@@ -274,8 +273,7 @@ _GLSL = {
 
 def gated_mean(total: Array, alpha: Array, gate: float) -> Array:
     """Weighted sums (H, W, Q) / alpha where alpha exceeds `gate`, else 0: nothing there means nothing."""
-    mean: Array = total / np.where(alpha > gate, alpha, np.float32(np.inf))[..., None]
-    return mean
+    return np.asarray(total / np.where(alpha > gate, alpha, np.float32(np.inf))[..., None])
 
 
 def full_ranges(ranges: Ranges) -> Array:

@@ -31,8 +31,7 @@ def in_sphere(means: Array, centre: Array, radius: float) -> Array:
     """Return (N,) bool: points that are finite and at most `radius` from `centre` (3,), world units."""
     offsets = np.asarray(means, np.float64) - centre
     with np.errstate(invalid="ignore"):
-        squares: Array = (offsets**2).sum(1)
-        return squares <= radius**2
+        return np.asarray((offsets**2).sum(1) <= radius**2)
 
 
 def in_box(means: Array, low: Array, high: Array) -> Array:

@@ -150,5 +150,4 @@ def _may_reach(
         across = np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5))
         down = np.abs(camera.fy * y + np.float32(camera.cy - pixel[1] - 0.5))
         in_front = (z > 0.999 * settings.near) & (z < 1.001 * protocol.farthest(settings))
-        reached: Array = in_front & ~(np.maximum(across, down) > 1.01 * reach)
-    return reached
+        return np.asarray(in_front & ~(np.maximum(across, down) > 1.01 * reach))

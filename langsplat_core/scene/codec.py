@@ -81,8 +81,7 @@ class Codec(ABC):
 
     def known(self, latents: Array) -> Array:
         """Return (M,) bool, False for latents without a meaning: vectors of zeros."""
-        known: Array = np.linalg.norm(latents, axis=1) > SHORTEST
-        return known
+        return np.asarray(np.linalg.norm(latents, axis=1) > SHORTEST)
 
     def unique(self, latents: Array) -> tuple[Array, Array]:
         """Return (U, d) latents, distinct where they repeat, and (M,) int64 index of each in them."""

@@ -301,8 +301,7 @@ class LanguageField:
     def known(self) -> Array:
         """(3, N) whether a Gaussian has a meaning at a level."""
         flat = self.codec.known(self.latents.reshape(-1, self.latents.shape[2]))
-        known: Array = (self.confidence > 0) & flat.reshape(self.confidence.shape)
-        return known
+        return np.asarray((self.confidence > 0) & flat.reshape(self.confidence.shape))
 
     def take(self, rows: Array) -> "LanguageField":
         """Return the field of the Gaussians at `rows` (indices or a boolean mask)."""

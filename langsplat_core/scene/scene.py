@@ -125,8 +125,7 @@ class Camera:
         places, z = np.asarray(pixels, np.float64), np.asarray(depths, np.float64)[..., None]
         offsets = (places - (self.cx, self.cy)) / (self.fx, self.fy) * (1.0 if self.orthographic else z)
         in_camera = np.concatenate([offsets, np.broadcast_to(z, (*offsets.shape[:-1], 1))], -1)
-        points: Array = (in_camera - self.world_to_camera[:3, 3]) @ self.rotation
-        return points
+        return np.asarray((in_camera - self.world_to_camera[:3, 3]) @ self.rotation)
 
     def pixel_centres(self) -> Array:
         """Return (H, W, 2) positions x, y of the centres of all pixels."""
@@ -136,8 +135,7 @@ class Camera:
     def in_image(self, pixels: Array, depths: Array) -> Array:
         """Return (N,) bool, which points, as of `project`, lie before the camera and inside its image."""
         with np.errstate(invalid="ignore"):
-            inside: Array = (depths > 0) & ((pixels >= 0) & (pixels < (self.width, self.height))).all(1)
-        return inside
+            return np.asarray((depths > 0) & ((pixels >= 0) & (pixels < (self.width, self.height))).all(1))
 
 
 def moved_pose(world_to_camera: Array, offset: Array) -> Array:

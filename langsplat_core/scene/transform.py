@@ -63,8 +63,7 @@ class Similarity:
         w, x, y, z = quaternions(self.rotation)
         left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
         with np.errstate(invalid="ignore"):
-            turned: Array = np.asarray(quats_wxyz, np.float64) @ left.T
-        return turned
+            return np.asarray(np.asarray(quats_wxyz, np.float64) @ left.T)
 
     def camera(self, camera: Camera) -> Camera:
         """Return `camera` moved along with the world; InputError where it would lie too far out."""

@@ -231,8 +231,7 @@ def inferred(forward: Callable[[], Any]) -> Array:
     import torch
 
     with torch.inference_mode():
-        values: Array = forward().float().cpu().numpy()
-    return values
+        return np.asarray(forward().float().cpu().numpy())
 
 
 # What families share.

@@ -356,17 +356,10 @@ class GlRasterizer:
 
     def release(self) -> None:
         """Give all device memory back; the rasterizer cannot be used afterwards."""
-        if self._targets is not None:
-            self._targets.release()
-            self._targets = None
-        if self._scene is not None:
-            self._scene.release()
-            self._scene = None
-        for program in self._splats.values():
-            program.release()
-        self._splats.clear()
-        self._project_vao.release()
-        self._project.release()
+        programs: list[Any] = [*self._splats.values(), self._project_vao, self._project]
+        for resource in (self._targets, self._scene, *programs):
+            if resource is not None:
+                resource.release()
 
 
 class GlView(View):

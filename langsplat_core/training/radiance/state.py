@@ -161,18 +161,12 @@ def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | Non
     state.seen = torch.zeros(len(state), device=state.device)
 
 
-def clean_gradients(state: TrainingState) -> None:
-    """Zero gradient entries that are NaN or infinite: one bad pixel must not end a training."""
-    for value in state.values.values():
-        if value.grad is not None:
-            value.grad.nan_to_num_(0.0, 0.0, 0.0)
-
-
 def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
     """Update each parameter that has a gradient by Adam (Kingma and Ba 2015), and drop the gradients."""
     for name, value in state.values.items():
         if value.grad is None or value.numel() == 0:
             continue
+        value.grad.nan_to_num_(0.0, 0.0, 0.0)  # one bad pixel must not end a training
         updates = torch.full((), float(state.updates[name]), device=state.device)  # not copied to a GPU
         with torch.no_grad():
             adam(

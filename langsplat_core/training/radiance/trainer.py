@@ -286,7 +286,6 @@ class _Run:
         loss = loss + losses.radiance_loss(image, target, config.lambda_dssim)
         loss.backward()
         training.add_opacity_decay(state, config.opacity_decay)
-        training.clean_gradients(state)
         if step < schedule.densify_until:
             training.accumulate(
                 state, rendered.means_px_grad(), rendered.visible, (camera.width, camera.height)
