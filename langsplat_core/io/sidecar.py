@@ -420,16 +420,12 @@ def rematch_language(sidecar: Path | str, new_means: Array) -> LanguageField:
         distance, nearest = points.query(new_means[new_rows])
         found = distance <= np.median(spacing) + stored.precision
         partner[new_rows[found]] = old_rows[nearest[found]]
-    field = replace(
-        field,
-        latents=np.pad(field.latents, ((0, 0), (0, 1), (0, 0)))[:, partner],
-        confidence=np.pad(field.confidence, ((0, 0), (0, 1)))[:, partner],
-        tree=None,
-    )
-    if stored.field.tree is None:
-        return field
-    leaves = np.pad(stored.field.tree.leaves, (0, 1), constant_values=NO_NODE)[partner]
-    return replace(field, tree=replace(stored.field.tree, leaves=leaves))
+    tree = field.tree
+    if tree is not None:
+        tree = replace(tree, leaves=np.pad(tree.leaves, (0, 1), constant_values=NO_NODE))
+    latents = np.pad(field.latents, ((0, 0), (0, 1), (0, 0)))
+    confidence = np.pad(field.confidence, ((0, 0), (0, 1)))
+    return replace(field, latents=latents, confidence=confidence, tree=tree).take(partner)
 
 
 # ---- positions in 8 bytes: 21 bits an axis, between the corners of their box ----

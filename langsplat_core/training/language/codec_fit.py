@@ -196,7 +196,7 @@ def fit_codebook(
         most = max(min(len(fitted) // 4, 65_535), 1)
         codewords = _smallest(grow, error, most, config.max_relevancy_error)
     progress("colours of the codewords", 0.8)
-    nearest, _ = nearest_centres(fitted, codewords)
+    nearest = nearest_centres(fitted, codewords)[0]
     usage = np.bincount(nearest, minlength=len(codewords)).astype(np.float64)
     return codebook_of(codewords, usage)
 
@@ -245,14 +245,11 @@ CHUNK = 8_192  # vectors compared with all centres at a time
 STEP = 8  # one in so many centres is added, or given up, at a time
 
 
-def nearest_centres(vectors: Array, centres: Array) -> tuple[Array, Array]:
-    """Return the (M,) int64 nearest of (K, D) unit centres, and (M,) float32 cosines."""
-    nearest, cosines, _ = _assigned(vectors, centres)
-    return nearest, cosines
+def nearest_centres(vectors: Array, centres: Array, gains: bool = False) -> tuple[Array, Array, Array]:
+    """Return the (M,) int64 nearest of (K, D) unit centres, and its (M,) float32 cosine with each vector.
 
-
-def _assigned(vectors: Array, centres: Array, gains: bool = False) -> tuple[Array, Array, Array]:
-    """Return (M,) nearest centre of each vector, its cosine, and, if asked, how much further the next is."""
+    And if `gains` are asked for, (M,) float32, by how much less the cosine with the next is.
+    """
     nearest, cosines = np.empty(len(vectors), np.int64), np.empty(len(vectors), np.float32)
     gain = np.zeros(len(vectors), np.float32)
     for part in pieces(len(vectors), CHUNK):
@@ -299,7 +296,7 @@ def _worth_keeping(vectors: Array, centres: Array, size: int) -> tuple[Array, Ar
     Where there are more than `size`. Only one in `STEP` goes at a time, because of two that are alike neither
     is missed.
     """
-    nearest, _, gain = _assigned(vectors, centres, gains=True)
+    nearest, _, gain = nearest_centres(vectors, centres, gains=True)
     missed = np.bincount(nearest, gain, len(centres))  # by how much the sum of cosines would fall
     spare = min(max(len(missed) - size, 0), 1 + len(missed) // STEP)
     kept = np.bincount(nearest, minlength=len(centres)) > 0
