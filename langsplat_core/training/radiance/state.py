@@ -162,11 +162,14 @@ def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | Non
 
 
 def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
-    """Update each parameter that has a gradient by Adam (Kingma and Ba 2015), and drop the gradients."""
+    """Update each parameter that has a gradient by Adam (Kingma and Ba 2015), and drop the gradients.
+
+    Entries that are NaN or infinite count as zero: one bad pixel must not end a training.
+    """
     for name, value in state.values.items():
         if value.grad is None or value.numel() == 0:
             continue
-        value.grad.nan_to_num_(0.0, 0.0, 0.0)  # one bad pixel must not end a training
+        value.grad.nan_to_num_(0.0, 0.0, 0.0)
         updates = torch.full((), float(state.updates[name]), device=state.device)  # not copied to a GPU
         with torch.no_grad():
             adam(
