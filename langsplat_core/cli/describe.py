@@ -14,7 +14,7 @@ import tyro
 
 from langsplat_core.arrays import Array, length_text
 from langsplat_core.cli.arguments import EncoderOption, JsonOption, Level, Needs, TrainedScene
-from langsplat_core.cli.query import Unit, basis_fields, camera_of, in_world, unit_of
+from langsplat_core.cli.query import Unit, basis_fields, camera_of, in_world
 from langsplat_core.cli.run import aligned, print_json
 from langsplat_core.config import CountOrZero, PictureConfig
 from langsplat_core.errors import EncoderError, InputError
@@ -77,7 +77,7 @@ class Describe:
             print_json(counts | {"outline" if self.outline else "inventory": found} | basis_fields(engine))
             return
         if self.outline:
-            print(*outline_lines(found, unit_of(scene.metres_per_unit, scene.origin)), sep="\n")
+            print(*outline_lines(found, Unit(scene.metres_per_unit, scene.origin)), sep="\n")
         else:
             _print_inventory(found, scene.origin)
         print(f"answers: {engine.basis.long}")

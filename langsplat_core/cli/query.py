@@ -45,14 +45,18 @@ log = logging.getLogger("langsplat")
 class Unit:
     """The unit that lengths are printed and given in, and what places are relative to."""
 
-    name: str  # "m" or "units"
-    length: float  # world units -> this
+    metres: float | None  # per world unit; None where nobody said, which is the unit then
     origin: Array  # (3,) world units, of the scene
 
     @property
-    def metres(self) -> float | None:
-        """Metres per world unit; None where nobody said."""
-        return self.length if self.name == "m" else None
+    def name(self) -> str:
+        """Name of the unit, for people."""
+        return "units" if self.metres is None else "m"
+
+    @property
+    def length(self) -> float:
+        """Length of a world unit in this one."""
+        return self.metres or 1.0
 
     def format(self, values: Array, between: str = " ") -> str:
         """Lengths in world units as numbers of this unit, joined by `between`."""
@@ -61,11 +65,6 @@ class Unit:
     def place(self, place: Array) -> str:
         """Return a place in the scene as numbers of this unit, in the world."""
         return length_text(self.length * place, origin=self.length * self.origin)
-
-
-def unit_of(metres_per_unit: float | None, origin: Array) -> Unit:
-    """Return the unit of lengths in a scene: metres where a scale is known, else world units."""
-    return Unit("units", 1.0, origin) if metres_per_unit is None else Unit("m", metres_per_unit, origin)
 
 
 PLACES = ("place", "centre", "box")  # keys of positions
@@ -195,7 +194,7 @@ class QueryScene:
         explain = _Explainer(self, scene) if self.why is not None else None
         camera = camera_of(scene, self.camera or 0) if scene.cameras or self.camera else None
         engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
-        unit = unit_of(self.scale or scene.metres_per_unit, scene.origin)
+        unit = Unit(self.scale or scene.metres_per_unit, scene.origin)
         texts = self._askable(engine, camera)
         outlined = self._outlined(scene, texts) if self.segmenter else {}
         drawn = camera if self.camera is not None or len(texts) <= CHANNELS_AT_ONCE else None
@@ -443,7 +442,7 @@ class Select:
         """Select, write the file, and print what is in it."""
         self._check()
         scene = searchable(self.scene)
-        unit = unit_of(self.scale or scene.metres_per_unit, scene.origin)
+        unit = Unit(self.scale or scene.metres_per_unit, scene.origin)
         engine = _engine(scene, load_text_encoder, self.encoder, self.taught)
         answers = [found_answer(engine, text, self.level) for text in self.texts]
         answer = answers[0] if len(answers) == 1 else compose.joined(answers, all_needed=True)

@@ -130,21 +130,15 @@ def _print_rows(rows: Iterable[tuple[str, str]]) -> None:
 
 def _machine() -> dict[str, str]:
     """Return what this machine has."""
-    cores = f"{os.cpu_count()} cores"
-    machine = {
-        "langsplat": __version__,
-        "python": f"{platform.python_version()} on {platform.platform()}, {cores}",
-    }
+    about = f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"
+    machine = {"langsplat": __version__, "python": about}
     machine |= {name: _version(name) for name in ("numpy", "numba", "moderngl", "imgui-bundle", *OPTIONAL)}
     if sys.platform == "linux":
         for library, package in LIBRARIES.items():
             found = ctypes.util.find_library(library)
             machine[f"lib{library}"] = found or f"missing: apt install {package}"
         machine["DISPLAY"] = os.environ.get("DISPLAY") or "not set: use --headless"
-    return machine | {
-        "OpenGL": _opengl(),
-        "text encoder": _encoder(),
-    }
+    return machine | {"OpenGL": _opengl(), "text encoder": _encoder()}
 
 
 def _opengl() -> str:

@@ -31,7 +31,7 @@ from plyfile import PlyData, PlyElement
 from langsplat_core.arrays import unit
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.describe import outline_lines, outline_of
-from langsplat_core.cli.query import unit_of
+from langsplat_core.cli.query import Unit
 from langsplat_core.config import DatasetConfig, check_settings
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import load_colmap
@@ -539,7 +539,7 @@ def searched(path: Path) -> float:
     engine.instances(answer)
     describer = Describer(engine, ["cup"])
     scene_inventory(describer)
-    outline_lines(outline_of(describer), unit_of(None, scene.origin))
+    outline_lines(outline_of(describer), Unit(None, scene.origin))
     values = np.concatenate([answer.relevancy.T, *latent_colours(field)], axis=1)
     drawn = render(scene, scene.framing_camera((32, 24)), values)
     assert np.isfinite(values).all()

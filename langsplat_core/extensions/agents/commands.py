@@ -20,7 +20,7 @@ from langsplat_core import __version__
 from langsplat_core.arrays import Array, decimals_of
 from langsplat_core.cli.arguments import EncoderOption
 from langsplat_core.cli.describe import outline_lines, outline_of
-from langsplat_core.cli.query import Unit, camera_of, unit_of
+from langsplat_core.cli.query import Unit, camera_of
 from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
 from langsplat_core.extensions.library.index import scenes_in
 from langsplat_core.interrupts import end, handled
@@ -204,7 +204,7 @@ def _first(scene: Scene) -> Camera | None:
 
 
 def _unit(scene: Scene) -> Unit:
-    return unit_of(scene.metres_per_unit, scene.origin)
+    return Unit(scene.metres_per_unit, scene.origin)
 
 
 def _places(values: Array | None, unit: Unit) -> Any:

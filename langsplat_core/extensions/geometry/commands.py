@@ -10,7 +10,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, Needs, OutFile, OutFolder
-from langsplat_core.cli.query import found_answer, unit_of
+from langsplat_core.cli.query import Unit, found_answer
 from langsplat_core.config import Count, LevelChoice, Positive
 from langsplat_core.errors import EncoderError, InputError, malformed, optional_imports, printable_line
 from langsplat_core.extensions.geometry.occupancy import (
@@ -78,7 +78,7 @@ class WriteMesh:
         check_suffix(self.out)
         check_keeps(self.out, self.scene)
         scene = searchable(self.scene) if self.phrase else load_scene(self.scene)
-        unit = unit_of(scene.metres_per_unit, scene.origin)
+        unit = Unit(scene.metres_per_unit, scene.origin)
         if self.phrase:
             engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
             scene = scene.take(found_answer(engine, self.phrase, self.level).members)

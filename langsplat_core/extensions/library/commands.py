@@ -10,7 +10,7 @@ import tyro
 
 from langsplat_core.arrays import length_text
 from langsplat_core.cli.arguments import EncoderOption, JsonOption, TrainedScene
-from langsplat_core.cli.query import Unit, in_world, once, unit_of
+from langsplat_core.cli.query import Unit, in_world, once
 from langsplat_core.cli.run import print_json
 from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError, report_loss
@@ -72,7 +72,7 @@ class Find:
 def _said(hit: Hit) -> str:
     place = "place not looked for" if hit.answer is None else "place -"
     if hit.answer is not None and hit.answer.place is not None:
-        unit = unit_of(hit.metres_per_unit, hit.origin)
+        unit = Unit(hit.metres_per_unit, hit.origin)
         place = f"place {unit.place(hit.answer.place)} {unit.name}"
     return f"{hit.said}, {place}"
 
@@ -147,7 +147,7 @@ class Changes:
         scenes = searchable(self.before), searchable(self.after)
         origin = scenes[0].origin
         placed = between_worlds(told, -scenes[1].origin, -origin).matrix
-        unit = unit_of(self.scale or scenes[0].metres_per_unit, origin)
+        unit = Unit(self.scale or scenes[0].metres_per_unit, origin)
         unsure = None in [scene.metres_per_unit for scene in scenes]
         first, second = (QueryEngine(scene, load_text_encoder, encoder_id=self.encoder) for scene in scenes)
         with TerminalProgress() as progress:
