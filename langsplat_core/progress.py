@@ -12,6 +12,8 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+import msgspec
+
 log = logging.getLogger("langsplat")
 
 
@@ -27,12 +29,7 @@ class Report:
     @classmethod
     def from_json(cls, line: str) -> "Report":
         """Return the report in a line of `line_progress`; ValueError for any other line."""
-        try:
-            stated = json.loads(line)
-            metrics = {str(name): float(value) for name, value in stated.get("metrics", {}).items()}
-            return cls(str(stated["stage"]), float(stated["fraction"]), str(stated.get("note", "")), metrics)
-        except (TypeError, KeyError, AttributeError):
-            raise ValueError("no line of progress") from None
+        return msgspec.convert(json.loads(line), cls)
 
     @property
     def text(self) -> str:

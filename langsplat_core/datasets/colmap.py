@@ -330,7 +330,6 @@ def load_colmap(folder: Path, model_folder: Path, config: DatasetConfig, progres
     # Without a folder of their own, photographs lie in the dataset's.
     images = folder / "images" if (folder / "images").is_dir() or not model.images else folder
     photos = located_photos(model, images)
-    # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
     there = [photo for photo in photos if os.path.isfile(photo.path)]
     missing = {photo.label for photo in photos} - {photo.label for photo in there}
     if photos and not there:

@@ -179,8 +179,7 @@ def _axes(records: bytes, path: Path, tell: Tell) -> int:
 #
 # Version 3 is written unless told otherwise. Its rotations are exact to 0.1 degrees where those of version 2
 # err by up to a degree. What reads the newer version 4, which differs in the container alone, reads 3 too,
-# but for PlayCanvas's engine, and many that read 3 do not know 4. Both hold the record of the axes. Source:
-# nianticlabs/spz; the code here is our own.
+# but for PlayCanvas's engine, and many that read 3 do not know 4. Both hold the record of the axes.
 
 COLOUR_SCALE = 0.15
 SMALLEST, LARGEST = -10, 255 / 16 - 10  # logarithms of sizes

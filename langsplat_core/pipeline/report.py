@@ -15,6 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from PIL import Image
 
@@ -67,9 +68,7 @@ def work_folder(out: Path) -> Path:
 
 def read_report(work: Path) -> TrainReport:
     """Read the report of the run which has just ended, in this process or another."""
-    stated = json.loads((work / REPORT).read_text(encoding="utf-8"))
-    scores = tuple(ViewScore(**score) for score in stated.get("held_out_views", ()))
-    return TrainReport(**stated | {"warnings": tuple(stated["warnings"]), "held_out_views": scores})
+    return msgspec.convert(json.loads((work / REPORT).read_bytes()), TrainReport)
 
 
 def stated_figures(path: Path) -> dict[str, Any]:
