@@ -64,7 +64,7 @@ class Command:
     button: str = ""  # its label in a panel
     repeats: bool = False  # while held
     is_edit: bool = False  # belongs to the box while one types, as it does everywhere
-    is_on: Callable[[Viewer], bool] | None = None  # for a check mark in the menu
+    is_on: Callable[[Viewer], bool] = lambda viewer: False  # for a check mark in the menu
     apart: bool = False  # a line is above it in the menu
     now: Callable[[Viewer], str] = lambda viewer: ""  # words for the menu in place of `does`
 
@@ -202,6 +202,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("invert the selection", editing.invert_selection, ("Ctrl+I",), "Invert", is_edit=True),
         Command("select what the search found", editing.select_query, apart=True),
         Command("select everything like the selection", editing.select_alike, (), "More like it"),
+        Command("name the selection ...", editing.ask_for_name, ("F2",)),
         Command("grow the selection", editing.grow_selection, (), "Grow"),
         Command("shrink the selection", editing.shrink_selection, (), "Shrink"),
         Command(
@@ -342,6 +343,7 @@ SYNONYMS = {
     "remove all queries": "clear reset delete search results answers",
     "undo": "back revert",
     "gizmo: move, rotate, scale, box, off": "transform translate turn resize handles crop box",
+    "name the selection ...": "rename teach label call",
     "delete the selection": "remove erase clean cut crop",
     "export the selection ...": "save extract cut out ply",
     "compare two displays": "split side by side beside wipe divide",

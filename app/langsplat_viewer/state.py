@@ -296,6 +296,7 @@ class ViewerState(SceneState):
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
     focus_input: bool = False  # the query box takes the keyboard at the next frame
+    focus_name: bool = False  # that for a name of what is selected does
     awaits_keyboard: bool = False  # keys wait until a box has it
     letters_muted: bool = False  # letters are no keys: they were meant for a box that is not there
 

@@ -550,6 +550,11 @@ def large_letters(s: Any) -> None:
     s.settle()
     assert imgui.internal.find_window_by_name("Messages").dock_id == docked
     assert abs(s.state.size[0] - narrow) < 0.15 * narrow
+    settings.prefer(s.viewer, ui_scale=1.5, panels=("Display",))
+    s.search("mug or plant", stay=True)
+    card, legend = map(imgui.internal.find_window_by_name, ("Search", "relevancy"))
+    assert legend.active
+    assert card.pos.x + card.size.x <= legend.pos.x
 
 
 def use_the_outline(s: Any) -> None:
@@ -567,6 +572,10 @@ def use_the_outline(s: Any) -> None:
     s.click(f"{row}eye")
 
     use_the_outline_by_keys(s, first)
+    s.key("f2", frames=6)  # names what is selected
+    s.enter("my first")
+    assert (result(s, -1).phrase, s.state.drafts.get("##phrase", "")) == ("my first", "")
+    s.key("escape", frames=3)
     s.key("R")
     s.ctx.mouse_move_to_pos(s.on_screen(CENTRES[1]))
     s.ctx.yield_(2)

@@ -21,6 +21,7 @@ from langsplat_core.scene import LEVELS
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
 from langsplat_viewer import marks
 from langsplat_viewer.actions.queries import ask_listed, forget_unlisted, teach, teach_given
+from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.marks import Drawn, Marks, Mode, Stroke, Tool
 from langsplat_viewer.rendering.request import UNCLIPPED
@@ -146,6 +147,13 @@ def of_thing(act: Callable[[Viewer, Array], None]) -> Callable[[Viewer, Target],
             viewer.ask_engine("finding the thing", work, done)
 
     return begin
+
+
+def ask_for_name(viewer: Viewer) -> None:
+    """Have the box for a name of what is selected take the keyboard."""
+    if has_selection(viewer):
+        open_panel(viewer, "Selection")
+        viewer.state.focus_name = viewer.state.awaits_keyboard = True
 
 
 def name_selection(viewer: Viewer, name: str) -> None:

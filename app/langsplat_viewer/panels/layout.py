@@ -231,7 +231,7 @@ def draw_over(
     if said:
         overlays.say(said, free)
     elif not state.show_start:
-        overlays.draw_legends(viewer, area)
+        overlays.draw_legends(viewer, area, free)
         outline.draw_legend(viewer, area)
         overlays.draw_pointing(viewer)
         select.draw_stroke(viewer, area)

@@ -37,8 +37,7 @@ def _items(viewer: Viewer, commands: Sequence[Command]) -> None:
             imgui.separator()
         does = command.now(viewer) or command.does
         title = does[0].upper() + does[1:]
-        is_on = command.is_on is not None and command.is_on(viewer)
-        if imgui.menu_item(title, ", ".join(command.keys[:1]), is_on)[0]:
+        if imgui.menu_item(title, ", ".join(command.keys[:1]), command.is_on(viewer))[0]:
             command.act(viewer)
 
 
@@ -88,7 +87,7 @@ def draw_toolbar(viewer: Viewer, area: ui.Area) -> float:
 
 
 def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
-    lit = command.is_on is not None and command.is_on(viewer)
+    lit = command.is_on(viewer)
     with theme.styled(button="pressed" if lit else theme.CLEAR, text="accent" if lit else "ink"):
         clicked = imgui.button(button_label(command), ImVec2(side, side))
     if clicked:

@@ -148,16 +148,10 @@ def _things_menu(viewer: Viewer, target: Target) -> None:
         if imgui.menu_item(label, "", False)[0]:
             act(viewer, target)
     imgui.separator()
-    name = _named("##name this", "name this", "")
-    if name:
-        outline.give_name(viewer, target, name)
+    entered, name = ui.box("##name this", "name this", "", hello_imgui.em_size(11))
+    if entered and name.strip():
+        outline.give_name(viewer, target, name.strip())
         imgui.close_current_popup()
-
-
-def _named(label: str, hint: str, text: str) -> str:
-    """Draw a box for a name; return the name once it is entered, else ""."""
-    entered, typed = ui.box(label, hint, text, hello_imgui.em_size(11))
-    return typed.strip() if entered else ""
 
 
 # The legend of displays that have a colour for each thing.

@@ -337,13 +337,13 @@ def _notes(notes: Sequence[Note], pen: Pen) -> None:
 # The legend of relevancy, and words in place of an image.
 
 STEPS = 32  # of a colour bar
-BAR_EM, BAR_HEIGHT_EM = 11.0, 0.8
+BAR_EM, BAR_HEIGHT_EM, LEAST_EM, AROUND_EM = 11.0, 0.8, 6.0, 3.0  # least: beside the search; around the bar
 
 
-def draw_legends(viewer: Viewer, area: ui.Area) -> None:
-    """Draw the legend of the scene, and of the one beside it, each on its side of the line."""
+def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
+    """Draw the legend of the scene, where it is `free`; with one beside it each on its side of the line."""
     if viewer.beside is None:
-        draw_legend(viewer, area)
+        draw_legend(viewer, free)
         return
     sides = ((viewer, "left"), (viewer.beside, "right"))
     for (side, name), part in zip(sides, parts_of(area, viewer.state.session.split), strict=False):
@@ -367,7 +367,8 @@ def draw_legend(viewer: Viewer, area: ui.Area, name: str = "relevancy") -> None:
             if result is not None:
                 by = picture.colour_map if len(slots) == 1 else slot
                 colours = bar_colours(STRENGTH[result.verdict], by)
-                _bar(result, colours, picture.heat_scale or result.heat_range)
+                width = min(BAR_EM, max(area.width / hello_imgui.em_size(1) - AROUND_EM, LEAST_EM))
+                _bar(result, colours, picture.heat_scale or result.heat_range, hello_imgui.em_size(width))
 
 
 def legend(name: str, area: ui.Area) -> AbstractContextManager[None]:
@@ -398,9 +399,9 @@ def bar_colours(strength: float, by: ColourMap | int) -> Array:
     return (0.5 + 0.5 * heat)[:, None] * QUERY_COLOURS[by] if isinstance(by, int) else mapped(heat, by)
 
 
-def _bar(result: QueryResult, colours: Array, ends: tuple[float, float]) -> None:
+def _bar(result: QueryResult, colours: Array, ends: tuple[float, float], width: float) -> None:
     """Phrase, bar with a tick at the threshold, and the relevancies at its ends and in its middle."""
-    width, height = hello_imgui.em_size(BAR_EM), hello_imgui.em_size(BAR_HEIGHT_EM)
+    height = hello_imgui.em_size(BAR_HEIGHT_EM)
     imgui.text_unformatted(ui.elided(result.phrase, width))
     start, (low, high) = imgui.get_cursor_screen_pos(), ends
     draw_bar(start, width, height, colours)

@@ -134,11 +134,11 @@ HIDDEN = (0.25, 0.25, 0.25)
 
 def _answers(viewer: Viewer) -> None:
     """Draw the list, newest first, and below it the chosen query."""
-    if viewer.state.session.queries and ui.begin_list("queries", MOST_ROWS):
-        for query in reversed(viewer.state.session.queries):
-            with imgui_ctx.push_id(query.phrase):
-                _line(viewer, query)
-    if viewer.state.session.queries:
+    if listed := viewer.state.session.queries:
+        if ui.begin_list("queries", MOST_ROWS):
+            for query in reversed(listed):
+                with imgui_ctx.push_id(query.phrase):
+                    _line(viewer, query)
         imgui.end_child()
     chosen = viewer.state.session.query(viewer.state.session.chosen)
     if chosen is not None:
@@ -212,17 +212,13 @@ def _details(viewer: Viewer, query: Query) -> None:
         queries.answer(viewer, query.phrase, shown_with=[query.phrase], alike=True)
     _uncover(viewer, answer)
     if imgui.tree_node_ex("Threshold, scores, place", imgui.TreeNodeFlags_.no_tree_push_on_open):
-        _figures(viewer, query, answer, result)
-
-
-def _figures(viewer: Viewer, query: Query, answer: QueryAnswer, result: QueryResult) -> None:
-    _cut(viewer, query, result)
-    _scores(result)
-    if result.place is not None:
-        ui.coloured("at " + length_text(result.place, "  ", 2, viewer.state.origin))
-        ui.tip("Where it is relevant most; world units")
-    if not answer.has_evidence:
-        ui.small_wrapped(NO_EVIDENCE)
+        _cut(viewer, query, result)
+        _scores(result)
+        if result.place is not None:
+            ui.coloured("at " + length_text(result.place, "  ", 2, viewer.state.origin))
+            ui.tip("Where it is relevant most; world units")
+        if not answer.has_evidence:
+            ui.small_wrapped(NO_EVIDENCE)
 
 
 def _uncover(viewer: Viewer, answer: QueryAnswer) -> None:

@@ -274,11 +274,8 @@ def choice(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = N
         if rows[-1] and sum(widths[other] for other in rows[-1]) + width > room:
             rows.append([])
         rows[-1].append(value)
-    height, paint, start = (
-        imgui.get_frame_height(),
-        imgui.get_window_draw_list(),
-        imgui.get_cursor_screen_pos(),
-    )
+    height, paint = imgui.get_frame_height(), imgui.get_window_draw_list()
+    start = imgui.get_cursor_screen_pos()
     end = ImVec2(start.x + room, start.y + len(rows) * height)
     rounding = imgui.get_style().frame_rounding
     paint.add_rect_filled(start, end, imgui.get_color_u32(imgui.Col_.frame_bg), rounding)
