@@ -131,12 +131,8 @@ def test_page_draws_heat_and_latents_as_opengl_does(tab, demo, engine, gl, measu
     values, ranges = heats(Subject(len(demo.gaussians), answers=[answer])), heat_ranges([answer])
     compare(measured, "demo, heat", ours, drawn(gl, demo, camera, values, display="relevancy", ranges=ranges))
     ours = tab.image(camera, origin, "latent")
-    compare(
-        measured,
-        "demo, latent",
-        ours,
-        drawn(gl, demo, camera, latent_colours(demo.language)[2], display="latent"),
-    )
+    theirs = drawn(gl, demo, camera, latent_colours(demo.language)[2], display="latent")
+    compare(measured, "demo, latent", ours, theirs)
 
 
 def hard(kind: str) -> Gaussians:
@@ -162,20 +158,14 @@ def hard(kind: str) -> Gaussians:
     return replace(gaussians, means=broken, opacity_logits=np.where(np.arange(600) % 7, logits, -np.inf))
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        *(f"degree {degree}" for degree in range(4)),
-        *("one", "flat and needles", "right angles", "far away", "broken rows"),
-    ],
-)
+OTHERS = "one", "flat and needles", "right angles", "far away", "broken rows"
+
+
+@pytest.mark.parametrize("kind", [*(f"degree {degree}" for degree in range(4)), *OTHERS])
 def test_page_draws_hard_scenes_as_opengl_does(browser, gl, measured, tmp_path, kind):
     scene = Scene(hard(kind), antialiased=kind == "degree 1")
-    camera = (
-        Scene(random_gaussians(600, 4)).framing_camera((320, 240))
-        if kind == "one"
-        else scene.framing_camera((320, 240))
-    )
+    framed = Scene(random_gaussians(600, 4)) if kind == "one" else scene
+    camera = framed.framing_camera((320, 240))
     with open_tab(browser, exported(tmp_path, scene)) as tab:
         ours = tab.image(camera, scene.bounds()[0])
         assert tab.run("async () => (await langsplat).page.language") is None
