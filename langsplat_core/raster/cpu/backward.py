@@ -184,16 +184,6 @@ def _add_up(rank: int, tiles: Tiles, sums: Sums, out: Array) -> bool:
     return some
 
 
-@helper
-def _clear(i: int, out: GaussianGradients) -> None:
-    out.means[i] = 0
-    out.log_scales[i] = 0
-    out.quats_wxyz[i] = 0
-    out.opacity_logits[i] = 0
-    out.values[i] = 0
-    out.means_px[i] = 0
-
-
 # From here on eight Gaussians at once: numbers are lanes, vectors tuples of three.
 
 
@@ -346,7 +336,7 @@ def to_parameters(
     camera: cp.KernelCamera,
     out: GaussianGradients,
 ) -> None:
-    """Fill `out` for rows [first, last).
+    """Fill `out`, which is 0, for rows [first, last) that are drawn.
 
     Sums what `backward` left, in the order of the tiles, and pulls the moments back through the projection.
     """
@@ -356,9 +346,7 @@ def to_parameters(
     for i in range(first, last):
         _fetch(i, last, tiles, sums)
         rank = sums.rank_of[i]
-        if rank < 0 or not _add_up(rank, tiles, sums, added[number]):
-            _clear(i, out)
-        else:
+        if rank >= 0 and _add_up(rank, tiles, sums, added[number]):
             out.values[i] = added[number, MOMENTS : MOMENTS + out.values.shape[1]]
             which[number], ranks[number], number = i, rank, number + 1
         if number == 8 or (number > 0 and i == last - 1):

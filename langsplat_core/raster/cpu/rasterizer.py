@@ -357,7 +357,7 @@ class CpuView(LiftingView):
         partial, reached = self._empty((met, columns), np.float32), np.empty(met, bool)
         self._over_tiles(backward.backward, plain(values[self.order]), grads, partial, reached)
         shapes = (3,), (3,), (4,), (), (channels,), (2,)
-        out = GaussianGradients(*(self._empty((n, *shape), np.float32) for shape in shapes))
+        out = GaussianGradients(*(np.zeros((n, *shape), np.float32) for shape in shapes))
         rank_of = np.full(n, -1, np.int32)
         rank_of[self.order] = np.arange(len(self.order), dtype=np.int32)
         sums = backward.Sums(rank_of, partial, reached)
