@@ -28,7 +28,6 @@ from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.selection import of_rows, shares_in_masks
-from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
@@ -291,17 +290,17 @@ class _Explainer:
         with TerminalProgress() as progress:
             place = asked.scene, scene, asked.work, asked.photographs
             self._photographs = kept_photographs(*place, progress)
-        self._rasterizer, self._sheets = load_rasterizer("cpu"), list[Array]()
+        self._sheets = list[Array]()
 
     def __call__(
         self, engine: QueryEngine, answer: QueryResult, phrases: tuple[str, ...]
     ) -> dict[str, Any] | None:
         """Return the evidence of an answer, ready for JSON; it is drawn too."""
         with TerminalProgress() as progress:
-            found = find_evidence(engine, answer, phrases, self._features, self._rasterizer, progress)
+            found = find_evidence(engine, answer, phrases, self._features, progress)
         if found is None:
             return None
-        source = engine.scene, self._features, self._photographs, self._rasterizer
+        source = engine.scene, self._features, self._photographs
         self._sheets.append(draw_evidence(found, answer, *source))
         return {
             "summary": str(found),

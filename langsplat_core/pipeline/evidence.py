@@ -22,7 +22,6 @@ from langsplat_core.pipeline.report import REPORT, stated_figures, work_folder
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.surface import SMALLEST
@@ -87,7 +86,6 @@ def find_evidence(
     answer: QueryResult,
     phrases: Sequence[str],
     features: Sequence[ImageFeatures],
-    rasterizer: Rasterizer,
     progress: Progress = silent,
 ) -> Evidence | None:
     """Return the evidence of the best region of `answer`; None where no region answers.
@@ -111,7 +109,7 @@ def find_evidence(
                 f"{seen.labels.shape[1]} pixels and {seen.vectors.shape[1]} numbers, not {camera.width}x"
                 f"{camera.height} and {size}; name this scene's own folder with --work"
             )
-        shown = _shown(scene, view, found[1], rasterizer)
+        shown = _shown(scene, view, found[1])
         if shown.sum() >= SHOWN:
             mask, overlap = _nearest(seen, shown)
             cosine = fit = None
@@ -137,9 +135,9 @@ def _best_region(engine: QueryEngine, answer: QueryResult) -> tuple[int, Array] 
     return best, inside & (at == best)
 
 
-def _shown(scene: Scene, view: int, members: Array, rasterizer: Rasterizer) -> Array:
+def _shown(scene: Scene, view: int, members: Array) -> Array:
     """Return (H, W) bool pixels of a view that these Gaussians paint more than half of."""
-    drawn = view_of(scene, scene.cameras[view], rasterizer)
+    drawn = view_of(scene, scene.cameras[view])
     return np.asarray(drawn.splat(members[:, None].astype(np.float32))[0][..., 0] > SOLID)
 
 
@@ -235,7 +233,6 @@ def draw_evidence(
     scene: Scene,
     features: Sequence[ImageFeatures],
     photographs: Mapping[str, Array],
-    rasterizer: Rasterizer,
 ) -> Array:
     """Return an (H, W, 3) uint8 contact sheet: the best votes, the worst ones, those against the answer."""
     rows = {"best votes": evidence.votes[:FEW]}
@@ -253,7 +250,7 @@ def draw_evidence(
         top = 3 * LINE + row * step
         brush.text((GAP, top), title, INK, font)
         for column, vote in enumerate(votes):
-            shown = _shown(scene, vote.view, evidence.members, rasterizer)
+            shown = _shown(scene, vote.view, evidence.members)
             mask = (features[vote.view].labels == vote.mask).any(0) & (vote.mask >= 0)
             left = GAP + column * (SIDE + GAP)
             thumbnail = _thumbnail(photographs[vote.photograph], mask, shown)

@@ -95,7 +95,7 @@ def engine(scene) -> QueryEngine:
 
 @pytest.fixture(scope="module")
 def evidence(engine, features) -> Evidence:
-    found = find_evidence(engine, engine.run("mug"), ["mug"], features, load_rasterizer("cpu"))
+    found = find_evidence(engine, engine.run("mug"), ["mug"], features)
     assert found is not None
     return found
 
@@ -151,13 +151,13 @@ def test_the_share_is_that_of_a_beta_distribution(evidence, votes, others):
 
 def test_nothing_answers_without_members(engine, features):
     nothing = replace(engine.run("mug"), members=np.zeros(len(MUG), bool))
-    assert find_evidence(engine, nothing, ["mug"], features, load_rasterizer("cpu")) is None
+    assert find_evidence(engine, nothing, ["mug"], features) is None
 
 
 def test_evidence_of_several_is_of_the_best_region(engine, features):
     both = run_phrase(engine, "mug or plant").answer
     uneven = replace(both, even=np.where(MUG, both.even, 0.5 * both.even))
-    found = find_evidence(engine, uneven, ["plant", "mug"], features, load_rasterizer("cpu"))
+    found = find_evidence(engine, uneven, ["plant", "mug"], features)
     assert both.members.sum() > MUG.sum()
     np.testing.assert_array_equal(found.members, MUG)
     assert found.phrase == "mug"
@@ -170,7 +170,7 @@ def test_features_of_another_scene_are_refused(engine, features, wrong):
         labels[..., :-1] if wrong == "size" else labels, vectors[:, : DIM - (wrong != "size")]
     )
     with pytest.raises(FormatError, match="another scene"):
-        find_evidence(engine, engine.run("mug"), ["mug"], [other] * VIEWS, load_rasterizer("cpu"))
+        find_evidence(engine, engine.run("mug"), ["mug"], [other] * VIEWS)
 
 
 # On the command line, with what a training keeps.
@@ -280,7 +280,7 @@ def test_a_training_keeps_all_that_is_needed(tmp_path):
     engine, seen = QueryEngine(scene), kept_features(tmp_path / "a.ply", scene)
     photographs = kept_photographs(tmp_path / "a.ply", scene)
     assert [image.shape[:2] for image in photographs.values()] == [(48, 64)] * len(scene.cameras)
-    found = find_evidence(engine, engine.run("red mug"), ["red mug"], seen, load_rasterizer("cpu"))
+    found = find_evidence(engine, engine.run("red mug"), ["red mug"], seen)
     assert found is not None
     assert found.votes or found.others
     with pytest.raises(InputError, match="--work"):
@@ -290,7 +290,7 @@ def test_a_training_keeps_all_that_is_needed(tmp_path):
 def test_a_taught_word_is_compared_with_what_was_shown(engine, features):
     """No text says what it is; the mask of another region is told from those of what was shown."""
     engine.teach("gizmo", MUG, "whole")
-    found = find_evidence(engine, engine.run("gizmo"), ["gizmo"], features, load_rasterizer("cpu"))
+    found = find_evidence(engine, engine.run("gizmo"), ["gizmo"], features)
     np.testing.assert_array_equal(found.members, MUG)
     *right, wrong = found.votes
     assert wrong.view == WRONG

@@ -22,7 +22,6 @@ from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.inventory import Suggestions, combined, completions, corrected, suggest
 from langsplat_core.query.rule import Verdict
-from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
 from langsplat_viewer.actions.settings import open_panel
@@ -252,11 +251,10 @@ def explain(viewer: Viewer, query: Query) -> None:
     def work(progress: Progress) -> Array:
         features = kept_features(path, scene)
         photographs = kept_photographs(path, scene, progress=progress)
-        rasterizer = load_rasterizer("cpu")
-        found = find_evidence(engine, result, asked_for, features, rasterizer, progress)
+        found = find_evidence(engine, result, asked_for, features, progress)
         if found is None:
             raise InputError(f"'{query.phrase}': nothing in the scene answers")
-        return draw_evidence(found, result, scene, features, photographs, rasterizer)
+        return draw_evidence(found, result, scene, features, photographs)
 
     def done(image: Array) -> None:
         if query.phrase in state.answers:
