@@ -87,7 +87,7 @@ _Format = tuple[str, tuple[str, ...], str]
 FIELD: _Format = ("langsplat", ("1", "2", "3"), "a language field")
 WORDS: _Format = ("langsplat words", ("1",), "taught words")
 
-_Odds = tuple[float, float, float, float]
+_Odds = Annotated[list[float], Meta(min_length=4, max_length=5)]
 _Count = Annotated[int, Meta(ge=1, le=MOST_SHOWN)]
 _PARSED: Mapping[str, Any] = {  # metadata that are JSON
     "d": int,
@@ -95,7 +95,7 @@ _PARSED: Mapping[str, Any] = {  # metadata that are JSON
     "phrases": list[str],
     "temperature": float,
     "found": float,
-    "odds": tuple[_Odds, _Odds, _Odds],
+    "odds": Annotated[list[_Odds], Meta(min_length=3, max_length=5)],  # older: 3, of 4 numbers
     "origin": tuple[float, float, float],
     "taught": list[tuple[str, int, _Count]],
 }

@@ -307,12 +307,13 @@ REJECTED = 0.95  # of what is absent, among the phrases that a calibration is fi
 def fit_scaling(present: Array, absent: Array) -> PlattScaling:
     """Fit to (P, 3) fits of phrases for what is there and (A, 3) of others, which weigh the same.
 
-    Raises InputError where there are fewer than ten of either, or the fits do not tell them apart.
+    A fourth column, the mean fits of phrases, counts too. Raises InputError where there are fewer than ten of
+    either, or the fits do not tell them apart.
     """
     if min(len(present), len(absent)) < FEWEST:
         raise InputError("a calibration needs ten phrases for what is there and ten for what is not")
     fits = np.concatenate([present, absent])
-    features = np.stack([fits[:, 2], fits[:, :2].max(axis=1)], axis=1)
+    features = np.column_stack([fits[:, 2], fits[:, :2].max(axis=1), fits[:, 3:]])
     targets = np.repeat(
         [(len(present) + 1) / (len(present) + 2), 1 / (len(absent) + 2)], [len(present), len(absent)]
     )
@@ -322,16 +323,17 @@ def fit_scaling(present: Array, absent: Array) -> PlattScaling:
         logits = parameters[0] + features @ parameters[1:]
         return float((weights * (np.logaddexp(0, logits) - targets * logits)).sum())
 
-    constant, whole, finer = minimize(loss, np.array([0.0, 10.0, 0.0]), method="BFGS").x.round(3)
+    start = np.array([0.0, 10.0, 0.0, 0.0])[: 1 + features.shape[1]]
+    constant, whole, finer, *common = minimize(loss, start, method="BFGS").x.round(3).tolist()
     if whole + finer <= 0:
         raise InputError("what is there has no larger fits than what is not: nothing to calibrate")
-    plain = PlattScaling(float(constant), float(whole), float(finer))
+    plain = PlattScaling(constant, whole, finer, **dict(zip(["common"], common, strict=False)))
     highest = float(np.quantile(_probabilities(plain, absent), REJECTED, method="higher"))
     return replace(plain, found=float(np.ceil(1000 * max(highest, RULE.weak_probability)) / 1000))
 
 
 def _probabilities(scaling: PlattScaling, fits: Array) -> Array:
-    return np.array([scaling.probability((m[0], m[1], m[2])) for m in fits.tolist()])
+    return np.array([scaling.probability((m[0], m[1], m[2]), sum(m[3:])) for m in fits.tolist()])
 
 
 def _cross_validated(present: Array, absent: Array) -> tuple[float, float]:

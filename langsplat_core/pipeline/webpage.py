@@ -60,7 +60,8 @@ from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary
 # In an order in which each imports only those before it, so that their code can stand in one script.
 MODULES = ("words", "rule", "encoder", "camera", "space", "language", "data", "draw", "headset", "page")
 BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, without its imports and exports
-LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL", "MEASURES", "OWNERS")
+LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "COLOURS", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL",
+         "MEASURES", "OWNERS")  # fmt: skip
 TABLES = ("SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")  # beside the lists of words, in query/grammar.py
 STILL = 1280  # pixels of the longer side of the picture in the page
 WIDE = 10  # columns of 16 bits: means, scales, quaternions

@@ -58,6 +58,7 @@ class QueryResult(Judged):
     even: Deferred = Deferred()  # (N,) float32 relevancy at the level, the same all over a region
     members: Deferred = Deferred()  # (N,) bool: the Gaussians that answer, wherever they are
     own_cut: float | None = None  # relevancy from which on everything is a member, where it was set by hand
+    common: float = 0.0  # mean fit of the regions that the verdict counts
     engine: Any = None  # the QueryEngine that was asked, whose scene a notebook shows
 
     def __repr__(self) -> str:
@@ -272,6 +273,7 @@ def by_regions(
         even=lambda: regions.spread(chosen, decision.relevancies, values[relevancy.features[chosen]]),
         peak=decision.scores[chosen],
         fits=decision.fits,
+        common=decision.common,
         judgement=decision.verdict,
         members=lambda: regions.spread(chosen, decision.inside, np.zeros(len(means), bool)),
         place=place,

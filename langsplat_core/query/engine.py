@@ -31,7 +31,7 @@ from langsplat_core.query.answers import (
 from langsplat_core.query.grammar import STOP_WORDS, check_names, named, only, thing_and_part
 from langsplat_core.query.instances import Instance, find_instances, find_wholes
 from langsplat_core.query.lookup import Lookup, Relevancy, through_cells
-from langsplat_core.query.rule import Bars, bars_of, decide, on_things
+from langsplat_core.query.rule import Bars, bars_of, decide, on_things, scaling_of
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
@@ -177,8 +177,9 @@ class QueryEngine:
         if thing is not None:
             fits += [] if part is None else [part]
             on = on_things(self.regions.table, thing)
-        judged = self.bars, self.calibration, on
-        decision = decide(self.regions.table, fits, named(phrase), level, *judged)
+        sought = named(phrase)
+        judged = self.bars, scaling_of(self.calibration, sought, phrase), on
+        decision = decide(self.regions.table, fits, sought, level, *judged)
         return by_regions(phrase, relevancy, decision, means, self.regions)
 
     def run_inside(
@@ -194,7 +195,7 @@ class QueryEngine:
         relevancy = replace(asked[0], values=np.mean([one.values for one in asked], axis=0))
         fits, on, table = list(map(self._own_fits, asked)), self.regions.mostly(members), self.regions.table
         bars = self.bars if calibration else bars_of(table, self.chance, on)
-        decision = decide(table, fits, "inside", level, bars, calibration, on)
+        decision = decide(table, fits, "inside", level, bars, scaling_of(calibration, "inside", names[0]), on)
         return by_regions(names[0], relevancy, decision, self.scene.gaussians.means, self.regions)
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:

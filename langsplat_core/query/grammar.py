@@ -22,16 +22,18 @@ STOP_WORDS = ARTICLES | _words(
     "then there here what where which who whose how i you he she we they me us them so do does did except "
     "please"
 )
-# Words that describe and name nothing: "red handle" is one thing, "mug handle" is a part of another.
-ADJECTIVES = _words(
+COLOURS = _words(
     "red orange yellow green blue purple pink brown black white grey gray beige turquoise cyan magenta "
-    "violet gold golden silver maroon navy teal olive cream tan light dark bright pale deep colourful "
-    "colorful plain striped dotted checkered spotted patterned wooden wood metal metallic steel iron plastic "
-    "glass leather cloth fabric cotton paper rubber ceramic porcelain stone marble concrete wax woollen "
-    "woolen straw big large huge small little tiny tall short long wide narrow thin thick flat round square "
-    "curved straight pointed sharp soft hard smooth rough shiny matte old new broken clean dirty open closed "
-    "empty full upper lower left right front rear back middle top bottom outer inner first second third "
-    "other same very"
+    "violet gold golden silver maroon navy teal olive cream tan"
+)
+# Words that describe and name nothing: "red handle" is one thing, "mug handle" is a part of another.
+ADJECTIVES = COLOURS | _words(
+    "light dark bright pale deep colourful colorful plain striped dotted checkered spotted patterned "
+    "wooden wood metal metallic steel iron plastic glass leather cloth fabric cotton paper rubber ceramic "
+    "porcelain stone marble concrete wax woollen woolen straw big large huge small little tiny tall short "
+    "long wide narrow thin thick flat round square curved straight pointed sharp soft hard smooth rough "
+    "shiny matte old new broken clean dirty open closed empty full upper lower left right front rear back "
+    "middle top bottom outer inner first second third other same very"
 )
 # Of these, what is a thing where no noun follows: "a mug and a glass".
 ALSO_NOUNS = _words("orange glass stone paper light cloth gold silver metal wood leather straw iron")

@@ -15,8 +15,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.config import LevelChoice
-from langsplat_core.query.grammar import Named
-from langsplat_core.scene import LEVELS, Calibration, Fits
+from langsplat_core.query.grammar import COLOURS, Named
+from langsplat_core.scene import LEVELS, Calibration, Fits, PlattScaling
 from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, fit_of
 
@@ -287,26 +287,35 @@ def combined(verdicts: Sequence[Verdict], all_needed: bool) -> Verdict:
     )
 
 
+def scaling_of(calibration: Calibration | None, sought: Sought, phrase: str) -> PlattScaling | None:
+    """Return the logistic function of a calibration that is for a phrase; None without a calibration."""
+    if calibration is None or sought == "inside":
+        return None if calibration is None else calibration.inside
+    coloured = not COLOURS.isdisjoint(phrase.lower().split()[:-1])
+    if sought == "thing":
+        return calibration.coloured_thing if coloured else calibration.thing
+    return calibration.coloured_part if coloured else calibration.part
+
+
 def judge(
     fits: Fits,
     sought: Sought,
     level: LevelChoice,
     bars: Bars | None,
-    calibration: Calibration | None,
+    scaling: PlattScaling | None,
     common: float = 0.0,
 ) -> Verdict:
-    """Return the verdict that the best fits of a scene's levels stand for; `bars` without a calibration.
+    """Return the verdict that the best fits of a scene's levels stand for; `bars` without a `scaling`.
 
-    common: the phrase's own of `common_fits`, if the bars are of a whole scene.
+    common: the phrase's own of `common_fits`, in the scene or on the thing.
     """
-    if calibration is None:
+    if scaling is None:
         assert bars is not None
-        subpart, part, whole = (fit - RULE.common_share * common for fit in fits)
+        share = 0 if sought == "inside" else RULE.common_share  # on one thing, bars keep what is in common
+        subpart, part, whole = (fit - share * common for fit in fits)
         margin = excess((subpart, part, whole), bars, sought, level)
         return Verdict(margin >= 0, "chance", margin)
-    ways = {"thing": calibration.thing, "inside": calibration.inside}
-    scaling = ways.get(sought, calibration.part)
-    probability = scaling.probability(fits)
+    probability = scaling.probability(fits, common)
     margin = float(logit(np.array(probability)) - logit(np.array(min(scaling.found, 1 - RULE.narrowest))))
     # It may be there, but what the wanted level shows is nearer to other phrases.
     shown = level == "auto" or sought == "inside" or fits[LEVELS.index(level)] >= 0
@@ -323,6 +332,7 @@ class Decision:
     level: int  # index into LEVELS
     scores: Fits  # best relevancy per level
     fits: Fits  # of the best region per level that the verdict counts
+    common: float  # mean fit of the regions that it counts
     relevancies: Array  # (r,) float32 of the regions of the level
     inside: Array  # (r,) bool: the regions that answer
     best: int  # the region that the place is taken from; -1 for none
@@ -335,7 +345,7 @@ def decide(
     sought: Sought,
     level: LevelChoice,
     bars: Bars,
-    calibration: Calibration | None,
+    scaling: PlattScaling | None,
     on: Array | None = None,
 ) -> Decision:
     """Return the answer of the whole regions of a scene that fit nearly as well as the best one.
@@ -346,11 +356,11 @@ def decide(
     Verdicts count the first name, in all regions, or on the thing where a part is sought "inside".
     """
     every, fits = region_fits(table, own[0]), region_fits(table, np.mean(own, axis=0))
-    common = float(common_fits(table, every)[0])
     if on is not None:
         fits = np.where(on, fits, RULE.nothing)
     if on is not None and sought == "inside":
-        every, common = np.where(on, every, RULE.nothing), 0.0
+        every = np.where(on, every, RULE.nothing)
+    common = float(common_fits(table, every)[0])
     evidence = triple(fit_of(best_relevancies(table, region_relevancies(every))[0]))
     relevancies = region_relevancies(fits)
     scores = best_relevancies(table, relevancies)[0]
@@ -366,10 +376,11 @@ def decide(
         level=chosen,
         scores=triple(scores),
         fits=evidence,
+        common=common,
         relevancies=shown,
         inside=table.level(chosen, fits) >= RULE.least_fit(float(best[chosen])),
         best=int(solid.argmax()) if solid.max(initial=0) > 0 else -1,
-        verdict=judge(evidence, sought, level, bars, calibration, common),
+        verdict=judge(evidence, sought, level, bars, scaling, common),
     )
 
 

@@ -186,34 +186,41 @@ class PlattScaling:
     """Platt scaling (Platt 1999): the probability as a logistic function of the best fits of an answer.
 
     ``probability = sigmoid(constant + whole * fit of whole things + finer * the better one of the finer
-    levels)``, present and absent being as likely beforehand.
+    levels + common * mean fit of all regions)``, present and absent being as likely beforehand.
     """
 
     constant: float
     whole: float
     finer: float
     found: float = 0.75  # probability from which a phrase counts as found; 0.5 up to here is a weak match
+    common: float = 0.0
 
     def __post_init__(self) -> None:
         slopes = (self.whole, self.finer)
-        bounded = (np.abs([self.constant, *slopes]) <= LARGEST).all()
+        bounded = (np.abs([self.constant, *slopes, self.common]) <= LARGEST).all()
         if not (bounded and sum(slopes) > 0 and 0.5 <= self.found <= 1):
             raise ValueError(f"{self}: expected up to {LARGEST:g}, rising with fits, and found in [0.5, 1]")
 
-    def probability(self, fits: Fits) -> float:
-        """Return the probability, in (0, 1), that what is asked for is there."""
+    def probability(self, fits: Fits, common: float = 0.0) -> float:
+        """Return the probability, in (0, 1), that what is asked for is there; common: its mean fit."""
         subpart, part, whole = fits
-        logit = self.constant + self.whole * whole + self.finer * max(subpart, part)
+        logit = self.constant + self.whole * whole + self.finer * max(subpart, part) + self.common * common
         return float(sigmoid(np.array(logit)))
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Platt scaling for each of the three ways in which something is looked for: their fits differ."""
+    """Platt scaling for each of the ways in which something is looked for: their fits differ."""
 
     thing: PlattScaling  # "mug": anything, among all that there is
     part: PlattScaling  # "handle": a part of whatever has one
     inside: PlattScaling  # "handle of the mug": a part, among what is on a thing that is there
+    coloured_thing: PlattScaling | None = None  # "red mug", which lies farther from everything than "mug"
+    coloured_part: PlattScaling | None = None  # "red handle"; None: as without the colour
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "coloured_thing", self.coloured_thing or self.thing)
+        object.__setattr__(self, "coloured_part", self.coloured_part or self.part)
 
 
 # The language field: what every Gaussian means, at three levels.

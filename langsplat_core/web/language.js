@@ -13,6 +13,7 @@ import {
   onThings,
   regionRelevancies,
   regionsAt,
+  scalingOf,
   sigmoid,
   strongest,
   verdict,
@@ -177,7 +178,8 @@ class Language {
     const on = Array.from(this.regions.sizes, (_, region) => isWithin(this.regions, region, among));
     const known = asked.filter(Boolean);
     const fits = known.map((one) => this.ownFits(one));
-    const decision = decide(rule, this.regions, fits, "inside", levels.indexOf(levelName), this.meta, on);
+    const [level, evidence] = [levels.indexOf(levelName), { scaling: scalingOf(calibration, "inside") }];
+    const decision = decide(rule, this.regions, fits, "inside", level, evidence, on);
     return this.answer(phrase, decision, mean(known));
   }
 
@@ -243,9 +245,12 @@ class Language {
     const named = namedBy(phrase, this.lists);
     const others = thingAndPart(phrase, this.lists).map((name) => this.known(name));
     const [own, thing, part] = [relevancies, ...others].map((one) => one && this.ownFits(one));
-    const on = thing && onThings(this.meta.rule, this.regions, thing);
+    const { rule, bars, calibration } = this.meta;
+    const on = thing && onThings(rule, this.regions, thing);
     const fits = thing && part ? [own, part] : [own];
-    const decision = decide(this.meta.rule, this.regions, fits, named, level, this.meta, on);
+    const coloured = key.split(" ").slice(0, -1).some((word) => this.lists.colours.has(word));
+    const evidence = { bars, scaling: scalingOf(calibration, named, coloured) };
+    const decision = decide(rule, this.regions, fits, named, level, evidence, on);
     return this.answer(phrase, decision, relevancies);
   }
 

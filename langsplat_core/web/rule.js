@@ -126,25 +126,31 @@ function combined(rule, verdicts, all, absent = false) {
   return verdict(rule, found, way, absent ? -Infinity : score("margin"), probability);
 }
 
+// The logistic function of a calibration that is for a phrase, or for one with a colour.
+function scalingOf(calibration, named, coloured = false) {
+  const kind = named === "part of a thing" ? "part" : named;
+  return calibration?.[coloured ? `coloured_${kind}` : kind];
+}
+
 // The verdict that the best fits of the levels stand for. level: number, or -1 where it is free. common: the
 // phrase's mean fit.
-function judge(rule, fits, named, level, { bars, calibration }, common) {
-  if (!calibration) {
+function judge(rule, fits, named, level, { bars, scaling }, common) {
+  if (!scaling) {
     const evidence = fits.map((fit) => fit - rule.common_share * common);
     const margin = excess(rule, evidence, named, level, bars);
     return verdict(rule, margin >= 0, "chance", margin);
   }
-  const odds = calibration[named] ?? calibration.part;
-  const logits = odds.constant + odds.whole * fits[2] + odds.finer * Math.max(fits[0], fits[1]);
+  const { constant, whole, finer, found } = scaling;
+  const logits = constant + whole * fits[2] + finer * Math.max(fits[0], fits[1]) + scaling.common * common;
   const probability = sigmoid(logits);
   const shown = level < 0 || named === "inside" || fits[level] >= 0;
-  const margin = logits - logit(Math.min(odds.found, 1 - rule.narrowest));
-  return verdict(rule, shown && probability >= odds.found, "calibration", margin, probability);
+  const margin = logits - logit(Math.min(found, 1 - rule.narrowest));
+  return verdict(rule, shown && probability >= found, "calibration", margin, probability);
 }
 
 // The answer of the whole regions that fit nearly as well as the best one: its level, `scores` and `fits` of
 // all levels, the regions that are `inside`, the `best` one that the place is of (-1: none), and the verdict.
-// evidence: { bars, calibration }. own: of every name of what is sought. on: whether each region is on the thing
+// evidence: { bars, scaling }. own: of every name of what is sought. on: whether each region is on the thing
 // that it is a part of, if it is.
 function decide(rule, regions, own, named, level, evidence, on = null) {
   const anywhere = regionFits(rule, regions, own[0]);
@@ -174,7 +180,7 @@ function decide(rule, regions, own, named, level, evidence, on = null) {
     regionFits: every,
     inside: numbers.filter((region) => every[region] >= least),
     best: strongest(solid, relevancies),
-    verdict: judge(rule, fits, named, level, evidence, commonFit(rule, regions, anywhere)),
+    verdict: judge(rule, fits, named, level, evidence, commonFit(rule, regions, heard)),
   };
 }
 
@@ -199,6 +205,7 @@ export {
   onThings,
   regionRelevancies,
   regionsAt,
+  scalingOf,
   sigmoid,
   strongest,
   verdict,

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from assets.making.dataset import PHRASE_KINDS, Region
+from assets.making.kit import COLOURS
 from assets.making.objects import EVERYTHING
 from assets.making.world import TIERS, Tier, part_words
 from langsplat_core.arrays import Array, logit, sigmoid
@@ -307,9 +308,11 @@ def _cell(shares: Array) -> str:
 
 BINS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # of probability
 SHARES = (0.9, 0.95, 0.98)  # of absent things rejected, at which acceptance is reported
-PAIRS = {  # what is looked for -> the kinds of phrases that are there and that are not
+PAIRS = {  # field of `Calibration` -> the kinds of phrases that are there and that are not
     "thing": ("object", "absent"),
+    "coloured_thing": ("colour+object", "absent colour+object"),
     "part": ("part", "absent part"),
+    "coloured_part": ("colour+part", "absent colour+part"),
     "inside": ("part of thing", "absent part of thing"),
 }
 SHOWN = {"thing shown elsewhere": ("shown", "absent shown")}  # these answer by likeness to examples
@@ -354,8 +357,9 @@ class Verdict:
     tier: str
     seed: int
     text: str
-    kind: str  # one of those in `PAIRS` and `SHOWN`, or "colour+object"
+    kind: str  # one of those in `PAIRS` and `SHOWN`
     fits: Fits  # of the best region of each level
+    common: float  # mean fit of the regions
     probability: float | None
     found: bool
     excess: float | None = None  # spreads above what is found; None where the verdict is not reached by these
@@ -363,15 +367,21 @@ class Verdict:
 
 def _verdict(room: Room, text: str, kind: str, answer: QueryResult) -> Verdict:
     excess = answer.judgement.margin if answer.judgement.reached in IN_SPREADS else None
-    return Verdict(room.tier, room.seed, text, kind, answer.fits, answer.probability, answer.found, excess)
+    said = answer.probability, answer.found, excess
+    return Verdict(room.tier, room.seed, text, kind, answer.fits, answer.common, *said)
 
 
 def measure_verdicts(room: Room, engine: QueryEngine) -> list[Verdict]:
     """Every phrase of one room, present and absent."""
     parts, absent_parts = _part_words(room)
     asked = [(p.text, p.kind) for p in room.truth.phrases if p.kind in ("object", "colour+object")]
-    asked += product(room.truth.absent(EVERYTHING), ["absent"])
-    asked += [*product(parts, ["part"]), *product(absent_parts, ["absent part"])]
+    things, absent = [text for text, kind in asked if kind == "object"], room.truth.absent(EVERYTHING)
+    asked += [
+        *product(absent, ["absent"]),
+        *product(parts, ["part"]),
+        *product(absent_parts, ["absent part"]),
+    ]
+    asked += _coloured(room, things, absent, "object") + _coloured(room, parts, absent_parts, "part")
     asked = [(text, kind) for text, kind in asked if not engine.unknown_words(text)]
     answers = engine.run_many([text for text, _ in asked])
     said = [(text, kind, answer) for (text, kind), answer in zip(asked, answers, strict=True)]
@@ -421,6 +431,21 @@ def _part_words(room: Room) -> tuple[list[str], list[str]]:
     return sorted(parts), sorted(_uncalled(PARTS, room.truth.words))
 
 
+def _coloured(room: Room, there: Sequence[str], absent: Sequence[str], kind: str) -> list[tuple[str, str]]:
+    """(phrase, kind): what is there in its colours, if parts, and in another; what is not there, in any."""
+    rng, known = np.random.default_rng((room.seed, 13, len(kind))), room.truth.words
+    parts = [region for region in room.truth.regions.values() if kind == "part" and region.colour]
+    right = {f"{region.colour} {region.word}" for region in parts if region.word in there}
+    wrong = (
+        next(f"{x} {word}" for x in rng.permutation(COLOURS) if f"{x} {word}" not in known) for word in there
+    )
+    absent_in = (f"{rng.choice(COLOURS)} {word}" for word in absent)
+    return [
+        *product(sorted(right), [f"colour+{kind}"]),
+        *product([*wrong, *absent_in], [f"absent colour+{kind}"]),
+    ]
+
+
 def _inside(room: Room, engine: QueryEngine) -> Iterator[tuple[str, str]]:
     """(phrase, kind): every part of every thing of the room, and as many that it has not."""
     rng = np.random.default_rng((room.seed, 11))
@@ -448,9 +473,13 @@ def _uncalled(words: Iterable[str], called: AbstractSet[str]) -> list[str]:
 
 def fit_calibration(rows: Sequence[Verdict]) -> Calibration:
     """Platt scaling of all kinds of phrases. Raises as `fit_scaling` does."""
-    fits = {kind: np.array([row.fits for row in own]) for kind, own in grouped(rows, "kind").items()}
+    fits = {k: np.array([(*row.fits, row.common) for row in own]) for k, own in grouped(rows, "kind").items()}
     return Calibration(
-        **{name: fit_scaling(fits[there], fits[not_]) for name, (there, not_) in PAIRS.items()}
+        **{
+            # Two colours of one thing have about the same mean fit: there it tells nothing.
+            name: fit_scaling(*(fits[kind][:, : 3 if "coloured" in name else 4] for kind in pair))
+            for name, pair in PAIRS.items()
+        }
     )
 
 
@@ -467,9 +496,8 @@ def verdict_table(rows: Sequence[Verdict]) -> str:
     at = (f"accepted at {100 * share:.0f} % rejected" for share in SHARES)
     head = ("tier", "asked for", "phrases", "accepted %", "absent rejected %", "ROC area %", *at)
     lines = []
-    asked = {"thing": PAIRS["thing"], "colour + thing": ("colour+object", "absent"), **PAIRS, **SHOWN}
     for tier, own in grouped(rows, "tier").items():
-        for name, pair in asked.items():
+        for name, pair in {**PAIRS, **SHOWN}.items():
             here = [row for row in own if row.kind in pair]
             if any(row.kind == pair[0] for row in here):
                 rooms = grouped(here, "seed").values()

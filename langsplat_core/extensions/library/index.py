@@ -52,6 +52,7 @@ from langsplat_core.query.rule import (
     judge,
     region_fits,
     region_relevancies,
+    scaling_of,
     triple,
 )
 from langsplat_core.scene import LEVELS, NO_ORIGIN, Calibration, LanguageField, Scene
@@ -544,8 +545,8 @@ def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[Verdict]:
     for text, vector in vectors.items():
         for row, (scene, fits, common) in enumerate(zip(group.scenes, *fits_in(group, vector), strict=True)):
             if scene.is_indexed:
-                judged = scene.bars, scene.calibration or kept, float(common)
-                verdict = judge(triple(fits), named(text), "auto", *judged)
+                scaling = scaling_of(scene.calibration or kept, named(text), text)
+                verdict = judge(triple(fits), named(text), "auto", scene.bars, scaling, float(common))
                 best[row] = max(best[row], verdict, key=lambda found: found.margin)
     return best
 
