@@ -326,7 +326,8 @@ def furnished(seed: int, tier: Tier) -> list[Placed]:
     room = _large_things(kit)
     objects = _chosen(kit, plan)
     table = StandingArea(np.zeros(3), _HALF_TABLE, plan.gap, ENLARGED, plan.crowd)
-    on_table = [table.stand(thing, rng) for thing in _wide_first(objects[: plan.table])]
+    wide_first = sorted(objects[: plan.table], key=_area, reverse=True)  # while there is room for them
+    on_table = [table.stand(thing, rng) for thing in wide_first]
     floor = StandingArea(np.array([0, 0, -furniture.TABLE_HEIGHT]), np.array([1.5, 1.5]), 0.03, ENLARGED)
     floor.taken = [
         footprint(item) for item in room if item.thing.word not in ("floor", "rug", "wall", "picture")
@@ -341,11 +342,6 @@ def _area(thing: Thing) -> float:
     """Footprint of the box around a thing as it stands in the room, square metres."""
     low, high = bounds(thing)
     return float(np.prod((high - low)[:2])) * ENLARGED**2
-
-
-def _wide_first(things: list[Thing]) -> list[Thing]:
-    """Wide things find room only while there is some."""
-    return sorted(things, key=lambda thing: -_area(thing))
 
 
 def _chosen(kit: Kit, plan: _Plan) -> list[Thing]:

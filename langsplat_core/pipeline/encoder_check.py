@@ -323,11 +323,11 @@ def fit_scaling(present: Array, absent: Array) -> PlattScaling:
         logits = parameters[0] + features @ parameters[1:]
         return float((weights * (np.logaddexp(0, logits) - targets * logits)).sum())
 
-    start = np.array([0.0, 10.0, 0.0, 0.0])[: 1 + features.shape[1]]
+    start = np.eye(1, 1 + features.shape[1], 1)[0]
     constant, whole, finer, *common = minimize(loss, start, method="BFGS").x.round(3).tolist()
     if whole + finer <= 0:
         raise InputError("what is there has no larger fits than what is not: nothing to calibrate")
-    plain = PlattScaling(constant, whole, finer, **dict(zip(["common"], common, strict=False)))
+    plain = PlattScaling(constant, whole, finer, common=sum(common, 0.0))
     highest = float(np.quantile(_probabilities(plain, absent), REJECTED, method="higher"))
     return replace(plain, found=float(np.ceil(1000 * max(highest, RULE.weak_probability)) / 1000))
 

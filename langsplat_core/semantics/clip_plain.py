@@ -138,8 +138,7 @@ class PlainClipImages:
         first = np.broadcast_to(tensors[f"{PATCHES}class_embedding"], (len(pixels), 1, len(weight)))
         x = np.concatenate([first, patches], 1) + tensors[f"{PATCHES}position_embedding.weight"]
         x = _layers(tensors, SEEN, self.config, _norm(tensors, f"{SEEN}pre_layrnorm", x, eps))  # spelt so
-        last = _norm(tensors, f"{SEEN}post_layernorm", x[:, 0], eps)
-        return last @ tensors["visual_projection.weight"].T
+        return _norm(tensors, f"{SEEN}post_layernorm", x[:, 0], eps) @ tensors["visual_projection.weight"].T
 
 
 def plain_image_tower(weights: Weights, statistics: tuple[Array, Array]) -> PlainClipImages | None:

@@ -380,8 +380,7 @@ def _special_token(weights: Weights, tokenizer: Any, role: str, usual: tuple[str
     """Return the number of the token with a role: as the folder states it, else by its usual names."""
     stated = None
     with suppress(OSError, ValueError, AttributeError, RecursionError):
-        text = (weights.folder / "tokenizer_config.json").read_text(encoding="utf-8")
-        stated = json.loads(text).get(role)
+        stated = json.loads((weights.folder / "tokenizer_config.json").read_bytes()).get(role)
     for token in (stated.get("content") if isinstance(stated, dict) else stated, *usual):
         number = tokenizer.token_to_id(token) if isinstance(token, str) else None
         if number is not None:

@@ -159,8 +159,7 @@ def mask_nms(masks: Array, scores: Array, config: MaskConfig) -> Array:
     share = common / np.maximum(area[:, None], 1)  # of the row's mask that lies in the column's
     # nearly all of it in another mask, which is more than twice as large
     inside = (share >= 0.85) & (share.T < 0.5) & (1 - share * share.T > config.nms_inner)
-    keep = (scores > config.nms_score) & ~rival.any(axis=1) & ~inside.any(axis=1)
-    return np.flatnonzero(keep)
+    return np.flatnonzero((scores > config.nms_score) & ~rival.any(axis=1) & ~inside.any(axis=1))
 
 
 # Hierarchical merging of the regions of a photograph: the data structure behind the graph's masks.

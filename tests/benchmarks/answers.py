@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise, permutations, product
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -338,7 +337,8 @@ class Verdicts(InRooms):
             rows += ask_elsewhere([show_things(room, engine) for room, engine in rooms])
         if self.fit is not None:
             calibration = fit_calibration(rows)
-            write_calibration(self.fit, calibration)
+            stated = json.loads(self.fit.read_text(encoding="utf-8")) if self.fit.exists() else {}
+            write_json(self.fit, stated | {"calibration": asdict(calibration)})
             print(f"{self.fit}: {calibration}")
         curves = [curve_table(rows, asked) for asked in PAIRS]
         tables = "\n".join([verdict_table(rows), *curves, chance_table(rows)])
@@ -373,15 +373,15 @@ def _verdict(room: Room, text: str, kind: str, answer: QueryResult) -> Verdict:
 
 def measure_verdicts(room: Room, engine: QueryEngine) -> list[Verdict]:
     """Every phrase of one room, present and absent."""
-    parts, absent_parts = _part_words(room)
-    asked = [(p.text, p.kind) for p in room.truth.phrases if p.kind in ("object", "colour+object")]
-    things, absent = [text for text, kind in asked if kind == "object"], room.truth.absent(EVERYTHING)
-    asked += [
-        *product(absent, ["absent"]),
-        *product(parts, ["part"]),
-        *product(absent_parts, ["absent part"]),
-    ]
-    asked += _coloured(room, things, absent, "object") + _coloured(room, parts, absent_parts, "part")
+    (parts, no_parts), truth = _part_words(room), room.truth
+    asked = [(p.text, p.kind) for p in truth.phrases if p.kind in ("object", "colour+object")]
+    things, nothing = [text for text, kind in asked if kind == "object"], truth.absent(EVERYTHING)
+    own = {f"{item.colour} {item.word}" for item in truth.regions.values() if item.colour and _part(item)}
+    asked += [(text, "colour+part") for text in sorted(own) if text.split()[-1] in parts]
+    for kind, there, absent in (("object", things, nothing), ("part", parts, no_parts)):
+        asked += product(absent, ["absent" if kind == "object" else "absent part"])
+        asked += product(_in_other_colours(room, [*there, *absent]), [f"absent colour+{kind}"])
+    asked += product(parts, ["part"])
     asked = [(text, kind) for text, kind in asked if not engine.unknown_words(text)]
     answers = engine.run_many([text for text, _ in asked])
     said = [(text, kind, answer) for (text, kind), answer in zip(asked, answers, strict=True)]
@@ -425,25 +425,15 @@ def _part_words(room: Room) -> tuple[list[str], list[str]]:
     """Words of parts that Gaussians of the room show, and such words that nothing in it is called by."""
     seen, counts = np.unique(room.labels, return_counts=True)
     shown = {int(number) for number, count in zip(seen, counts, strict=True) if count >= MIN_GAUSSIANS}
-    parts = {
-        region.word for number, region in room.truth.regions.items() if number in shown and _part(region)
-    }
+    parts = {item.word for key, item in room.truth.regions.items() if key in shown and _part(item)}
     return sorted(parts), sorted(_uncalled(PARTS, room.truth.words))
 
 
-def _coloured(room: Room, there: Sequence[str], absent: Sequence[str], kind: str) -> list[tuple[str, str]]:
-    """(phrase, kind): what is there in its colours, if parts, and in another; what is not there, in any."""
-    rng, known = np.random.default_rng((room.seed, 13, len(kind))), room.truth.words
-    parts = [region for region in room.truth.regions.values() if kind == "part" and region.colour]
-    right = {f"{region.colour} {region.word}" for region in parts if region.word in there}
-    wrong = (
-        next(f"{x} {word}" for x in rng.permutation(COLOURS) if f"{x} {word}" not in known) for word in there
-    )
-    absent_in = (f"{rng.choice(COLOURS)} {word}" for word in absent)
-    return [
-        *product(sorted(right), [f"colour+{kind}"]),
-        *product([*wrong, *absent_in], [f"absent colour+{kind}"]),
-    ]
+def _in_other_colours(room: Room, words: Sequence[str]) -> list[str]:
+    """Every word with a colour that nothing of that name has."""
+    rng, known = np.random.default_rng((room.seed, 13)), room.truth.words
+    wrong = [[phrase for x in COLOURS if (phrase := f"{x} {word}") not in known] for word in words]
+    return [str(rng.choice(phrases)) for phrases in wrong]
 
 
 def _inside(room: Room, engine: QueryEngine) -> Iterator[tuple[str, str]]:
@@ -473,21 +463,11 @@ def _uncalled(words: Iterable[str], called: AbstractSet[str]) -> list[str]:
 
 def fit_calibration(rows: Sequence[Verdict]) -> Calibration:
     """Platt scaling of all kinds of phrases. Raises as `fit_scaling` does."""
-    fits = {k: np.array([(*row.fits, row.common) for row in own]) for k, own in grouped(rows, "kind").items()}
-    return Calibration(
-        **{
-            # Two colours of one thing have about the same mean fit: there it tells nothing.
-            name: fit_scaling(*(fits[kind][:, : 3 if "coloured" in name else 4] for kind in pair))
-            for name, pair in PAIRS.items()
-        }
-    )
-
-
-def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write a calibration into a `reading.json`, whose other fields stay."""
-    stated = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    stated["calibration"] = asdict(calibration)
-    write_json(path, stated)
+    fits = {  # the mean fit of a phrase with a colour tells nothing more
+        kind: np.array([(*row.fits, row.common) for row in own])[:, : 3 if "colour" in kind else 4]
+        for kind, own in grouped(rows, "kind").items()
+    }
+    return Calibration(**{name: fit_scaling(fits[one], fits[other]) for name, (one, other) in PAIRS.items()})
 
 
 def verdict_table(rows: Sequence[Verdict]) -> str:

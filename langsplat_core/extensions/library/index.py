@@ -507,8 +507,7 @@ def _ask_group(
 ) -> Answered:
     key, taught = phrase_key(phrase), {name for scene in group.scenes for name in scene.taught}
     try:
-        texts = heads(parse(phrase, taught))
-        vectors = {text: _vector(library, group, text, load_encoder) for text in texts}
+        vectors = {text: _vector(library, group, text, load_encoder) for text in heads(parse(phrase, taught))}
     except EncoderError as error:
         if key not in taught:
             return Answered(phrase, group.encoder_id, (), str(error))
