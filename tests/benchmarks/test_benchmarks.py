@@ -290,14 +290,14 @@ def test_vectors_of_a_file_are_found_by_name(tmp_path):
     assert encoder.digest != ClipGeometry(0.31).digest
 
 
-TRUE = PlattScaling(-1.0, 18.0, 6.0)
+TRUE = PlattScaling(-1.0, 18.0, 6.0, common=2.0)
 
 
 def logistic(count: int, seed: int = 0) -> tuple[Array, Array]:
-    """Fits of things that are there and that are not, by `TRUE`: about as many of both."""
+    """Fits, and mean fit, of things that are there and that are not, by `TRUE`: about as many of both."""
     rng = np.random.default_rng(seed)
-    margins = rng.uniform([-0.3, -0.3, -0.25], [0.3, 0.1, 0.3], (count, 3))
-    likely = np.array([TRUE.probability(tuple(row)) for row in margins.tolist()])
+    margins = rng.uniform([-0.3, -0.3, -0.25, -1], [0.3, 0.1, 0.3, 1], (count, 4))
+    likely = np.array([TRUE.probability(tuple(row), common) for *row, common in margins.tolist()])
     there = rng.uniform(size=count) < likely
     return margins[there], margins[~there]
 
@@ -307,6 +307,7 @@ def test_fit_recovers_the_scaling_that_made_the_data():
     fitted = fit_scaling(present, absent)
     assert fitted.whole == pytest.approx(TRUE.whole, rel=0.06)
     assert fitted.finer == pytest.approx(TRUE.finer, rel=0.12)
+    assert fitted.common == pytest.approx(TRUE.common, rel=0.06)
     # Both weigh the same in the fit: the constant moves by the logarithm of how many there are of each.
     want = TRUE.constant - np.log(len(present) / len(absent))
     assert fitted.constant == pytest.approx(want, abs=0.12)
@@ -315,13 +316,13 @@ def test_fit_recovers_the_scaling_that_made_the_data():
 def test_fitted_threshold_rejects_the_required_share():
     present, absent = logistic(3_000)
     fitted = fit_scaling(present, absent)
-    said = np.array([fitted.probability(tuple(row)) for row in absent.tolist()])
+    said = np.array([fitted.probability(tuple(row), common) for *row, common in absent.tolist()])
     assert REJECTED <= (said < fitted.found).mean() < REJECTED + 0.01
     often = fit_scaling(present, np.tile(absent, (9, 1)))  # how many there are of each changes nothing
     for name in ("constant", "whole", "finer", "found"):
         assert getattr(often, name) == pytest.approx(getattr(fitted, name), rel=0.02, abs=0.02)
     apart = fit_scaling(np.full((20, 3), 0.5), np.full((20, 3), -0.5))
-    assert apart.found == 0.5  # never less than even
+    assert (apart.found, apart.common) == (0.5, 0)  # never less than even
     assert np.isfinite([apart.constant, apart.whole, apart.finer]).all()  # Platt's targets keep it so
 
 
@@ -335,11 +336,11 @@ def test_fit_refuses_too_little_and_reversed_evidence():
 def row(kind: str, probability: float | None, *, found: bool | None = None, seed: int = 1, tier="clutter"):
     margin = 0.1 if probability is None else probability
     said = (probability or 0) >= 0.75 if found is None else found
-    return Verdict(tier, seed, "a thing", kind, (margin, -0.1, margin), probability, said)
+    return Verdict(tier, seed, "a thing", kind, (margin, -0.1, margin), 0.0, probability, said)
 
 
 ROOM = [row("object", p) for p in (0.2, 0.8, 0.9, 0.95)] + [row("colour+object", p) for p in (0.7, 0.99)]
-ROOM += [row("absent", p) for p in (0.01, 0.02, 0.5, 0.76)]
+ROOM += [row(f"absent{colour}", p) for colour in ("", " colour+object") for p in (0.01, 0.02, 0.5, 0.76)]
 
 
 def cells(table: str, line: int) -> list[str]:
@@ -349,7 +350,7 @@ def cells(table: str, line: int) -> list[str]:
 def test_verdict_table_states_means_over_rooms():
     parts = [row("part", 0.9), row("part", 0.3), row("absent part", 0.1)]
     table = verdict_table(ROOM + parts)
-    assert [cells(table, n)[1] for n in range(2, 5)] == ["thing", "colour + thing", "part"]
+    assert [cells(table, n)[1] for n in range(2, 5)] == ["thing", "coloured_thing", "part"]
     tier, _, phrases, accepted, rejected, area, *at = cells(table, 2)
     assert (tier, phrases, accepted, rejected) == ("clutter", "8", "75.0", "75.0")
     pairs = [a > b for a in (0.2, 0.8, 0.9, 0.95) for b in (0.01, 0.02, 0.5, 0.76)]
@@ -385,7 +386,9 @@ def test_chance_table_counts_absent_phrases_above_the_bar():
 
 def test_verdicts_write_tables_and_a_calibration(tmp_path, monkeypatch):
     rows = [
-        Verdict("clutter", 301, "x", kind, tuple(m), float(sigmoid(20 * np.float64(m[2]))), m[2] > 0.1)
+        Verdict(
+            "clutter", 301, "x", kind, tuple(m[:3]), m[3], float(sigmoid(20 * np.float64(m[2]))), m[2] > 0.1
+        )
         for pair in PAIRS.values()
         for kind, margins in zip(pair, logistic(300), strict=True)
         for m in margins.tolist()

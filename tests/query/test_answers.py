@@ -33,6 +33,7 @@ from langsplat_core.query.rule import (
     judge,
     on_things,
     region_fits,
+    scaling_of,
 )
 from langsplat_core.query.taught import FOUND, LIKEST, NEXT, shown
 from langsplat_core.scene import (
@@ -79,17 +80,18 @@ def asked(
     if rule == "peak":
         return by_peak(phrase, relevancy, gaussians.means, surface, scale, field.found, level)
     regions, calibration = regions_of(Scene(gaussians, field), surface), field.calibration
-    return by_rule(relevancy, regions, gaussians.means, scale, named(phrase), level, calibration)
+    scaling = scaling_of(calibration, named(phrase), phrase)
+    return by_rule(relevancy, regions, gaussians.means, scale, named(phrase), level, scaling)
 
 
 def by_rule(
-    relevancy, regions: Regions, means: Array, scale: Scale, sought: Named, level="auto", calibration=None
+    relevancy, regions: Regions, means: Array, scale: Scale, sought: Named, level="auto", scaling=None
 ) -> QueryResult:
     """Answer to (3, N) relevancy, every number of which is a feature of its own."""
     values = np.append(relevancy, 0).astype(np.float32)
     of_features = Relevancy(values, np.arange(values.size - 1).reshape(np.shape(relevancy)))
     own = scale.fit(np.concatenate(regions.means(relevancy)))
-    decision = decide(regions.table, [own], sought, level, BARS, calibration)
+    decision = decide(regions.table, [own], sought, level, BARS, scaling)
     return by_regions("x", of_features, decision, means, regions)
 
 
@@ -163,19 +165,6 @@ def test_calibrated_verdict_follows_the_probability(below, verdict):
     result = calibrated(Calibration(odds, never, never)).run("book")
     assert result.probability == pytest.approx(1 / (1 + np.exp(-(1 + below))))
     assert (result.found, result.verdict) == (verdict == "found", verdict)
-
-
-def test_part_asked_for_alone_has_its_own_calibration():
-    gaussians, field = random_gaussians(300), random_field(300, "codebook")
-    relevancy = np.full((3, 300), 0.4, np.float32)
-    relevancy[1, :100] = 0.8  # among the parts it is there, among wholes it is not
-    calibration = Calibration(PlattScaling(0, 20, 0), PlattScaling(0, 0, 20), PlattScaling(-99, 1, 1))
-    field = replace(field, calibration=calibration)
-    part, thing = (asked(relevancy, gaussians, field, "regions", phrase=text) for text in ("handle", "mug"))
-    assert part.fits == thing.fits
-    assert part.probability == pytest.approx(sigmoid(np.array(20 * max(part.fits[:2]))))
-    assert part.probability > 0.5 > thing.probability
-    assert (thing.found, thing.probability) == (False, pytest.approx(sigmoid(np.array(20 * part.fits[2]))))
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -259,9 +248,27 @@ def test_verdicts_by_chance_leave_out_what_lies_near_everything():
     by_hand = judge((0.0, 1.0, 2.0), "thing", "auto", BARS, None)
     assert near.margin == pytest.approx(by_hand.margin)
     assert near.margin < plain.margin
-    calibration = Calibration(*[PlattScaling(-2.0, 1.5, 0.5)] * 3)
-    told = [judge(fits, "thing", "auto", None, calibration, common) for common in (0.0, 2.0)]
-    assert told[0] == told[1]
+    for counted in (0.0, 0.75, -0.5):
+        scaling = PlattScaling(-2.0, 1.5, 0.5, common=counted)
+        told = [judge(fits, "thing", "auto", None, scaling, common).margin for common in (0.0, 2.0)]
+        assert told[1] - told[0] == pytest.approx(2 * counted)
+
+
+def test_common_fit_of_a_part_is_of_its_thing_alone():
+    own, on = np.array([0.2, -1.0, 0.7, -0.4, 1.1, 0.3]), np.arange(6) % 2 == 0
+    for sought, where in (("thing", None), ("inside", on)):
+        counted = region_fits(TWO, own)[TWO.solid & (True if where is None else where)]
+        decision = decide(TWO, [own], sought, "auto", BARS, None, where)
+        assert decision.common == pytest.approx(counted.mean())
+
+
+def test_ways_of_looking_have_calibrations_of_their_own():
+    ways = [PlattScaling(number, 1, 1) for number in range(5)]
+    phrases = ("orange", "pale Orange mug", "lid", "blue lid", "mug lid")
+    for known, used in ((5, [0, 3, 1, 4, 1]), (3, [0, 0, 1, 1, 1])):
+        calibration = Calibration(*ways[:known])
+        assert [scaling_of(calibration, named(text), text) for text in phrases] == [ways[k] for k in used]
+        assert scaling_of(calibration, "inside", "blue lid") == ways[2]
 
 
 @pytest.mark.parametrize(("margin", "said"), [(0.0, "5 %"), (1.0, "0.7 %"), (-1.0, "28 %"), (9.0, "0.1 %")])

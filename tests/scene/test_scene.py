@@ -255,10 +255,11 @@ N = 20
 
 
 def test_probability_is_the_logistic_of_two_margins():
-    odds = PlattScaling(-1.0, 18.0, 3.0)
+    odds = PlattScaling(-1.0, 18.0, 3.0, common=2.0)
     for fits in ((0.1, -0.2, 0.3), (-0.2, 0.1, 0.3), (-5.0, -4.0, -9.0)):
         logit = -1 + 18 * fits[2] + 3 * max(fits[:2])
         assert odds.probability(fits) == pytest.approx(1 / (1 + np.exp(-logit)))
+        assert odds.probability(fits, -0.5) == pytest.approx(1 / (1 + np.exp(1 - logit)))
     far = odds.probability((-999.0, -999.0, -999.0)), odds.probability((999.0, 999.0, 999.0))
     assert 0 <= far[0] < 1e-9 < 1 - 1e-9 < far[1] <= 1
     assert type(far[0]) is float
