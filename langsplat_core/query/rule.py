@@ -17,6 +17,7 @@ from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import COLOURS, Named
 from langsplat_core.scene import LEVELS, Calibration, Fits, PlattScaling
+from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, fit_of
 
@@ -291,7 +292,7 @@ def scaling_of(calibration: Calibration | None, sought: Sought, phrase: str) -> 
     """Return the logistic function of a calibration that is for a phrase; None without a calibration."""
     if calibration is None or sought == "inside":
         return None if calibration is None else calibration.inside
-    coloured = not COLOURS.isdisjoint(phrase.lower().split()[:-1])
+    coloured = not COLOURS.isdisjoint(phrase_key(phrase).split()[:-1])
     if sought == "thing":
         return calibration.coloured_thing if coloured else calibration.thing
     return calibration.coloured_part if coloured else calibration.part

@@ -58,7 +58,9 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def demo() -> Scene:
-    return load_scene(DEMO)
+    """The bundled scene, with its encoder's calibration of today."""
+    scene, calibration = load_scene(DEMO), load_text_encoder("demo").calibration
+    return replace(scene, language=replace(scene.language, calibration=calibration))
 
 
 @pytest.fixture(scope="module")
@@ -726,6 +728,7 @@ def test_notebooks_show_a_page_that_was_asked(browser, demo, engine, tmp_path, p
     """In a frame without rights, as a cell has it: bounded, answered over all Gaussians, searchable."""
     if phrases is None:
         asked, other, shown = "duck", "penguin", frame_of_docs()
+        engine = QueryEngine(load_scene(DEMO), load_text_encoder)
     elif phrases == "an answer":
         asked, other = "ball near the teddy bear", "ball"
         shown = run_phrase(engine, asked).answer._repr_html_()

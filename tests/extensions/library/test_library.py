@@ -31,7 +31,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.progress import Progress, Report
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import named
-from langsplat_core.query.rule import judge, triple
+from langsplat_core.query.rule import judge, scaling_of, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Calibration, Gaussians, PlattScaling, Scene
 from langsplat_core.scene.transform import place_scene
@@ -422,8 +422,8 @@ def index_verdicts(engine: QueryEngine, phrases: list[str], folder: Path) -> Ite
     (scene,) = group.scenes
     for phrase in phrases:
         (fits,), (common,) = fits_in(group, engine.text_vectors([phrase])[0])
-        judged = scene.bars, scene.calibration, float(common)
-        yield fits, judge(triple(fits), named(phrase), "auto", *judged)
+        scaling = scaling_of(scene.calibration, named(phrase), phrase)
+        yield fits, judge(triple(fits), named(phrase), "auto", scene.bars, scaling, float(common))
 
 
 @pytest.mark.long
