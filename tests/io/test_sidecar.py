@@ -37,11 +37,7 @@ from tests.support.file_samples import assert_refused, assert_same_field, random
 from tests.support.scenes import random_gaussians
 
 N = 60
-CALIBRATION = Calibration(
-    PlattScaling(-0.25, 18.548, 2.7, 0.62, 1.5), PlattScaling(0.5, 2.25, 15.5),
-    PlattScaling(0.75, -0.5, 9.25, 0.5), coloured_part=PlattScaling(0.5, 3, 4),
-)  # fmt: skip
-
+CALIBRATION = Calibration(*(PlattScaling(x, 18.548, 2.7, 0.62, 1.5) for x in (-0.25, 0.5, 1, 2, 3)))
 AXES = np.eye(3, 16, dtype=np.float32)
 TAUGHT = (
     TaughtWord("Grandma's vase", 2, AXES[:2], np.array([0.25, 0.5], np.float32)),
@@ -156,10 +152,7 @@ def test_sidecars_have_the_documented_layout(sidecar, means):
         "everyday": ("F16", [60, 16]), "phrasebook": ("F32", [2, 16]), "taught": ("F16", [3, 16]),
         "taught.rivals": ("F16", [3]), "codec.encoder.0.weight": ("F32", [8, 16]),
     }.items()  # fmt: skip
-    assert json.loads(metadata.pop("odds")) == [
-        *([-0.25, 18.548, 2.7, 0.62, 1.5], [0.5, 2.25, 15.5, 0.75, 0], [0.75, -0.5, 9.25, 0.5, 0]),
-        *([-0.25, 18.548, 2.7, 0.62, 1.5], [0.5, 3, 4, 0.75, 0]),
-    ]
+    assert json.loads(metadata.pop("odds")) == [[*vars(way).values()] for way in vars(CALIBRATION).values()]
     assert metadata == {
         "format": "langsplat",
         "version": "3",
@@ -253,10 +246,9 @@ def test_malformed_words_are_refused_in_a_line(own_words, case):
 
 
 def test_odds_of_three_ways_are_read(sidecar, means):
-    says(odds="[[-0.25, 18.5, 2.5, 0.625], [0.5, 2, 15, 0.75], [0.75, -0.5, 9, 0.5]]")(sidecar)
-    thing, part = PlattScaling(-0.25, 18.5, 2.5, 0.625), PlattScaling(0.5, 2, 15)
-    want = Calibration(thing, part, PlattScaling(0.75, -0.5, 9, 0.5), thing, part)
-    assert read_language(sidecar, means).calibration == want
+    says(odds="[[0, 18.5, 2.5, 0.625], [0.5, 2, 15, 0.75], [1, -0.5, 9, 0.5]]")(sidecar)
+    ways = PlattScaling(0, 18.5, 2.5, 0.625), PlattScaling(0.5, 2, 15), PlattScaling(1, -0.5, 9, 0.5)
+    assert read_language(sidecar, means).calibration == Calibration(*ways)
 
 
 def test_things_of_version_2_are_not_read(sidecar, means, caplog):

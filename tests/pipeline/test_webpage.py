@@ -58,8 +58,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def demo() -> Scene:
-    """The bundled scene, with its encoder's calibration of today."""
-    scene, calibration = load_scene(DEMO), load_text_encoder("demo").calibration
+    scene, calibration = load_scene(DEMO), load_text_encoder("demo").calibration  # which is newer
     return replace(scene, language=replace(scene.language, calibration=calibration))
 
 
