@@ -248,7 +248,10 @@ class Language {
     const { rule, bars, calibration } = this.meta;
     const on = thing && onThings(rule, this.regions, thing);
     const fits = thing && part ? [own, part] : [own];
-    const coloured = key.split(" ").slice(0, -1).some((word) => this.lists.colours.has(word));
+    const coloured = key
+      .split(" ")
+      .slice(0, -1)
+      .some((word) => this.lists.colours.has(word));
     const evidence = { bars, scaling: scalingOf(calibration, named, coloured) };
     const decision = decide(rule, this.regions, fits, named, level, evidence, on);
     return this.answer(phrase, decision, relevancies);
