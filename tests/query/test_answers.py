@@ -256,10 +256,9 @@ def test_common_fit_of_a_part_is_of_its_thing_alone():
 def test_ways_of_looking_have_calibrations_of_their_own():
     ways = [PlattScaling(number, 1, 1) for number in range(5)]
     phrases = ("orange", "pale Orange mug", "lid", "blue lid", "mug lid")
-    for known, used in ((5, [0, 3, 1, 4, 1]), (3, [0, 0, 1, 1, 1])):
-        calibration = Calibration(*ways[:known])
-        assert [scaling_of(calibration, named(text), text) for text in phrases] == [ways[k] for k in used]
-        assert scaling_of(calibration, "inside", "blue lid") == ways[2]
+    for known, used in ((Calibration(*ways), [0, 3, 1, 4, 1]), (Calibration(*ways[:3]), [0, 0, 1, 1, 1])):
+        assert [scaling_of(known, named(text), text) for text in phrases] == [ways[k] for k in used]
+        assert scaling_of(known, "inside", "blue lid") == ways[2]
 
 
 @pytest.mark.parametrize(("margin", "said"), [(0.0, "5 %"), (1.0, "0.7 %"), (-1.0, "28 %"), (9.0, "0.1 %")])
