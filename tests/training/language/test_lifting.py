@@ -441,8 +441,7 @@ def test_backends_descend_to_the_same_latents():
 
 @pytest.mark.long
 def test_published_start_at_zero_descends_under_its_normalisation():
-    pairs = views()
-    config = replace(SHORT, start="zeros-as-published")
+    pairs, config = views(), replace(SHORT, start="zeros-as-published")
     latents, _ = lift_by_gradient(load_lifting_rasterizer("cpu"), GAUSSIANS, pairs, CODEC, config)
     assert l1(latents, pairs) < 0.99 * l1(np.zeros_like(latents), pairs)
 
