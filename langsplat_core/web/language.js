@@ -93,7 +93,7 @@ class Language {
       .slice(0, 3)
       .map((phrase) => {
         try {
-          const tree = this.taught.has(phraseKey(phrase)) ? { text: phrase } : parse(phrase, this.lists);
+          const tree = parse(this.withNames(phrase), this.lists);
           return this.drawn({ ...this.follow(tree, levelName, camera), phrase });
         } catch (error) {
           if (error instanceof PhraseError && this.keys.has(phraseKey(phrase))) {
@@ -102,6 +102,20 @@ class Language {
           throw error;
         }
       });
+  }
+
+  // A phrase with each taught name in it as one word, by spaces that do not break, the longest first.
+  withNames(phrase) {
+    const words = phrase.split(" ");
+    for (let at = 0; at < words.length; ++at) {
+      for (let count = words.length - at; count > 1; --count) {
+        const name = words.slice(at, at + count).join(" ");
+        if (this.taught.has(name.toLowerCase())) {
+          words.splice(at, count, name.replaceAll(" ", "\u00a0"));
+        }
+      }
+    }
+    return words.join(" ");
   }
 
   // The answer to a tree of phrases (words.js, parse): of what is asked for, the regions in whose wholes the
@@ -116,7 +130,8 @@ class Language {
     }
     const other = anchor && this.thing(anchor, "auto", camera);
     if (kind === "inside") {
-      const part = what.text && this.part(what.text, anchor, other, levelName);
+      const plain = what.text && !this.taught.has(phraseKey(what.text));
+      const part = plain && this.part(what.text, anchor, other, levelName);
       const asked = part || this.follow(what, levelName, camera);
       return this.restricted(asked, (part || other).inside, other);
     }
@@ -148,10 +163,11 @@ class Language {
 
   // The number of wholes that an answer has parts of or is, if it reached further down: a count needs as many.
   count(answer) {
-    const { level, regionFits } = answer;
+    const { level, regionFits, inside } = answer;
     const { rule, space } = this.meta;
     const least = this.reached(answer, rule.wide);
-    const all = regionsAt(this.regions, level).filter((region) => regionFits[region] >= least);
+    const more = regionsAt(this.regions, level).filter((region) => regionFits[region] >= least);
+    const all = [...new Set([...inside, ...more])];
     const things = Map.groupBy(all, (region) => wholeOf(this.regions, region)).values();
     const sizes = Array.from(things, (own) =>
       own.reduce((sum, region) => sum + this.regions.sizes[region], 0),

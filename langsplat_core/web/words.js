@@ -78,9 +78,9 @@ function thingAndPart(phrase, lists) {
   return [words.slice(0, -1).join(" "), words[words.length - 1]];
 }
 
-const AND = /\s(?:and|&|as well as)\s/iu;
-const OR = /\sor\s/iu;
-const EXCLUDE = /,?\s(?:(?:but|and)\s)?(?:not|without|except|other than)\s/iu;
+const AND = / (?:and|&|as well as) /iu;
+const OR = / or /iu;
+const EXCLUDE = /,? (?:(?:but|and) )?(?:not|without|except|other than) /iu;
 const SEPARATE = /[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)/iu;
 
 // Whether words name a thing: more than stop words and descriptions.
