@@ -48,7 +48,7 @@ from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.query.instances import BOXED, oriented_box
 from langsplat_core.query.inventory import suggest
 from langsplat_core.query.relations import ASIDE, FEWEST, NEAR, SPECK, WHOLE, Body, body, stands, upright
-from langsplat_core.query.rule import RULE
+from langsplat_core.query.rule import LOW, RULE
 from langsplat_core.raster.opengl import WEB, shader, splat_shaders
 from langsplat_core.raster.render import render, view_of
 from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
@@ -59,7 +59,7 @@ from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary
 
 # In an order in which each imports only those before it, so that their code can stand in one script.
 MODULES = ("words", "rule", "encoder", "camera", "space", "language", "data", "draw", "headset", "page")
-BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, without its imports and exports
+BEGIN = "// [page]\n"  # between imports and code of a module
 LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "COLOURS", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL",
          "MEASURES", "OWNERS")  # fmt: skip
 TABLES = ("SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")  # beside the lists of words, in query/grammar.py
@@ -244,6 +244,7 @@ def language_tables(
     codes = np.where(field.known, field.latents[..., 0], len(codebook))
     inside, first = regions.everywhere[:, rows], np.cumsum([0, *map(len, regions.nodes[:-1])], dtype=np.int32)
     palette = field.codec.colours(np.arange(len(codebook), dtype=np.uint16)[:, None], np.ones(len(codebook)))
+    is_calibrated = engine.calibration is not None and not engine.taught  # whatever is asked
     tensors: dict[str, Array] = {
         "codebook": codebook.astype(np.float16),
         "zero": zero,
@@ -251,6 +252,7 @@ def language_tables(
         "codes": codes[:, rows].astype(np.uint16),
         "regions": np.where(inside < 0, -1, inside + first[:, None]),
         "palette": to_bytes(255 * palette),
+        "chance": np.array(() if engine.chance is None or is_calibrated else engine.chance, np.float16),
         **_region_tables(engine, codes),
     }
     bars = [asdict(bar) for bar in engine.bars or ()]
@@ -264,7 +266,7 @@ def language_tables(
         "guess": engine.basis.short if engine.basis.guesses else "",
         "bars": bars,
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
-        "rule": asdict(RULE) | {"found": found, "half": HALF},
+        "rule": asdict(RULE) | {"found": found, "half": HALF, "low": LOW},
         "grammar": {
             **{name.lower(): sorted(getattr(grammar, name)) for name in LISTS},
             "prepositions": {" ".join(words): kind for words, kind in grammar.PREPOSITIONS.items()},
@@ -373,7 +375,9 @@ def page_text(title: str, data: bytes, still: bytes) -> str:
     """Return the HTML file, whose policy lets only its own script run, and nothing be fetched."""
     folder = files("langsplat_core") / "web"
     modules = [folder.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES]
-    script = "\n".join(module.split(BEGIN)[1].split(END)[0] for module in modules)
+    script = "\n".join(
+        re.sub("^export ", "", module.split(BEGIN)[1], flags=re.MULTILINE) for module in modules
+    )
     style = folder.joinpath("page.css").read_text(encoding="utf-8")
     script_hash, style_hash = (
         base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (script, style)

@@ -338,7 +338,7 @@ def nested_partitions(image: Array) -> Array:
 def denoise(image: Array, weight: float) -> Array:
     """Return an (H, W, C) float32 image of less total variation: less noise, the same edges.
 
-    By Chambolle 2004, bit for bit as scikit-image's `denoise_tv_chambolle`, in an eighth of its time.
+    By Chambolle 2004, as scikit-image's `denoise_tv_chambolle`, to 1e-6, in an eighth of its time.
     """
     given = np.pad(image.transpose(2, 0, 1), ((0, 0), (0, 0), (0, 1)), "edge")
     images = given.copy()

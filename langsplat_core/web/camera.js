@@ -3,11 +3,15 @@
 // rows; positions are relative to the page's origin.
 
 // [page]
-const add = (a, b, times = 1) => a.map((value, i) => value + times * b[i]);
-const inner = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const unit = (a) => a.map((value) => value / (Math.hypot(...a) || 1));
-const axes = ({ rotation }) => [rotation.slice(0, 3), rotation.slice(3, 6), rotation.slice(6, 9)];
+export const add = (a, b, times = 1) => a.map((value, i) => value + times * b[i]);
+export const inner = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const cross = (a, b) => [
+  a[1] * b[2] - a[2] * b[1],
+  a[2] * b[0] - a[0] * b[2],
+  a[0] * b[1] - a[1] * b[0],
+];
+export const unit = (a) => a.map((value) => value / (Math.hypot(...a) || 1));
+export const axes = ({ rotation }) => [rotation.slice(0, 3), rotation.slice(3, 6), rotation.slice(6, 9)];
 
 // A vector turned about an axis of length 1, by Rodrigues' formula.
 function turned(vector, axis, angle) {
@@ -26,13 +30,14 @@ function upright(directions) {
 }
 
 // Pixels of a camera in which a point is seen, and its depth.
-function project(camera, point) {
+export function project(camera, point) {
   const [x, y, z] = axes(camera).map((axis) => inner(axis, add(point, camera.position, -1)));
   return [(camera.fx * x) / z + camera.cx, (camera.fy * y) / z + camera.cy, z];
 }
 
 // The points of a box's (8, 3) corners.
-const cornersOf = (box) => Array.from({ length: 8 }, (_, k) => Array.from(box.slice(3 * k, 3 * k + 3)));
+export const cornersOf = (box) =>
+  Array.from({ length: 8 }, (_, k) => Array.from(box.slice(3 * k, 3 * k + 3)));
 
 const STEP = 24; // pixels of a drag that a press of an arrow key is worth
 const FLIGHT = 700; // ms
@@ -40,7 +45,7 @@ const FLYING = { w: [2, 1], s: [2, -1], a: [0, -1], d: [0, 1] }; // axis of the 
 const SPEED = 0.6; // radii a second
 const TURN = 60; // pixels of a drag a second, of the turntable
 
-class Controls {
+export class Controls {
   // page.moved() is called when the camera has another pose; page.free() has left, top, width and height of what
   // no panel covers, pixels of CSS.
   constructor(element, page) {
@@ -256,6 +261,3 @@ class Controls {
     requestAnimationFrame(step);
   }
 }
-// [/page]
-
-export { Controls, add, axes, cornersOf, cross, inner, project, unit };

@@ -21,7 +21,7 @@ const KINDS = {
 
 // Tensors by name as { values, shape }, half floats as single ones, and the JSON that lies beside them.
 // unpacked(share): called with how much of it is read.
-async function readPage(text, unpacked) {
+export async function readPage(text, unpacked) {
   const letters = atob(text.trim());
   const packed = new Uint8Array(letters.length);
   for (let i = 0; i < letters.length; ++i) {
@@ -59,7 +59,7 @@ const [MEAN, SCALE, QUATERNION, OPACITY, SH] = [0, 3, 6, 10, 11]; // the first c
 
 // The Gaussians as textures take them: `means` (M, 3), relative to the page's origin; `geometry`, three layers
 // of RGBA floats (mean and opacity, scales, unit quaternion) and `sh`, the coefficients four to a texel.
-function unpackGaussians({ low, high, ranges }, texels) {
+export function unpackGaussians({ low, high, ranges }, texels) {
   const [columns, count] = low.shape;
   const wide = high.shape[0];
   const chunks = ranges.shape[1];
@@ -93,6 +93,3 @@ function unpackGaussians({ low, high, ranges }, texels) {
   }
   return { count, means, geometry, sh, layers };
 }
-// [/page]
-
-export { readPage, unpackGaussians };

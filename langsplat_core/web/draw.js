@@ -64,7 +64,7 @@ function large(geometry, count, texels) {
   return Uint8Array.from(covered, (area) => (area >= least ? 1 : 0));
 }
 
-class Painter {
+export class Painter {
   // Throws an Error with a sentence for people where this browser cannot draw the scene.
   constructor(canvas, meta, tensors) {
     const options = { antialias: false, alpha: false, powerPreference: "high-performance" };
@@ -395,6 +395,3 @@ class Painter {
     return bytes;
   }
 }
-// [/page]
-
-export { Painter };

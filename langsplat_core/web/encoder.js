@@ -5,7 +5,7 @@ import { nearest } from "./words.js";
 
 // [page]
 // What a browser says of a phrase that cannot be asked, the word that is unknown, and a known one like it.
-class PhraseError extends Error {
+export class PhraseError extends Error {
   constructor(message, word = "", near = "") {
     super(message);
     Object.assign(this, { word, near });
@@ -13,7 +13,7 @@ class PhraseError extends Error {
 }
 
 // The dot product of `size` numbers of two arrays, from a place in each.
-function dot(a, firstOfA, b, size, firstOfB = 0) {
+export function dot(a, firstOfA, b, size, firstOfB = 0) {
   let sum = 0;
   for (let i = 0; i < size; ++i) {
     sum += a[firstOfA + i] * b[firstOfB + i];
@@ -21,7 +21,7 @@ function dot(a, firstOfA, b, size, firstOfB = 0) {
   return sum;
 }
 
-class ClipText {
+export class ClipText {
   // described: { words, config, begin, end }; weight(name): values of a tensor; dim: numbers of a vector.
   constructor(described, weight, dim) {
     Object.assign(this, described);
@@ -135,6 +135,3 @@ class ClipText {
     return this.linear(`${name}out_proj`, mixed, width);
   }
 }
-// [/page]
-
-export { PhraseError, ClipText, dot };

@@ -9,7 +9,7 @@ const TURN_BY = 30; // degrees, once each time the right stick is pushed aside
 const DEAD = 0.2; // of a stick
 const AWAY = 1.5; // metres to what the page's camera turns around, in a scene of unknown size
 
-class Headset {
+export class Headset {
   constructor(page) {
     Object.assign(this, { page, session: null });
   }
@@ -84,6 +84,3 @@ class Headset {
     }
   }
 }
-// [/page]
-
-export { Headset };

@@ -3,6 +3,7 @@
 
 import { ClipText, PhraseError, dot } from "./encoder.js";
 import {
+  barsOn,
   combined,
   decide,
   fitOf,
@@ -62,7 +63,7 @@ function smoothed(point, values) {
   });
 }
 
-class Language {
+export class Language {
   // meta: what pipeline/webpage.py says of the language field; tensors: { values, shape } by name; places: mean and
   // opacity of each Gaussian.
   constructor(meta, tensors, places) {
@@ -179,24 +180,23 @@ class Language {
 
   // The answer to a part of a thing, on what answers to it; on what fits a plain name nearly as well, too.
   part(name, thing, other, levelName) {
-    const { rule, levels, calibration } = this.meta;
+    const { rule, levels } = this.meta;
     const own = thing.text && !this.taught.has(phraseKey(thing.text));
     const phrase = own ? `${thing.text} ${name}` : name;
-    const asked = [name, phrase].map((text) => this.known(text));
-    if (!asked[0] || !calibration) {
-      return this.ask(phrase, levelName);
-    }
+    const asked = [this.relevancies(this.vector(phraseKey(name))), this.known(phrase)].filter(Boolean);
     const words = own ? thing.text.toLowerCase().split(" ") : [];
     const plain = own && words.every((word) => !this.lists.adjectives.has(word));
     const least = plain ? this.reached(other, rule.around) : Infinity;
     const near = regionsAt(this.regions, other.level).filter((region) => other.regionFits[region] >= least);
     const among = new Set([...other.inside, ...near]);
     const on = Array.from(this.regions.sizes, (_, region) => isWithin(this.regions, region, among));
-    const known = asked.filter(Boolean);
-    const fits = known.map((one) => this.ownFits(one));
-    const [level, evidence] = [levels.indexOf(levelName), { scaling: scalingOf(calibration, "inside") }];
-    const decision = decide(rule, this.regions, fits, "inside", level, evidence, on);
-    return this.answer(phrase, decision, mean(known));
+    const fits = asked.map((one) => this.ownFits(one));
+    const evidence =
+      other.verdict.probability === null
+        ? { bars: barsOn(rule, this.regions, this.tensors.chance, on) }
+        : { scaling: scalingOf(this.meta.calibration, "inside") };
+    const decision = decide(rule, this.regions, fits, "inside", levels.indexOf(levelName), evidence, on);
+    return this.answer(phrase, decision, mean(asked));
   }
 
   // As `follow`, but a thing is looked for among wholes, unless it fits none.
@@ -392,6 +392,3 @@ class Language {
     return [0, 1, 2].map((channel) => Float32Array.from(own, (code) => colour(code, channel)));
   }
 }
-// [/page]
-
-export { Language, PhraseError };

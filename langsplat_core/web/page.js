@@ -1,7 +1,8 @@
 // The page: the panel, what is shown, and the marks over the image. All text from the scene is set as text.
 
 import { readPage } from "./data.js";
-import { Language, PhraseError } from "./language.js";
+import { PhraseError } from "./encoder.js";
+import { Language } from "./language.js";
 import { Controls, cornersOf, project } from "./camera.js";
 import { Painter } from "./draw.js";
 import { Headset } from "./headset.js";
@@ -585,4 +586,3 @@ globalThis.langsplat.catch((error) => {
   byId("welcome").className += " failed";
   throw error;
 });
-// [/page]

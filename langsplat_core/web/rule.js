@@ -5,16 +5,16 @@
 // region of the level above, -1 for none.
 
 // [page]
-const sigmoid = (x) => 1 / (1 + Math.exp(-x));
+export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
 const logit = (share) => Math.log(share / (1 - share));
 
 // The fit that a relevancy stands for; finite at 0 and 1.
-function fitOf(rule, relevancy) {
+export function fitOf(rule, relevancy) {
   return logit(Math.min(Math.max(relevancy, rule.narrowest), 1 - rule.narrowest));
 }
 
 // Means of arrays of the same length.
-function mean(arrays) {
+export function mean(arrays) {
   return arrays[0].map((_, i) => arrays.reduce((sum, values) => sum + values[i], 0) / arrays.length);
 }
 
@@ -36,41 +36,67 @@ function regionFits(rule, regions, own) {
 }
 
 // Relevancies that fits stand for, 0 for what fits nothing.
-function regionRelevancies(rule, fits) {
+export function regionRelevancies(rule, fits) {
   return fits.map((fit) => (fit > rule.nothing ? sigmoid(fit) : 0));
 }
 
 // Numbers of the regions of a level, in their order.
-function regionsAt({ counts }, level) {
+export function regionsAt({ counts }, level) {
   const first = counts.slice(0, level).reduce((sum, count) => sum + count, 0);
   return Array.from({ length: counts[level] }, (_, i) => first + i);
 }
 
 // The one of some regions that has the largest value, of equal ones the first; -1 of none.
-function strongest(some, values) {
+export function strongest(some, values) {
   return some.reduce((best, region) => (best < 0 || values[region] > values[best] ? region : best), -1);
+}
+
+// The regions of a level that are no crumbs; all where it has no others.
+function solidAt(rule, regions, level) {
+  const every = regionsAt(regions, level);
+  const solid = every.filter((region) => regions.sizes[region] >= rule.smallest);
+  return solid.length ? solid : every;
 }
 
 // The best relevancy of a level; of crumbs only where it has no more.
 function bestRelevancy(rule, regions, relevancies, level) {
-  const every = regionsAt(regions, level);
-  const solid = every.filter((region) => regions.sizes[region] >= rule.smallest);
-  return Math.max(0, relevancies[strongest(solid.length ? solid : every, relevancies)] ?? 0);
+  return Math.max(0, relevancies[strongest(solidAt(rule, regions, level), relevancies)] ?? 0);
+}
+
+// Bars of the best fits of everyday phrases on one thing: of each level, and of the better one of the finer two.
+// chance: fits of each region, by phrase. on: whether each region is on the thing.
+export function barsOn(rule, regions, chance, on) {
+  const count = chance.length / regions.sizes.length;
+  const best = regions.counts.map((_, level) => {
+    const there = solidAt(rule, regions, level).filter((region) => on[region]);
+    const most = (_, phrase) => Math.max(...there.map((region) => chance[region * count + phrase]));
+    return Array.from({ length: count }, most);
+  });
+  const finer = best[0].map((fit, phrase) => Math.max(fit, best[1][phrase]));
+  return [...best, finer].map((fits) => {
+    const sorted = fits.toSorted((a, b) => a - b);
+    const [low, median] = [rule.low, 0.5].map((share) => {
+      const at = share * (count - 1);
+      const [below, above] = [sorted[Math.floor(at)], sorted[Math.ceil(at)]];
+      return below + (at % 1) * (above - below);
+    });
+    return Number.isFinite(sorted[0]) ? { median, spread: median - low } : { median: Infinity, spread: 1 };
+  });
 }
 
 // The whole that a region is a part of, or is.
-function wholeOf(regions, region) {
+export function wholeOf(regions, region) {
   const above = regions.parents[region];
   return above < 0 ? region : wholeOf(regions, above);
 }
 
 // Whether a region is one of a Set of others, or a part of one.
-function isWithin(regions, region, others) {
+export function isWithin(regions, region, others) {
   return region >= 0 && (others.has(region) || isWithin(regions, regions.parents[region], others));
 }
 
 // Where parts of a thing may be: in and below the wholes that fit it nearly as well as the best one does.
-function onThings(rule, regions, own) {
+export function onThings(rule, regions, own) {
   const thing = regionFits(rule, regions, own);
   const level = regions.counts.length - 1;
   const best = bestRelevancy(rule, regions, regionRelevancies(rule, thing), level);
@@ -79,7 +105,7 @@ function onThings(rule, regions, own) {
 }
 
 // The fit from which a region belongs to an answer; `share`: of the way that it reaches.
-function leastFit(rule, best, share = 1) {
+export function leastFit(rule, best, share = 1) {
   return best - share * Math.min(Math.max(rule.reach * best, rule.nearest), rule.farthest);
 }
 
@@ -104,7 +130,7 @@ const IN_SPREADS = ["chance", "example"]; // ways of reaching a verdict whose ma
 
 // A verdict: `outcome` in words, how it was `reached`, `margin` above what counts as found, `probability`, and the
 // share of phrases for nothing here that fit as well `byChance`.
-function verdict(rule, found, reached, margin, probability = null) {
+export function verdict(rule, found, reached, margin, probability = null) {
   const near = IN_SPREADS.includes(reached) && margin >= rule.weak_excess;
   const weak = probability === null ? near : probability >= rule.weak_probability;
   const outcome = found ? "found" : weak ? "weak match" : "not here";
@@ -114,7 +140,7 @@ function verdict(rule, found, reached, margin, probability = null) {
 }
 
 // One verdict of several: the weakest where all are needed, else the strongest; absent: nothing is there.
-function combined(rule, verdicts, all, absent = false) {
+export function combined(rule, verdicts, all, absent = false) {
   const score = (name) => (all ? Math.min : Math.max)(...verdicts.map((one) => one[name]));
   const every = (holds) => verdicts.every(holds);
   const [{ reached }] = verdicts;
@@ -127,7 +153,7 @@ function combined(rule, verdicts, all, absent = false) {
 }
 
 // The logistic function of a calibration that is for a phrase, or for one with a colour.
-function scalingOf(calibration, named, coloured = false) {
+export function scalingOf(calibration, named, coloured = false) {
   const kind = named === "part of a thing" ? "part" : named;
   return calibration?.[coloured ? `coloured_${kind}` : kind];
 }
@@ -136,7 +162,8 @@ function scalingOf(calibration, named, coloured = false) {
 // phrase's mean fit.
 function judge(rule, fits, named, level, { bars, scaling }, common) {
   if (!scaling) {
-    const evidence = fits.map((fit) => fit - rule.common_share * common);
+    const share = named === "inside" ? 0 : rule.common_share; // on one thing, bars keep what is in common
+    const evidence = fits.map((fit) => fit - share * common);
     const margin = excess(rule, evidence, named, level, bars);
     return verdict(rule, margin >= 0, "chance", margin);
   }
@@ -152,7 +179,7 @@ function judge(rule, fits, named, level, { bars, scaling }, common) {
 // all levels, the regions that are `inside`, the `best` one that the place is of (-1: none), and the verdict.
 // evidence: { bars, scaling }. own: of every name of what is sought. on: whether each region is on the thing
 // that it is a part of, if it is.
-function decide(rule, regions, own, named, level, evidence, on = null) {
+export function decide(rule, regions, own, named, level, evidence, on = null) {
   const anywhere = regionFits(rule, regions, own[0]);
   const there = (fits) => (on ? fits.map((fit, region) => (on[region] ? fit : rule.nothing)) : fits);
   const every = there(regionFits(rule, regions, mean(own)));
@@ -185,29 +212,10 @@ function decide(rule, regions, own, named, level, evidence, on = null) {
 }
 
 // Relevancies at which a heat map of an answer is coldest and hottest. best: the highest of its members.
-function heatRange(rule, peak, found, best) {
+export function heatRange(rule, peak, found, best) {
   const high = Math.max(peak, best);
   if (found && peak < rule.floor + rule.heat_span) {
     return [peak - rule.heat_span, high];
   }
   return [rule.floor, Math.max(high, rule.floor + rule.heat_span)];
 }
-// [/page]
-
-export {
-  combined,
-  decide,
-  fitOf,
-  heatRange,
-  isWithin,
-  leastFit,
-  mean,
-  onThings,
-  regionRelevancies,
-  regionsAt,
-  scalingOf,
-  sigmoid,
-  strongest,
-  verdict,
-  wholeOf,
-};

@@ -4,7 +4,7 @@
 import { add, axes, inner } from "./camera.js";
 
 // [page]
-class Space {
+export class Space {
   // frame: rotation of the world into those axes, by rows; aside: of the mean size, what is closer is level.
   constructor({ counts, space }, { bodies, pairs }) {
     Object.assign(this, space, { bodies, first: counts[0] + counts[1] });
@@ -85,6 +85,3 @@ class Space {
     return things.toSorted((a, b) => value(b) - value(a)).slice(0, count);
   }
 }
-// [/page]
-
-export { Space };

@@ -7,7 +7,7 @@ const MARK = /[\p{P}\p{Z}\p{Cf}]/u; // punctuation, spaces and invisible letters
 const EMPTY = /[\p{Cf}\p{Po}\p{Mn}]/u; // letters that are no word alone
 
 // Words without quotes and punctuation around them, and commas, none at the end.
-function tokens(text) {
+export function tokens(text) {
   const plain = text
     .replace(APOSTROPHES, "'")
     .normalize("NFKC")
@@ -42,7 +42,7 @@ function bareWord(word) {
 }
 
 // A phrase as it is shown.
-function tidy(text) {
+export function tidy(text) {
   return tokens(text)
     .join(" ")
     .replaceAll(" ,", ",")
@@ -50,7 +50,7 @@ function tidy(text) {
 }
 
 // The key by which a phrase is looked up and encoded.
-function phraseKey(text) {
+export function phraseKey(text) {
   return tokens(text)
     .filter((token) => token !== ",")
     .join(" ")
@@ -64,7 +64,7 @@ function forms(word) {
 }
 
 // What a phrase names: "thing", "part" or "part of a thing". lists: of Sets of words, by name.
-function namedBy(phrase, { parts, adjectives, articles }) {
+export function namedBy(phrase, { parts, adjectives, articles }) {
   const words = phrase.toLowerCase().split(" ");
   if (!forms(words.pop()).some((form) => parts.has(form))) {
     return "thing";
@@ -73,7 +73,7 @@ function namedBy(phrase, { parts, adjectives, articles }) {
 }
 
 // The thing that a phrase names a part of, and the part: "red mug" and "handle"; else "".
-function thingAndPart(phrase, lists) {
+export function thingAndPart(phrase, lists) {
   const words = namedBy(phrase, lists) === "part of a thing" ? phrase.split(" ") : [""];
   return [words.slice(0, -1).join(" "), words[words.length - 1]];
 }
@@ -90,7 +90,7 @@ function names(text, { stop_words: stops, adjectives, also_nouns: nouns }) {
 }
 
 // The phrases of a line; "" where it has no word.
-function splitPhrases(line) {
+export function splitPhrases(line) {
   const phrases = line.split(SEPARATE).map(tidy).filter(Boolean);
   return phrases.length ? phrases : [""];
 }
@@ -103,7 +103,7 @@ function named(text, joint, lists) {
 
 // What a phrase asks for: { text }, { kind, what, anchor } of such, of a count { count, what }, of several { kind,
 // items }. The rules, in their order and by their names, are those of query/grammar.py.
-function parse(text, lists) {
+export function parse(text, lists) {
   const group = (kind, items) => (items.length > 1 ? { kind, items } : items[0]);
   const one = (side) => clause(side, lists);
   const both = (side) => group("both", named(side, AND, lists).map(one));
@@ -208,7 +208,7 @@ function distance(a, b) {
 }
 
 // The known word that is written most like another one; "" where none is like it.
-function nearest(word, known) {
+export function nearest(word, known) {
   let [best, least] = ["", word.length / 3 + 1];
   for (const other of known) {
     const letters = distance(word, other) + (word[0] === other[0] ? 0 : 0.5);
@@ -218,6 +218,3 @@ function nearest(word, known) {
   }
   return best;
 }
-// [/page]
-
-export { namedBy, nearest, parse, phraseKey, splitPhrases, thingAndPart, tidy, tokens };
