@@ -68,7 +68,7 @@ class CropSet:
 
     @staticmethod
     def join(sets: list["CropSet"]) -> "CropSet":
-        """One set of the crops of several."""
+        """Return one set of the crops of several."""
         labels = tuple(label for one in sets for label in one.labels)
         return CropSet(np.concatenate([one.images for one in sets]), labels)
 
@@ -144,7 +144,7 @@ def _photograph(image: Array, rng: np.random.Generator) -> Array:
 def _regions(
     world: World, rendered: RenderedView, rng: np.random.Generator
 ) -> list[tuple[Array, RegionLabel]]:
-    """One imperfect mask for every region that is large enough; equal regions of two levels once."""
+    """Return an imperfect mask for every region that is large enough; equal regions of two levels once."""
     ids = np.where(rendered.pieces[..., None] >= 0, world.ids[rendered.pieces], -1)
     found: list[tuple[Array, RegionLabel]] = []
     seen: set[tuple[int, int, int]] = set()

@@ -204,7 +204,7 @@ def build_model(tokens: int, start: int, end: int) -> Any:
 
 
 def normalised(crops: Array) -> Tensor:
-    """Map (B, 64, 64, 3) uint8 to (B, 3, 64, 64) float32 as the encoder takes them."""
+    """Return (B, 3, 64, 64) float32 images as the encoder takes them, of (B, 64, 64, 3) uint8."""
     pixels = torch.from_numpy(np.ascontiguousarray(crops)).permute(0, 3, 1, 2).float() / 255
     return (pixels - torch.tensor(MEAN).view(3, 1, 1)) / torch.tensor(STD).view(3, 1, 1)
 
@@ -525,7 +525,7 @@ class _Run:
         self.optimiser = torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.98))
 
     def advance(self, batch: Batch) -> None:
-        """One step of AdamW on a warmed-up cosine schedule, in bfloat16 where that is fast."""
+        """Take a step of AdamW on a warmed-up cosine schedule, in bfloat16 where that is fast."""
         # Decides which patches are shown, also after a resume.
         torch.manual_seed(self.config.seed * 1_000_003 + self.step)
         warm, done = min(1.0, (self.step + 1) / 300), self.step / self.config.steps

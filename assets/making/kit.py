@@ -352,7 +352,7 @@ def to_display(linear: Array) -> Array:
 
 
 def to_lch(display: Array) -> Array:
-    """Map (..., 3) sRGB in [0, 1] to (..., 3) CIE lightness [0, 100], chroma, hue in degrees [0, 360)."""
+    """Return (..., 3) CIE lightness [0, 100], chroma, hue [0, 360) degrees of (..., 3) sRGB in [0, 1]."""
     ratio = to_linear(display) @ _TO_XYZ.T / _WHITE
     f = np.where(ratio > 216 / 24389, np.cbrt(ratio), (24389 / 27 * ratio + 16) / 116)
     a, b = 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])
@@ -442,11 +442,11 @@ class Kit:
         return float(self.rng.uniform(low, high))
 
     def pick(self, *words: Word) -> Word:
-        """One of several words."""
+        """Return one of several words, by chance."""
         return words[int(self.rng.integers(len(words)))]
 
     def other(self, word: str, *words: str) -> str:
-        """One of `words` that is not `word`."""
+        """Return one of `words` that is not `word`."""
         return self.pick(*[candidate for candidate in words if candidate != word])
 
     def paint(

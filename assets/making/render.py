@@ -470,7 +470,7 @@ def shade(s, triangle, uv, eye, out):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """What one camera sees of a drawn room."""
+    """The image that one camera takes of a drawn room, and what lies at each pixel."""
 
     image: Array  # (H, W, 3) uint8 sRGB
     pieces: Array  # (H, W) int32 row of `World.ids` at each pixel's centre, -1 where no surface is

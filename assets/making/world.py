@@ -421,7 +421,7 @@ def _hung(kit: Kit, turn: np.ndarray, along: float, height: float) -> Placed:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """All surfaces of a room in one set of arrays. The origin is the middle of the table's top, z up."""
+    """A room: all its surfaces in one set of arrays. The origin is the middle of the table's top, z up."""
 
     vertices: Array  # (V, 3) float32 world points, metres
     normals: Array  # (V, 3) float32 unit
@@ -445,7 +445,7 @@ def build_room(seed: int, tier: Tier = "clutter") -> World:
 
 
 def assemble(placed: list[Placed]) -> World:
-    """One set of arrays from placed things; ids count up through wholes, parts and subparts."""
+    """Return the room of placed things; ids count up through wholes, parts and subparts."""
     columns: dict[str, list[Array]] = {key: [] for key in ("v", "n", "l", "t", "p")}
     labels: list[RegionLabel] = []
     known: dict[tuple[object, ...], int] = {}

@@ -31,7 +31,7 @@ class BrownDistortion:
     k6: float = 0.0
 
     def __call__(self, xy: Array) -> Array:
-        """Map (N, 2) normalised to (N, 2) distorted coordinates, float64."""
+        """Return (N, 2) float64 distorted coordinates of (N, 2) normalised ones."""
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -51,7 +51,7 @@ class FisheyeDistortion:
     k4: float = 0.0
 
     def __call__(self, xy: Array) -> Array:
-        """Map (N, 2) normalised to (N, 2) distorted coordinates, float64."""
+        """Return (N, 2) float64 distorted coordinates of (N, 2) normalised ones."""
         r = np.linalg.norm(xy, axis=-1)
         theta = np.arctan(r)
         t2 = theta * theta
@@ -90,7 +90,7 @@ class PhotoIntrinsics(Intrinsics):
         return replace(self, **vars(self.resized(width, height)))
 
     def pixels(self, xy: Array) -> Array:
-        """Map (N, 2) normalised coordinates to (N, 2) pixel positions in the photograph."""
+        """Return (N, 2) pixel positions in the photograph of (N, 2) normalised coordinates."""
         distorted = xy if self.distortion is None else self.distortion(xy)
         return distorted * (self.fx, self.fy) + (self.cx, self.cy)
 
@@ -127,7 +127,7 @@ def _jacobian(distortion: Distortion, xy: Array, step: float = 1e-6) -> Array:
 
 
 def undistorted_points(distortion: Distortion, distorted: Array) -> Array:
-    """Map (N, 2) distorted to (N, 2) normalised coordinates, by Newton's method from the radial inverse.
+    """Return (N, 2) normalised coordinates of distorted ones, by Newton's method from the radial inverse.
 
     Points that the lens cannot have seen within the invertible radius come back on that radius.
     Raises ValueError if the distortion is singular on the axis itself.

@@ -44,7 +44,7 @@ MAX_QUERIES = len(QUERY_COLOURS)  # shown at a time: one colour each, one channe
 
 
 def mapped(t: Array, name: ColourMap) -> Array:
-    """Map (...,) values in [0, 1] to (..., 3) colours in [0, 1] of a colour map."""
+    """Return (..., 3) colours in [0, 1] of a colour map at (...,) values in [0, 1]."""
     position = np.clip(t, 0, 1) * (NODES - 1)
     low = np.minimum(position.astype(int), NODES - 2)
     fraction = (position - low)[..., None]
@@ -53,7 +53,7 @@ def mapped(t: Array, name: ColourMap) -> Array:
 
 
 def oklab(colours: Array) -> Array:
-    """Map (..., 3) colours in [0, 1] to lightness, a and b in OKLab (B. Ottosson 2020).
+    """Return lightness, a and b in OKLab (B. Ottosson 2020) of (..., 3) colours in [0, 1].
 
     Squares stand for sRGB's curve, which is close and costs nothing.
     """

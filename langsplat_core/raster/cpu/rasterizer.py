@@ -45,7 +45,7 @@ def _add_values(work: Any, x: Array, s: int, row: int, low: int, weight: Lanes, 
 
 @kernel
 def splat_tiles(first: int, last: int, tiles: Tiles, values: Array, image: Array, alpha: Array) -> None:
-    """Map (M, C) values in depth order to fills (H, W, C) image and (H, W, 1) alpha, all float32."""
+    """Fill (H, W, C) image and (H, W, 1) alpha by blending (M, C) values in depth order, all float32."""
     sums = np.empty(PIXELS * tiling.padded_inside(image.shape[2]), np.float32)
     for i in range(first, last):
         tile = tiling.tile_at(i, tiles)
