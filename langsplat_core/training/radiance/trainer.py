@@ -372,7 +372,7 @@ def _first_gaussians(
 
 
 # Few photographs can be overfitted, and from some number of steps on they are: views that were held out get
-# worse. That number grows with the photographs (docs/benchmarks/few.md#presets).
+# worse. That number grows with the photographs (docs/experiments.md).
 VISITS = 64  # steps for each of few photographs, after which held-out views gain no more ...
 MEMBERS = 2  # ... but of another training, merged with it: an ensemble (Lakshminarayanan et al. 2017)
 
