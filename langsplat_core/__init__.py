@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from langsplat_core.pipeline.notebook import draw, show
     from langsplat_core.pipeline.train import train_scene
     from langsplat_core.query.answers import QueryResult
+    from langsplat_core.query.compose import run_phrase
     from langsplat_core.query.engine import QueryEngine
     from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
     from langsplat_core.raster.render import Rendering, render, view_of
@@ -37,6 +38,7 @@ _HOMES = {
         "raster": "load_rasterizer load_lifting_rasterizer",
         "semantics.encoders": "load_text_encoder",
         "query.engine": "QueryEngine QueryResult",
+        "query.compose": "run_phrase",
         "pipeline.train": "train_scene",
         "pipeline.notebook": "show draw",
         "config": "TrainConfig",
@@ -48,8 +50,8 @@ _HOMES = {
 __all__ = [
     "Camera", "Gaussians", "Intrinsics", "LanguageField", "QueryEngine", "QueryResult", "Rendering",
     "Scene", "TrainConfig", "Words", "draw", "load_lifting_rasterizer", "load_rasterizer", "load_scene",
-    "load_text_encoder", "look_at", "read_words", "render", "save_scene", "show", "train_scene", "view_of",
-    "write_words",
+    "load_text_encoder", "look_at", "read_words", "render", "run_phrase", "save_scene", "show", "train_scene",
+    "view_of", "write_words",
 ]  # fmt: skip
 
 
@@ -58,3 +60,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'langsplat_core' has no attribute {name!r}")
     with optional_imports():
         return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__", "errors"]

@@ -12,6 +12,7 @@ import io
 import json
 import logging
 import os
+import re
 import signal
 import sys
 import time
@@ -73,6 +74,8 @@ def one_line(box: str) -> str:
         elif said:
             break
     words = " ".join(" ".join(said).split()) or title.strip(" ╭╮─").lower()
+    hint = r"\1 is missing; is there an unknown option, or a file '-NAME' in place of './-NAME'?"
+    words = re.sub(r"Missing value for argument 'command\.(\w+)'.*", hint, words)
     return f"{words or 'unusable arguments'} (see --help)"
 
 

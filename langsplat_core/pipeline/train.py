@@ -54,8 +54,8 @@ log = logging.getLogger("langsplat")
 
 
 def train_scene(  # noqa: PLR0913  what the command has as options
-    dataset: Path,
-    out: Path,
+    dataset: Path | str,
+    out: Path | str,
     config: TrainConfig,
     work: Path | None = None,
     progress: Progress = silent,
@@ -71,6 +71,7 @@ def train_scene(  # noqa: PLR0913  what the command has as options
     scene. `gaussians_from`: a scene in the photographs' world whose Gaussians are taken instead of training
     some. `until` "gaussians": a scene without a language field, which a later call adds to it.
     """
+    dataset, out = Path(dataset), Path(out)
     check_settings(config)
     language_field.check_lift(config)
     if out.suffix.lower() != ".ply":

@@ -101,8 +101,7 @@ def check_phrase(
 ) -> None:
     """Raise what `run_phrase` would, without searching; what was encoded for it is kept."""
     tree = parse(text, engine.taught)
-    if not isinstance(tree, Atom):
-        _check_viewpoint(tree, viewpoint)
+    _check_viewpoint(tree, viewpoint)
     try:
         engine.text_vectors(encoded_texts(engine, tree), progress)
     except EncoderError:

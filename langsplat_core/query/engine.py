@@ -48,7 +48,7 @@ from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, kept_calibra
 from langsplat_core.semantics.relevancy import FEWEST, Scale, TextEncoder, everyday_vectors, relevancy_of
 
 BATCH = 512  # phrases that are encoded at a time
-NO_FIELD = "this scene has no language field: it can be looked at, not searched; `langsplat train` makes one"
+NO_FIELD = f"no language field (NAME{SUFFIX}) lies beside it; `langsplat train` makes one"
 
 LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
 
@@ -56,7 +56,7 @@ LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo";
 def no_field(scene: Scene) -> str:
     """Return the reason why a scene has no language field."""
     unread = [reason for reason in scene.unread if SUFFIX in reason]
-    return f"it can be looked at, not searched: {unread[0]}" if unread else NO_FIELD
+    return f"it can be looked at, not searched: {unread[0] if unread else NO_FIELD}"
 
 
 def searchable(path: Path) -> Scene:
@@ -121,9 +121,10 @@ class QueryEngine:
     # Answers.
 
     def run(self, phrase: str, level: LevelChoice = "auto", progress: Progress = silent) -> QueryResult:
-        """Answer `phrase`; a taught word by what was shown. Raises as `text_vectors` does.
+        """Answer `phrase` as one name; a taught word by what was shown. Raises as `text_vectors` does.
 
-        The level is chosen for the scene and not for a view: the image does not flicker between levels.
+        The level is chosen for the scene and not for a view: the image does not flicker between levels. "Lid
+        of the teapot" is one name here; `run_phrase` reads it.
         """
         return self.run_many([phrase], level, progress)[0]
 
@@ -131,6 +132,8 @@ class QueryEngine:
         self, phrases: Sequence[str], level: LevelChoice = "auto", progress: Progress = silent
     ) -> list[QueryResult]:
         """Return the answers of `run` to phrases, which are encoded and compared together."""
+        if level not in ("auto", *LEVELS):
+            raise InputError(f"no level {level!r}; choose auto or one of {', '.join(LEVELS)}")
         texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
         vectors = self.text_vectors(texts, progress)  # first: what it refuses leaves nothing cached
         relevancies = self._lookup.relevancies(vectors) if texts else iter(())

@@ -285,6 +285,8 @@ PREPOSITIONS: dict[tuple[str, ...], Side | Literal["nearest", "farthest", "of"]]
 }
 _EMPTY = STOP_WORDS | ADJECTIVES
 _LONGEST = max(map(len, PREPOSITIONS))
+# Before what is looked for, where that is asked in a sentence: "where is the mug".
+_QUESTION = r"(?i)^(?:(?:where|which)(?:'s| is| are)|(?:is|are) there|find(?: me)?|show me|look for) (?=.)"
 _EXCLUSIONS = [["but", "not"], ["and", "not"], ["other", "than"], ["not"], ["without"], ["except"]]
 
 
@@ -296,8 +298,8 @@ def parse(text: str, names: Collection[str] = ()) -> Phrase:
     """
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"a query of {len(text)} characters; use at most {MAX_CHARACTERS}")
-    tokens = _with_names(list(tokens_of(text)), names)
-    words = [token for token in tokens if token != ","]
+    tokens = re.sub(_QUESTION, "", " ".join(_with_names(list(tokens_of(text)), names))).split(" ")
+    words = [token for token in tokens if token not in ("", ",")]
     if words and _exclusion_at(tokens, 0):
         raise InputError(
             f"'{' '.join(words)[:60]}' only says what not to look for; "

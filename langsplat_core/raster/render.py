@@ -18,7 +18,7 @@ from typing import overload
 
 import numpy as np
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import RasterSettings
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, protocol
 from langsplat_core.scene import Camera, Gaussians, Scene
@@ -77,9 +77,11 @@ def render(
     values: (N, C) further numbers per Gaussian, finite, to be blended along with the colours. backend: one
     of `raster.BACKENDS` that needs no device handed to it ("cpu", "cuda", "reference"). profile: constants
     of image formation, such as `config.INRIA`; None: the published ones with the scene's own near plane. Its
-    antialiasing applies to both. Raises InputError for an unknown backend,
-    BackendError for one that cannot load here.
+    antialiasing applies to both. Raises InputError for an unknown backend, BackendError for one that cannot
+    load here, ValueError for values of another shape.
     """
+    if values is not None:
+        check_array("values", np.asarray(values), ("N", "C"), {"N": len(scene.gaussians.means)})
     rasterizer = _cpu() if backend == "cpu" else load_rasterizer(backend)
     view = view_of(scene, camera, rasterizer, scene.raster_settings(profile))
     return splat_colours(view, scene.gaussians, values)

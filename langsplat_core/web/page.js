@@ -94,13 +94,12 @@ class Page {
     }
     const offered = language ? [...this.language.taught.keys(), ...language.phrases] : [];
     byId("list").append(...offered.map((value) => element("option", "", { value })));
-    byId("examples").append(
-      ...examples.map((phrase) => {
-        const button = element("button", phrase, { type: "button" });
-        button.addEventListener("click", () => this.search(phrase));
-        return button;
-      }),
-    );
+    byId("examples").append(...examples.map((phrase) => this.asking(phrase, phrase)));
+  }
+
+  // A button that asks a phrase.
+  asking(text, phrase) {
+    return element("button", text, { type: "button", onclick: () => this.search(phrase) });
   }
 
   fillRadios(id, texts, chosen) {
@@ -324,21 +323,16 @@ class Page {
     if (hot.length === 1) {
       this.legend(hot[0]);
     }
-    if (problem) {
-      said.append(problem.message);
-    }
+    said.append(problem?.message ?? "");
     if (problem?.near) {
       const meant = this.phrase.toLowerCase().replace(problem.word, problem.near);
-      const button = element("button", `Did you mean “${meant}”?`, { type: "button" });
-      button.addEventListener("click", () => this.search(meant));
-      said.append(" ", button);
+      said.append(" ", this.asking(`Did you mean “${meant}”?`, meant));
     }
     if (this.display === "latent") {
       this.painter.show(this.language.latents(this.level === "auto" ? 2 : levels.indexOf(this.level)));
     } else if (this.display !== "rgb") {
       const heats = (answer) => this.language.heats(answer, byId("heat").value, this.meta.picture.heat_base);
-      const members = (answer) => answer.members;
-      this.painter.show(hot.map(this.display === "segmentation" ? members : heats));
+      this.painter.show(hot.map(this.display === "segmentation" ? ({ members }) => members : heats));
     }
     this.redraw();
   }

@@ -79,6 +79,8 @@ export function thingAndPart(phrase, lists) {
 }
 
 const AND = / (?:and|&|as well as) /iu;
+// Before what is looked for, where that is asked in a sentence: "where is the mug".
+const QUESTION = /^(?:(?:where|which)(?:'s| is| are)|(?:is|are) there|find(?: me)?|show me|look for) (?=.)/iu;
 const OR = / or /iu;
 const EXCLUDE = /,? (?:(?:but|and) )?(?:not|without|except|other than) /iu;
 const SEPARATE = /[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)/iu;
@@ -109,7 +111,7 @@ export function parse(text, lists) {
   const both = (side) => group("both", named(side, AND, lists).map(one));
   const either = (side) => group("either", named(side, OR, lists).map(both));
   const isPart = (tree) => tree.text && namedBy(tree.text, lists) !== "thing";
-  const [what, ...others] = named(text, EXCLUDE, lists).map(either);
+  const [what, ...others] = named(text.replace(QUESTION, ""), EXCLUDE, lists).map(either);
   const own = what.text && !isPart(what); // "mug without handle"
   const ofIt = (tree) => (own && isPart(tree) ? { kind: "inside", what: tree, anchor: what } : tree);
   return others.length ? { kind: "without", what, anchor: group("either", others.map(ofIt)) } : what;

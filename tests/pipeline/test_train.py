@@ -84,7 +84,7 @@ def test_training_keeps_a_calibration_for_drawn_rooms_alone(room, tmp_path):
 
 def test_photographs_become_a_searchable_scene(room, tmp_path):
     out = tmp_path / "scene.ply"
-    report = train_scene(room, out, tiny_settings(room))
+    report = train_scene(str(room), str(out), tiny_settings(room))
     scene = load_scene(out)
     assert scene.language is not None
     assert scene.metres_per_unit == 0.5

@@ -32,8 +32,8 @@ READ = {
     "wing of the airplane's tail": Inside(Atom("wing"), Inside(Atom("tail"), Atom("airplane"))),
     "back of the chair": Inside(Atom("back"), Atom("chair")),
     "mug on the table": Relation("on", MUG, DESK),
-    "mug on top of the table": Relation("on", MUG, DESK),
-    "a mug to the left of my book": Relation("left of", MUG, BOOK),
+    "Show me the mug on top of the table": Relation("on", MUG, DESK),
+    "where is a mug to the left of my book?": Relation("left of", MUG, BOOK),
     "handle of the mug on the table": Inside(HANDLE, Relation("on", MUG, DESK)),
     "mug and the book": Both((MUG, BOOK)),
     "mug as well as book & table": Both((MUG, BOOK, DESK)),
@@ -45,7 +45,7 @@ READ = {
     "mug, not red mug, not blue mug": Without(MUG, Union((Atom("red mug"), Atom("blue mug")))),
     "mug without its handle": Without(MUG, Inside(HANDLE, MUG)),
     "the biggest mug on the table": Superlative("biggest", Relation("on", MUG, DESK)),
-    "nearest mug to the book": Superlative("nearest", MUG, BOOK),
+    "find the nearest mug to the book": Superlative("nearest", MUG, BOOK),
     "biggest two mugs": Counted(2, Superlative("biggest", MUG)),
     "the mug on the left": Superlative("leftmost", MUG),
     "handle of the smallest mug": Inside(HANDLE, Superlative("smallest", MUG)),
@@ -57,7 +57,7 @@ READ = {
 ASKED_WHOLE = (
     *("red handle", "wooden leg", "glass lid", "cup of tea", "pair of scissors", "children's book"),
     *("t-shirt", "red and blue ball", "on the table", "mug on", "mug and", "mug without", "biggest"),
-    *("handle", "orange", "three", "杯子", "красная кружка", "κούπα", "كوب أحمر", "☕"),
+    *("handle", "orange", "three", "杯子", "красная кружка", "κούπα", "كوب أحمر", "☕", "what is that mug"),
 )
 READ |= {text: Atom(text) for text in ASKED_WHOLE}
 

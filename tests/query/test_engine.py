@@ -60,8 +60,9 @@ def test_engine_errors_say_what_to_do():
     scene = named_scene()
     with pytest.raises(EncoderError, match="only the phrases in the scene's phrasebook"):
         QueryEngine(scene).run("sofa")
-    with pytest.raises(InputError, match="empty"):
-        QueryEngine(scene).run("  ")
+    for asked, level, said in (("  ", "auto", "empty"), ("mug", "Whole", "no level 'Whole'; choose")):
+        with pytest.raises(InputError, match=said):
+            QueryEngine(scene).run(asked, level)
     with pytest.raises(InputError, match="langsplat train"):
         QueryEngine(Scene(scene.gaussians)).run("mug")
 

@@ -229,6 +229,8 @@ def test_a_view_is_formed_as_the_scene_was_trained(backend):
 def test_backends_that_cannot_draw_or_lift_are_refused():
     with pytest.raises(InputError, match="choose one of reference, cpu, opengl, cuda"):
         render(Scene(G), CAMERA, backend="vulkan")
+    with pytest.raises(ValueError, match=r"values: expected shape \(N, C\) with {'N': 80}"):
+        render(Scene(G), CAMERA, random_values(160, 2))
     with pytest.raises(BackendError, match="--backend cpu"):
         render(Scene(G), CAMERA, backend="cuda")
     assert load_lifting_rasterizer("auto").name == "cpu"
@@ -238,6 +240,7 @@ def test_backends_that_cannot_draw_or_lift_are_refused():
 
 
 def test_every_public_name_is_there():
+    assert set(langsplat_core.__all__) <= set(dir(langsplat_core))
     for name in langsplat_core.__all__:
         assert getattr(langsplat_core, name).__doc__
     with pytest.raises(AttributeError, match="nothing_like_it"):
