@@ -66,6 +66,7 @@ def rows(seed: int, newest: str) -> list[Row]:
     steps = subprocess.run([sys.executable, "-c", STEPS], capture_output=True, text=True, check=True).stdout
     every = steps.split()
     avx512 = [name for name in every if "512" in name or name == "X86_V4"]
+    later = [name for name in avx512 if name in ("AVX512_ICL", "AVX512_SPR")]
     libraries = (
         "OPENBLAS_CORETYPE={} NPY_DISABLE_CPU_FEATURES={} ATEN_CPU_CAPABILITY={} ONEDNN_MAX_CPU_ISA={} "
         "MKL_ENABLE_INSTRUCTIONS={}"
@@ -73,6 +74,7 @@ def rows(seed: int, newest: str) -> list[Row]:
     return [
         Row("sse", libraries.format("Prescott", ",".join(every), "default", "SSE41", "SSE4_2")),
         Row("avx2", libraries.format("Haswell", ",".join(avx512), "avx2", "AVX2", "AVX2")),
+        Row("skylake", libraries.format("SkylakeX", ",".join(later), "avx512", "AVX512_CORE", "AVX512")),
         Row("numba", "NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR={tmp}"),
         Row("threads", "OMP_NUM_THREADS=4"),
         Row("one-core", before="taskset -c 0", folders=f"{COMPUTING} pipeline"),
