@@ -301,6 +301,8 @@ def export_labels(describer: Describer, path: Path) -> Path:
 
 EXAMPLES = 6
 TRIES = 4  # candidates that are asked for each example wanted
+# The basic colours of English (Berlin and Kay 1969): all that the demo encoder recognises on photographs.
+COLOURS = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "grey")
 
 
 @dataclass(frozen=True)
@@ -312,7 +314,10 @@ class Suggestions:
 
 
 def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = silent) -> Suggestions:
-    """Return examples from a scene's inventory and phrasebook, asked and found, in seconds; maybe none."""
+    """Return examples from a scene's inventory and phrasebook, asked and found, in seconds; maybe none.
+
+    Where answers are guesses they are colours.
+    """
     here: tuple[str, ...] = ()
     taught: tuple[str, ...] = ()
     try:
@@ -324,12 +329,15 @@ def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = s
     except LangSplatError:  # no encoder here, or one that knows none of the words: the phrasebook is left
         pass
     candidates = tuple(dict.fromkeys((*here, *engine.field.phrasebook)))
-    found = (phrase for phrase in candidates[: TRIES * at_most] if _is_found(engine, phrase))
+    asked = COLOURS if engine.basis.guesses else candidates[: TRIES * at_most]
+    found = (phrase for phrase in asked if _is_found(engine, phrase))
     return Suggestions(tuple(islice(found, at_most)), tuple(dict.fromkeys((*candidates, *taught))))
 
 
 def combined(engine: QueryEngine, suggestions: Suggestions) -> tuple[str, ...]:
     """Return a part of a thing and a thing near another, as phrases that are asked and found; maybe none."""
+    if engine.basis.guesses:
+        return ()
     here = suggestions.phrases[: TRIES * EXAMPLES]
     parts = (phrase for phrase in here if " " in phrase and is_part(phrase.split()[-1]))
     pairs = (f"{thing} near the {other}" for thing, other in permutations(suggestions.examples, 2))

@@ -8,12 +8,7 @@ import pytest
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.query import describe
-from langsplat_core.query.describe import (
-    Describer,
-    build_words,
-    field_features,
-    look_at_pixel,
-)
+from langsplat_core.query.describe import Describer, build_words, field_features, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.inventory import (
     DEEPEST,
@@ -28,6 +23,7 @@ from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import NO_NODE, LanguageField, LinearCodec, Scene, Tree
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.scene.surface import surface_areas
+from langsplat_core.semantics.encoders import DEMO
 from tests.support.fakes import (
     CENTRES,
     NAMES,
@@ -271,10 +267,11 @@ def test_every_example_is_found_in_the_scene():
 
 def test_without_an_encoder_the_phrasebook_is_asked():
     nothing = (-axis(0) - axis(1) - axis(2)) / np.float32(np.sqrt(3))
-    book = {"mug": axis(0), "unicorn": nothing, "of": axis(1)}
-    scene = replace(blob_scene(), language=replace(language(), phrasebook=book))
-    found = suggest(QueryEngine(scene))
-    assert (found.examples, found.phrases) == (("mug",), ("mug", "unicorn", "of"))
+    book = {"mug": axis(0), "unicorn": nothing, "of": axis(1), "red": axis(2)}
+    fields = (replace(language(), phrasebook=book, encoder_id=one) for one in ("lab/clip", DEMO))
+    found, guesses = (suggest(QueryEngine(replace(blob_scene(), language=field))) for field in fields)
+    assert (found.examples, found.phrases) == (("mug", "red"), tuple(book))
+    assert (guesses.examples, guesses.phrases) == (("red",), tuple(book))  # all that is known are colours
 
 
 @pytest.mark.parametrize(
