@@ -48,15 +48,14 @@ from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, kept_calibra
 from langsplat_core.semantics.relevancy import FEWEST, Scale, TextEncoder, everyday_vectors, relevancy_of
 
 BATCH = 512  # phrases that are encoded at a time
-NO_FIELD = f"no language field (NAME{SUFFIX}) lies beside it; `langsplat train` makes one"
 
 LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
 
 
 def no_field(scene: Scene) -> str:
     """Return the reason why a scene has no language field."""
-    unread = [reason for reason in scene.unread if SUFFIX in reason]
-    return f"it can be looked at, not searched: {unread[0] if unread else NO_FIELD}"
+    none = f"no language field (NAME{SUFFIX}) lies beside it; `langsplat train` makes one"
+    return f"it can be looked at, not searched: {next((why for why in scene.unread if SUFFIX in why), none)}"
 
 
 def searchable(path: Path) -> Scene:

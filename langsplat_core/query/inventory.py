@@ -314,18 +314,13 @@ class Suggestions:
 
 
 def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = silent) -> Suggestions:
-    """Return examples from a scene's inventory and phrasebook, asked and found, in seconds; maybe none.
-
-    Where answers are guesses they are colours.
-    """
-    here: tuple[str, ...] = ()
-    taught: tuple[str, ...] = ()
+    """Return what is asked and found, in seconds: words of the inventory, colours where these are guesses."""
+    here = taught = tuple[str, ...]()
     try:
         describer = Describer(engine, progress=progress)
         taught = describer.words[0].phrases
-        inventory = scene_inventory(describer, progress, placed=False)
-        entries = sorted(inventory, key=lambda entry: -entry.probability)
-        here = tuple(entry.phrase for entry in entries)
+        entries = scene_inventory(describer, progress, placed=False)
+        here = tuple(entry.phrase for entry in sorted(entries, key=lambda entry: -entry.probability))
     except LangSplatError:  # no encoder here, or one that knows none of the words: the phrasebook is left
         pass
     candidates = tuple(dict.fromkeys((*here, *engine.field.phrasebook)))
@@ -336,8 +331,6 @@ def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = s
 
 def combined(engine: QueryEngine, suggestions: Suggestions) -> tuple[str, ...]:
     """Return a part of a thing and a thing near another, as phrases that are asked and found; maybe none."""
-    if engine.basis.guesses:
-        return ()
     here = suggestions.phrases[: TRIES * EXAMPLES]
     parts = (phrase for phrase in here if " " in phrase and is_part(phrase.split()[-1]))
     pairs = (f"{thing} near the {other}" for thing, other in permutations(suggestions.examples, 2))

@@ -280,6 +280,8 @@ def prepare_suggestions(viewer: Viewer) -> None:
     def work(engine: QueryEngine, progress: Progress) -> Suggestions:
         asked = engine if here else QueryEngine(scene)  # by the phrasebook
         found = suggest(asked, progress=progress)
+        if asked.basis.guesses:  # colours, of which nothing is a part
+            return found
         return replace(found, examples=(*found.examples[:SIMPLE], *combined(asked, found)))
 
     viewer.ask_engine("finding examples", work, partial(setattr, state, "suggestions"), lambda reason: None)
