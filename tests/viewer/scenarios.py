@@ -555,6 +555,9 @@ def large_letters(s: Any) -> None:
     card, legend = map(imgui.internal.find_window_by_name, ("Search", "relevancy"))
     assert legend.active
     assert card.pos.x + card.size.x <= legend.pos.x
+    settings.toggle_wipe(s.viewer)  # depth is right of the line, heat left of it
+    s.settle()
+    assert legend.pos.x + legend.size.x <= scene_area().left + 0.5 * scene_area().width
 
 
 def use_the_outline(s: Any) -> None:

@@ -41,6 +41,8 @@ def test_scene_without_field_says_what_makes_one(viewer):
     open_scene(viewer, "plain.ply")
     assert viewer.state.session.picture.display == "rgb"
     assert "langsplat train" in viewer.state.messages[-1].text
+    queries.ask(viewer, "")  # nothing, as a command line without --query
+    assert errors(viewer) == []
     queries.ask(viewer, "mug")
     settings.set_display(viewer, "latent")
     assert viewer.state.session.queries == ()

@@ -44,7 +44,7 @@ def ask(viewer: Viewer, text: str) -> None:
 def ask_together(viewer: Viewer, phrases: Sequence[str]) -> None:
     """Search the scene for phrases, and give a colour to each that may be there."""
     state, listed = viewer.state, list[str]()
-    for phrase in phrases if viewer.searchable() is not None else ():
+    for phrase in phrases if phrases and viewer.searchable() is not None else ():
         viewer.remember()
         queries, key = state.session.queries, phrase_key(phrase)
         query = next((query for query in queries if phrase_key(query.phrase) == key), Query(phrase))

@@ -341,9 +341,10 @@ BAR_EM, BAR_HEIGHT_EM, LEAST_EM, AROUND_EM = 11.0, 0.8, 6.0, 3.0  # least: besid
 
 
 def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
-    """Draw the legend of the scene, where it is `free`; with one beside it each on its side of the line."""
+    """Draw the legend where it is `free`, or left of the line where only that has heat; of two scenes two."""
     if viewer.beside is None:
-        draw_legend(viewer, free)
+        is_left = [pane.row.drawing is Drawing.HEAT for pane in viewer.state.panes()] == [True, False]
+        draw_legend(viewer, parts_of(area, viewer.state.session.split)[0] if is_left else free)
         return
     sides = ((viewer, "left"), (viewer.beside, "right"))
     for (side, name), part in zip(sides, parts_of(area, viewer.state.session.split), strict=False):
