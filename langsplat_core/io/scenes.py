@@ -266,7 +266,7 @@ def report_left_out(path: Path, scene: Scene, kind: str, loses: Sequence[str], k
 
 
 def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer | None = None) -> None:
-    """Write `scene` in the format of its name, with its companions; those it lacks are removed.
+    """Write `scene` in the format of its name, with its companions; those it lacks are removed, and named.
 
     Only the PLY keeps everything: see `SceneFormat.loses`. All formats keep the rows' order. All files are
     first written whole under temporary names. Then the old companions are removed, the scene's file renamed
@@ -284,6 +284,9 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer 
     sidecar, cameras, origin = _companions(path)
     if tell:
         report_left_out(path, scene, f"{row.suffix} files", row.loses, origin.name)
+    for file, new in ((sidecar, scene.language), (cameras, scene.cameras or None)):
+        if new is None and os.path.exists(file):
+            report_loss("%s: removes %s of the scene that was there", shown(path), shown(Path(file.name)))
     path.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as lock, ExitStack() as renames:  # made in the reverse order of these lines
         if scene.cameras:

@@ -255,7 +255,6 @@ def language_tables(
         "chance": np.array(() if engine.chance is None or is_calibrated else engine.chance, np.float16),
         **_region_tables(engine, codes),
     }
-    bars = [asdict(bar) for bar in engine.bars or ()]
     found = {name: [None if np.isinf(x) else x for x in pair] for name, pair in RULE.found.items()}
     progress("choosing phrases", 0.3)
     suggested = suggest(engine)
@@ -264,7 +263,7 @@ def language_tables(
         "counts": [len(nodes) for nodes in regions.nodes],
         "basis": engine.basis.long,
         "guess": engine.basis.short if engine.basis.guesses else "",
-        "bars": bars,
+        "bars": [asdict(bar) for bar in engine.bars or ()],
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
         "rule": asdict(RULE) | {"found": found, "half": HALF, "low": LOW},
         "grammar": {

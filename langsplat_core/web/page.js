@@ -147,9 +147,7 @@ class Page {
       document.fullscreenElement ? document.exitFullscreen() : document.body.requestFullscreen(),
     );
     byId("picture").addEventListener("click", () => this.save());
-    byId("spin").addEventListener("click", () => {
-      byId("spin").ariaPressed = String(this.controls.spin());
-    });
+    byId("spin").addEventListener("click", () => (byId("spin").ariaPressed = String(this.controls.spin())));
     const offer = (offered) => (byId("headset").hidden = !offered);
     navigator.xr?.isSessionSupported("immersive-vr").then(offer, () => {}); // rejected in a frame without the right
     const refused = (problem) => this.update(Object.assign(this, { problem }));

@@ -156,12 +156,12 @@ def test_formats_for_reading_alone_refuse_writing(tmp_path, row):
     assert not list(tmp_path.iterdir())
 
 
-def test_replacing_a_scene_removes_its_companions(tmp_path):
+def test_replacing_a_scene_removes_its_companions_and_says_so(tmp_path, caplog):
     save_scene(tmp_path / "scene.ply", full_scene())
     save_scene(tmp_path / "scene.ply", Scene(random_gaussians(5)))
     assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]
-    got = load_scene(tmp_path / "scene.ply")
-    assert (got.language, got.cameras) == (None, ())
+    assert load_scene(tmp_path / "scene.ply").language is None
+    assert [SIDECAR in said for said in caplog.messages] == [True, False]  # the other is of cameras
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no signal 9")
