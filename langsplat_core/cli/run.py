@@ -32,7 +32,7 @@ from langsplat_core.io.files import NO_ROOM, shown
 
 log = logging.getLogger("langsplat")
 SHELLS = ("bash", "zsh", "fish", "tcsh")
-_CONTINUES = "; the same command continues where it stopped"
+_CONTINUES = "; the same command goes on from what was finished"
 _ROOM = "make room, or choose another place; what was finished is kept"
 
 _Flag = Annotated[

@@ -361,7 +361,7 @@ def signalled(code: str, number: int, seconds: float = 0.0) -> tuple[int, list[s
 ENDED = pytest.mark.parametrize(
     ("number", "said"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")]
 )
-CONTINUES = "langsplat: {}; the same command continues where it stopped"
+CONTINUES = "langsplat: {}; the same command goes on from what was finished"
 
 
 @ENDED

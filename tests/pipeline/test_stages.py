@@ -239,7 +239,7 @@ def test_training_stopped_in_every_stage_ends_with_the_same_bytes(how, kind, tmp
         assert ended.code in (0, expected), ended.said  # 0: it was faster than the signal
         assert "Traceback" not in ended.said
         if ended.code > 0:
-            assert ended.said.splitlines()[-1].endswith("the same command continues where it stopped")
+            assert ended.said.splitlines()[-1].endswith("the same command goes on from what was finished")
         stopped.append(ended.code != 0)
     print(f"{kind}: {sum(stopped)} of {len(stopped)} {how}")
     assert sum(stopped) > len(stopped) / 2
