@@ -23,11 +23,8 @@ class DiscView(View):
         light = np.cumprod(1 - alphas, 0) / (1 - alphas)  # that reaches each
         self.weights = (alphas * light)[np.argsort(order)]  # the matrix W of `langsplat_core.raster.protocol`
 
-    def splat(self, values):  # (N, C) -> W x of (H, W, C), and alpha (H, W)
+    def splat(self, values):  # (N, C) -> W x, (H, W, C), and alpha; a view that can lift has `gather`, W^T y
         return np.einsum("nhw,nc->hwc", self.weights, values), self.weights.sum(0)
-
-    def depth(self):  # (H, W); a view that can lift also has `gather`, W^T y, and `contributions`, W^T 1
-        return self.splat(self.depths[:, None])[0][..., 0] / np.maximum(self.weights.sum(0), 1e-9)
 
 
 class Discs:

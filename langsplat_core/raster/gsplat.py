@@ -1,10 +1,13 @@
 """The CUDA backend: gsplat's rasterizer behind our interfaces. This is the only file that knows gsplat.
 
 gsplat (1.5 or newer) is an optional dependency and compiles its kernels at first use. What differs from the
-reference, all of it gsplat's own: float32 throughout, the covariance formed in 3D first, so that long thin
-footprints lose digits, alpha capped at 0.999 in 1.5, at 0.99 from 1.6 on, antialiasing without INRIA's floor
-of 0.005, images smaller than the photographs without their pixels' means (`protocol.dilation`), and `gather`
-sums with atomics, so its last digits vary between runs.
+reference, all of it gsplat's own: alpha is capped at 0.999 in 1.5, at 0.99 from 1.6 on; `gather` sums with
+atomics, so its last digits vary between runs; numbers are float32. The footprints of a view come from the
+CPU's kernels, in float64 and sorted, and are shown to gsplat as flat Gaussians in pixels. It rounds a mean to
+6e-8 of the image's size, and a covariance, whose inverse loses 6e-8 times the ratio of its variances and
+overflows beyond 4e9 pixels. In training (`draw`) gsplat projects, too: Gaussians of equal float32 depths are
+drawn in the order of rows, covariances are formed in 3D, antialiasing lacks INRIA's floor of 0.005, and
+images smaller than the photographs lack their pixels' means (`protocol.dilation`).
 """
 
 import subprocess
@@ -15,14 +18,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from langsplat_core.arrays import Array, affine, check_array
+from langsplat_core.arrays import Array, check_array
+from langsplat_core.compiled import shared_workers
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.protocol import LiftingView, dilation, farthest, mean_depth
+from langsplat_core.raster.cpu import projection
+from langsplat_core.raster.cpu.tiles import depth_order
+from langsplat_core.raster.protocol import LiftingView, dilation, farthest
 from langsplat_core.scene import Camera, Gaussians, look_at
 
 DEVICE = "cuda"
 RAW = ("means", "log_scales", "quats_wxyz", "opacity_logits")  # of what is drawn
+has_device = torch.cuda.is_available
 FARTHEST = 1e10  # world units: where gsplat's far plane is when it is not told
 
 
@@ -43,11 +50,6 @@ class DifferentiableImage:
         """Return the (N, 2) gradient; zeros when nothing was differentiated."""
         grad = torch.zeros_like(self.means_px) if self.means_px.grad is None else self.means_px.grad
         return grad.reshape(-1, 2)
-
-
-def has_device() -> bool:
-    """Return True where torch finds the device that gsplat draws on."""
-    return torch.cuda.is_available()
 
 
 def require_device() -> None:
@@ -73,13 +75,11 @@ def draw(
     camera: Camera,
     settings: RasterSettings,
     sh_degree: int | None = None,
-    view_matrix: Array | None = None,
 ) -> DifferentiableImage:
-    """Blend (N, C) `values`, or of `sh_degree` (N, K, 3) harmonics; view_matrix: (4, 4), for the camera's."""
+    """Blend (N, C) `values`, or of `sh_degree` (N, K, 3) harmonics."""
     from gsplat import rasterization
 
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
-    view = camera.world_to_camera if view_matrix is None else view_matrix
     added, fitted = dilation(camera, settings)
     images, alphas, extra = rasterization(
         means=gaussians["means"],
@@ -87,7 +87,7 @@ def draw(
         scales=gaussians["log_scales"].exp(),
         opacities=gaussians["opacity_logits"].sigmoid(),
         colors=values,
-        viewmats=to_device(view[None]),
+        viewmats=to_device(camera.world_to_camera[None]),
         Ks=torch.tensor([intrinsics], dtype=torch.float32, device=DEVICE),
         width=camera.width,
         height=camera.height,
@@ -112,22 +112,37 @@ def to_device(array: Array) -> Tensor:
 
 
 class GsplatView(LiftingView):
-    """Valid Gaussians on the device; gsplat projects them anew in every call."""
+    """M drawn of N Gaussians in depth order: their footprints, on the device."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> None:
-        self.camera, self._settings = camera, settings
-        self.count, self._rows = len(gaussians), np.flatnonzero(gaussians.valid())
-        kept = gaussians.take(self._rows)
-        # Relative to the camera in float64 first: float32 has no digits left far from the origin.
-        means = kept.means.astype(np.float64) - camera.position
-        self._depths = (means @ camera.rotation[2]).astype(np.float32)
-        self._turn = affine(camera.rotation, np.zeros(3))
-        arrays = {**vars(kept), "means": means}
-        self._gaussians = {name: to_device(arrays[name]) for name in RAW}
+        self.camera, self.count, workers = camera, len(gaussians), shared_workers()
+        kernel_camera = projection.kernel_camera(camera, settings)
+        found = projection.project_all(projection.rows_of(gaussians), kernel_camera, workers)
+        self._rows = depth_order(found.depths, np.flatnonzero(found.drawn).astype(np.int32), workers)
+        self.depths, geometry = found.depths, found.geometry[self._rows]
+        covariances = np.zeros((len(self._rows), 3, 3))
+        covariances[:, :2, :2] = projection.covariances(geometry)
+        # gsplat sorts by a float32 depth: the place in our order, in place of a depth, keeps the order.
+        means = np.column_stack([geometry[:, :2], np.arange(1, len(self._rows) + 1)])
+        opacities = np.exp2(geometry[:, projection.LOG2_OPACITY])
+        of_one = {"viewmats": np.eye(4)[None], "Ks": np.eye(3)[None]}
+        arrays = {"means": means, "covars": covariances, "opacities": opacities, **of_one}
+        tensors = {name: to_device(array) for name, array in arrays.items()}
+        self._flat = {**tensors, "quats": None, "scales": None}
 
     def _draw(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        drawn = draw(self._gaussians, values, self.camera, self._settings, view_matrix=self._turn)
-        return drawn.image, drawn.alpha
+        from gsplat import rasterization
+
+        images, alphas, _ = rasterization(
+            **self._flat,
+            colors=values,
+            width=self.camera.width,
+            height=self.camera.height,
+            eps2d=0.0,  # footprints are dilated
+            packed=False,
+            camera_model="ortho",
+        )
+        return images[0], alphas[0, ..., 0]
 
     def splat(self, values: Array) -> tuple[Array, Array]:
         channels = check_array("values", values, (self.count, "C"))["C"]
@@ -149,12 +164,6 @@ class GsplatView(LiftingView):
             gathered[self._rows] = grad.cpu().numpy()
         return gathered
 
-    def depth(self) -> Array:
-        both = np.ones((self.count, 2), np.float32)
-        both[self._rows, 0] = self._depths
-        sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
-        return mean_depth(sums, weights)
-
 
 class GsplatRasterizer:
     """Stateless; BackendError where there is no CUDA device or gsplat's kernels do not work."""
@@ -165,8 +174,8 @@ class GsplatRasterizer:
         require_device()
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> GsplatView:
-        """Project with gsplat, which fixes all but near, far, dilation and antialiased: BackendError."""
-        for name in ("fov_clamp", "alpha_min", "transmittance_min"):
+        """Project; BackendError for cut-offs other than those that gsplat fixes."""
+        for name in ("alpha_min", "transmittance_min"):
             if getattr(settings, name) != getattr(INRIA, name):
                 raise BackendError(f"rasterizer 'cuda' cannot change {name}; use --backend cpu")
         return GsplatView(gaussians, camera, settings)

@@ -27,6 +27,7 @@ class View(ABC):
 
     camera: Camera
     count: int  # N
+    depths: Array  # (N,) camera z of what is drawn, unless `depth` is a view's own
 
     @abstractmethod
     def splat(self, values: Array) -> tuple[Array, Array]:
@@ -41,9 +42,11 @@ class View(ABC):
         """`splat` of values at `rows` alone, (M, C)."""
         return self.splat(values)
 
-    @abstractmethod
     def depth(self) -> Array:
         """Return (H, W) alpha-weighted mean depth along camera z, world units; 0 where nothing is drawn."""
+        # Ones are blended along: alpha may be 1 - T, which has no digits left where it is small.
+        both = np.column_stack([self.depths, np.ones_like(self.depths)])
+        return mean_depth(*np.moveaxis(self.splat(both)[0], -1, 0))
 
     def median_depth(self) -> Array:
         """Return (H, W) camera z of the Gaussian at which the transmittance falls to 0.5 or below.

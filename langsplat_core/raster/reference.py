@@ -21,7 +21,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array, rotation_matrices, sigmoid, unit
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.protocol import LiftingView, dilation, farthest, mean_depth, tangent_limits
+from langsplat_core.raster.protocol import LiftingView, dilation, farthest, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.scene.transform import sh_basis
 
@@ -137,7 +137,7 @@ class ReferenceView(LiftingView):
 
     def __init__(self, footprints: Footprints, camera: Camera, settings: RasterSettings) -> None:
         self.camera, self.settings, self.footprints = camera, settings, footprints
-        self.count = len(footprints.depths)
+        self.count, self.depths = len(footprints.depths), footprints.depths
         self.order = np.argsort(footprints.depths, kind="stable")
 
     def steps(self, wider: float = 0.0) -> Iterator[Step]:
@@ -193,10 +193,6 @@ class ReferenceView(LiftingView):
         for step in self.steps():
             values[step.index] = np.tensordot(step.weights, image[step.window], 2)
         return values
-
-    def depth(self) -> Array:
-        total, alpha = self.splat(self.footprints.depths[:, None])
-        return mean_depth(total[..., 0], alpha)
 
     def median_depth(self) -> Array:
         return np.append(self.footprints.depths, 0)[self.median_rows()]

@@ -205,7 +205,7 @@ def test_images_of_cuda_equal_the_reference(settings, channels, orthographic):
     assert reference.splat(values)[1].max() > 0.5
     for got, want in zip(view.splat(values), reference.splat(values), strict=True):
         np.testing.assert_allclose(got[clear], want[clear], atol=2e-5)
-    np.testing.assert_allclose(view.depth()[clear], reference.depth()[clear], rtol=1e-3)
+    np.testing.assert_allclose(view.depth()[clear], reference.depth()[clear], rtol=2e-5)
 
 
 @on_cuda

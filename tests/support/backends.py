@@ -70,11 +70,15 @@ class Backend:
         """
         return {"reference": 1e-12, "cuda": 6e-4}.get(self.name, 1e-5)
 
-    def promises(self, gaussians: Gaussians, settings: RasterSettings) -> bool:
-        """Whether `tolerance` holds. Not for gsplat's needles, whose covariances are formed in 3D in float32,
-        nor for its antialiasing of whatever is far smaller than a pixel, which has no floor."""
-        spread = np.ptp(gaussians.log_scales, axis=1).max(initial=0)
-        return not self.gsplat or bool(spread < np.log(100) and not settings.antialiased)
+    def promises(self, footprints: Footprints) -> bool:
+        """Return whether `tolerance` holds: with gsplat only where float32 keeps enough of all covariances.
+
+        With k = xx yy / det >= 1, the terms of an exponent s add up to 4 k s at most, and the determinant is
+        a difference of k and k - 1 times itself: some 40 roundings of 2^-24 move an alpha by at most
+        40 k s exp(-s) 2^-24, which is 2e-5 for k = 23.
+        """
+        xx, xy, yy = footprints.conics[footprints.opacities > 0].T
+        return not self.gsplat or bool((xx * yy <= 23 * (xx * yy - xy * xy)).all())
 
     def expected_settings(self, settings: RasterSettings) -> RasterSettings:
         """With these the reference forms the image that this backend means to form."""
@@ -128,23 +132,16 @@ def gl_rasterizers(gl_session: Any) -> Iterator[dict[str, Any]]:
             rasterizer.release()
 
 
-@pytest.fixture(params=NAMES)
-def backend(request: pytest.FixtureRequest) -> Backend:
-    """Each rasterizer in turn; one that cannot load here is skipped with its reason."""
-    return _backend(request)
-
-
-@pytest.fixture(params=NAMES[1:])
-def fast_backend(request: pytest.FixtureRequest) -> Backend:
-    """The same without the reference."""
-    return _backend(request)
-
-
 def _backend(request: pytest.FixtureRequest) -> Backend:
+    """Each rasterizer in turn; one that cannot load here is skipped with its reason."""
     try:
         return Backend(request.param, _load(request.param, request), *_PROMISES[request.param])
     except BackendError as error:
         pytest.skip(str(error))
+
+
+backend = pytest.fixture(params=NAMES, name="backend")(_backend)
+fast_backend = pytest.fixture(params=NAMES[1:], name="fast_backend")(_backend)  # without the reference
 
 
 # OpenGL contexts, and figures that accuracy tests measured.

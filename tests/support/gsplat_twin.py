@@ -49,14 +49,16 @@ def _plain(name: str) -> Any:
 
 
 def rasterization(  # noqa: PLR0913  gsplat's signature
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor,
-    Ks: Tensor, width: int, height: int, near_plane: float, far_plane: float, eps2d: float,
-    sh_degree: int | None, packed: bool, rasterize_mode: str, camera_model: str,
+    means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor,
+    viewmats: Tensor, Ks: Tensor, width: int, height: int, eps2d: float, packed: bool, camera_model: str,
+    near_plane: float = 0.01, far_plane: float = 1e10, sh_degree: int | None = None,
+    rasterize_mode: str = "classic", covars: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:  # fmt: skip
     """Return (1, H, W, C) images, (1, H, W, 1) alphas, and of the Gaussians means2d (1, N, 2) and radii."""
     assert (viewmats.shape, Ks.shape, packed) == ((1, 4, 4), (1, 3, 3), False)
-    covariances, _ = _plain("quat_scale_to_covar_preci")(quats, scales, compute_preci=False)
-    points, turned = _plain("world_to_cam")(means, covariances, viewmats)
+    if covars is None:
+        covars, _ = _plain("quat_scale_to_covar_preci")(quats, scales, compute_preci=False)
+    points, turned = _plain("world_to_cam")(means, covars, viewmats)
     project = _plain("persp_proj" if camera_model == "pinhole" else "ortho_proj")
     means2d, sharp = project(points, turned, Ks, width, height)
     blurred = sharp[0] + eps2d * torch.eye(2)

@@ -12,12 +12,13 @@ and det are the 2D covariance's). A long thin footprint's conic is a difference 
 is not, so float32 pixels suffice.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.compiled import helper, kernel, plain, shared_workers
+from langsplat_core.compiled import Workers, helper, kernel, plain, shared_workers
 from langsplat_core.config import RasterSettings
 from langsplat_core.raster.cpu.lanes import (
     Lanes,
@@ -260,6 +261,23 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
                 out.depths[i] = found[j, COLUMNS]
                 for n in range(COLUMNS):
                     out.geometry[i, n] = found[j, n]
+
+
+def project_all(
+    rows: Rows, camera: KernelCamera, workers: Workers, empty: Callable[..., Array] = np.empty
+) -> Projection:
+    """Return `project` of all rows; empty: gives the memory of their geometry."""
+    n = len(rows.valid)
+    found = Projection(empty((n, COLUMNS), np.float64), np.empty(n), np.empty(n, bool))
+    workers.run(project, n, rows, camera, found)
+    return found
+
+
+def covariances(geometry: Array) -> Array:
+    """Return the (M, 2, 2) covariances of (M, 8) footprints, px^2: the module's factors solved for them."""
+    xx, k, yy = (geometry[:, column] for column in (FACTOR_A, FACTOR_K, FACTOR_C))
+    xx, yy = HALF_LOG2_E / xx**2, HALF_LOG2_E / yy**2
+    return np.stack([xx + k * k * yy, k * yy, k * yy, yy], -1).reshape(-1, 2, 2)
 
 
 # View-dependent colours on the CPU: the compiled twin of `reference.colours`, and its adjoint.

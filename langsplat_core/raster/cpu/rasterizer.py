@@ -24,7 +24,7 @@ from langsplat_core.raster.cpu import tiles as tiling
 from langsplat_core.raster.cpu.backward import GaussianGradients
 from langsplat_core.raster.cpu.lanes import Lanes
 from langsplat_core.raster.cpu.tiles import PIXELS, TILE, Tiles
-from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, LiftingView, mean_depth
+from langsplat_core.raster.protocol import CHANNELS_AT_ONCE, LiftingView
 from langsplat_core.scene import Camera, Gaussians
 
 
@@ -273,19 +273,14 @@ class CpuView(LiftingView):
     def __init__(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, workers: Workers, memory: Memory
     ) -> None:
-        n = self.count = len(gaussians)
+        self.count = len(gaussians)
         self.camera, self.workers, self._empty = camera, workers, memory.empty
         self._kernel_camera = projection.kernel_camera(camera, settings)
         self._rows = projection.rows_of(gaussians)
-        found = projection.Projection(
-            self._empty((n, projection.COLUMNS), np.float64), np.empty(n), np.empty(n, bool)
-        )
-        workers.run(projection.project, n, self._rows, self._kernel_camera, found)
+        found = projection.project_all(self._rows, self._kernel_camera, workers, self._empty)
         drawn = np.flatnonzero(found.drawn).astype(np.int32)
-        self.order, self._depths = (
-            tiling.depth_order(found.depths, drawn, workers),
-            found.depths,
-        )  # (M,), (N,)
+        self.order = tiling.depth_order(found.depths, drawn, workers)  # (M,)
+        self.depths = found.depths
         size = camera.width, camera.height
         self.tiles = tiling.bin_tiles(found.geometry, self.order, size, settings, workers, self._empty)
 
@@ -317,7 +312,7 @@ class CpuView(LiftingView):
 
     @property
     def nbytes(self) -> int:
-        arrays = (self.order, self._depths, *self.tiles)
+        arrays = (self.order, self.depths, *self.tiles)
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
     def gather(self, image: Array) -> Array:
@@ -368,7 +363,7 @@ class CpuView(LiftingView):
         self.workers.run(kernel, len(self.tiles.starts) - 1, self.tiles, *arguments)
 
     def median_depth(self) -> Array:
-        return self._at_half(self._depths[self.order])
+        return self._at_half(self.depths[self.order])
 
     def median_rows(self) -> Array:
         """Return (H, W) int64 Gaussian at which the transmittance falls to 0.5 or below, -1 where never.
@@ -383,13 +378,6 @@ class CpuView(LiftingView):
         found = np.empty((self.camera.height, self.camera.width, 1), np.float32)
         self._over_tiles(median_tiles, values, found)
         return found[..., 0]
-
-    def depth(self) -> Array:
-        # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
-        both = plain(np.stack([self._depths, np.ones_like(self._depths)], -1)[self.order])
-        image = np.empty((self.camera.height, self.camera.width, 2), np.float32)
-        self._over_tiles(splat_tiles, both, image, np.empty_like(image[..., :1]))
-        return mean_depth(image[..., 0], image[..., 1])
 
 
 class CpuRasterizer:

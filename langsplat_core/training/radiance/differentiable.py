@@ -17,7 +17,7 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import BackendError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster import gsplat
+from langsplat_core.raster import gsplat, load_rasterizer
 from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
 from langsplat_core.raster.gsplat import DifferentiableImage
@@ -116,10 +116,7 @@ class CudaRenderer:
     def __init__(self, settings: RasterSettings = INRIA) -> None:
         self.device = torch.device(gsplat.DEVICE)
         self._settings = settings
-        try:
-            gsplat.require_device()
-        except BackendError as error:
-            raise BackendError(f"backend cuda: {error}; use --backend cpu") from error
+        load_rasterizer("cuda")  # BackendError where gsplat does not work
 
     def render(
         self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int, focal: float | None = None
