@@ -75,7 +75,8 @@ def train_scene(  # noqa: PLR0913  what the command has as options
     check_settings(config)
     language_field.check_lift(config)
     if out.suffix.lower() != ".ply":
-        raise InputError(f"{out}: the scene must be named *.ply, for example --out {out.with_suffix('.ply')}")
+        example = out.with_suffix(".ply") if out.name else out / "scene.ply"  # "." has no name
+        raise InputError(f"{out}: the scene must be named *.ply, for example --out {example}")
     work = work or reports.work_folder(out)
     check_writable(out)
     check_output_folder(work)
