@@ -193,8 +193,9 @@ def test_a_run_interrupted_in_every_stage_ends_with_the_same_bytes(room, whole, 
 
 
 def test_unusable_arguments_are_refused_before_work(room, tmp_path):
-    with pytest.raises(InputError, match=r"\*\.ply"):
-        train_scene(room, tmp_path / "scene.splat", tiny_settings(room))
+    for out in (tmp_path / "scene.splat", Path()):
+        with pytest.raises(InputError, match=r"\*\.ply"):
+            train_scene(room, out, tiny_settings(room))
     absent = replace(tiny_settings(room), clip=ClipConfig(model=str(tmp_path / "nothing")))
     with pytest.raises(EncoderError, match=r"--clip\.model"):
         train_scene(room, tmp_path / "scene.ply", absent)
