@@ -2,12 +2,11 @@
 
 gsplat (1.5 or newer) is an optional dependency and compiles its kernels at first use. What differs from the
 reference, all of it gsplat's own: alpha is capped at 0.999 in 1.5, at 0.99 from 1.6 on; `gather` sums with
-atomics, so its last digits vary between runs; numbers are float32. The footprints of a view come from the
-CPU's kernels, in float64 and sorted, and are shown to gsplat as flat Gaussians in pixels. It rounds a mean to
-6e-8 of the image's size, and a covariance, whose inverse loses 6e-8 times the ratio of its variances and
-overflows beyond 4e9 pixels. In training (`draw`) gsplat projects, too: Gaussians of equal float32 depths are
-drawn in the order of rows, covariances are formed in 3D, antialiasing lacks INRIA's floor of 0.005, and
-images smaller than the photographs lack their pixels' means (`protocol.dilation`).
+atomics, so its last digits vary between runs; numbers are float32. A view's footprints, sorted and in
+float64 by the CPU's kernels, are shown to gsplat as flat Gaussians in pixels: it rounds a mean to 6e-8 of the
+image's size, and a covariance, whose inverse loses 6e-8 times the ratio of its variances and overflows beyond
+4e9 pixels. In training (`draw`) gsplat projects: equal float32 depths stay in the order of rows, covariances
+are formed in 3D, antialiasing lacks INRIA's floor of 0.005, smaller images their pixels' means (`dilation`).
 """
 
 import subprocess
@@ -147,8 +146,8 @@ class GsplatView(LiftingView):
     def splat(self, values: Array) -> tuple[Array, Array]:
         channels = check_array("values", values, (self.count, "C"))["C"]
         if len(self._rows) == 0:
-            shape = (self.camera.height, self.camera.width)
-            return np.zeros((*shape, channels), np.float32), np.zeros(shape, np.float32)
+            nothing = np.zeros((self.camera.height, self.camera.width, channels + 1), np.float32)
+            return nothing[..., 1:], nothing[..., 0]
         drawn = values[self._rows] if channels else np.zeros((len(self._rows), 1))  # gsplat needs one
         with torch.no_grad():
             image, alpha = self._draw(to_device(drawn))

@@ -273,8 +273,7 @@ class CpuView(LiftingView):
     def __init__(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, workers: Workers, memory: Memory
     ) -> None:
-        self.count = len(gaussians)
-        self.camera, self.workers, self._empty = camera, workers, memory.empty
+        self.camera, self.count, self.workers, self._empty = camera, len(gaussians), workers, memory.empty
         self._kernel_camera = projection.kernel_camera(camera, settings)
         self._rows = projection.rows_of(gaussians)
         found = projection.project_all(self._rows, self._kernel_camera, workers, self._empty)
@@ -344,8 +343,7 @@ class CpuView(LiftingView):
         n, height, width = self.count, self.camera.height, self.camera.width
         channels = check_array("values", values, (n, "C"))["C"]
         check_array("image_grad", image_grad, (height, width, channels))
-        if alpha_grad is None:
-            alpha_grad = np.zeros((height, width), np.float32)
+        alpha_grad = np.zeros((height, width), np.float32) if alpha_grad is None else alpha_grad
         check_array("alpha_grad", alpha_grad, (height, width))
         grads = (plain(image_grad), plain(alpha_grad)[..., None])
         met, columns = len(self.tiles.met), backward.MOMENTS + tiling.padded(channels)

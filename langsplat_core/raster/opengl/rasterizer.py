@@ -395,8 +395,7 @@ class GlView(View):
         return flat.reshape(self.camera.height, self.camera.width, texture.components).astype(np.float32)
 
     def depth(self) -> Array:
-        total, alpha = np.moveaxis(self._read(self.rasterizer.draw(self, [], with_depth=True)[0]), -1, 0)
-        return mean_depth(total, alpha)
+        return mean_depth(*np.moveaxis(self._read(self.rasterizer.draw(self, [], with_depth=True)[0]), -1, 0))
 
     def depth_at(self, column: int, row: int) -> tuple[float, float]:
         """Return what `View.depth_at` does, from the projection read back."""

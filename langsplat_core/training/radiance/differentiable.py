@@ -20,7 +20,6 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import gsplat, load_rasterizer
 from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
-from langsplat_core.raster.gsplat import DifferentiableImage
 from langsplat_core.scene import Camera, Gaussians, near_plane
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.losses import fit_exposure, patch_means, radiance_loss, with_exposure
@@ -41,7 +40,7 @@ class DifferentiableRenderer(Protocol):
 
     def render(
         self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int, focal: float | None = None
-    ) -> DifferentiableImage:
+    ) -> gsplat.DifferentiableImage:
         """Draw the raw `parameters` with harmonics up to `sh_degree`; focal: as of `RasterSettings`."""
 
 
@@ -77,11 +76,7 @@ class _CpuImage(torch.autograd.Function):
         gaussians, eye, view, values = ctx.kept
         image_grad, alpha_grad, _ = grads
         assert image_grad is not None  # the image always enters the loss
-        by = view.backward(
-            values,
-            np.ascontiguousarray(image_grad.numpy()),
-            None if alpha_grad is None else np.ascontiguousarray(alpha_grad.numpy()),
-        )
+        by = view.backward(values, image_grad.numpy(), None if alpha_grad is None else alpha_grad.numpy())
         sh_grad, means_grad = colours_backward(gaussians.sh, gaussians.means, eye, by.values)
         by_means = by.means + means_grad
         arrays = (by_means, by.log_scales, by.quats_wxyz, by.opacity_logits, sh_grad, by.means_px)
@@ -97,7 +92,7 @@ class CpuRenderer:
 
     def render(
         self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int, focal: float | None = None
-    ) -> DifferentiableImage:
+    ) -> gsplat.DifferentiableImage:
         means, settings = parameters["means"], replace(self._settings, focal=focal)
         probe = torch.zeros(len(means), 2, requires_grad=means.requires_grad)
         image, alpha, visible = _CpuImage.apply(
@@ -107,20 +102,19 @@ class CpuRenderer:
             _coefficients(parameters, sh_degree),
             probe,
         )
-        return DifferentiableImage(image, alpha, visible, probe)
+        return gsplat.DifferentiableImage(image, alpha, visible, probe)
 
 
 class CudaRenderer:
     """`DifferentiableRenderer` on gsplat; `raster.gsplat` says how it differs from the CPU kernels."""
 
     def __init__(self, settings: RasterSettings = INRIA) -> None:
-        self.device = torch.device(gsplat.DEVICE)
-        self._settings = settings
+        self.device, self._settings = torch.device(gsplat.DEVICE), settings
         load_rasterizer("cuda")  # BackendError where gsplat does not work
 
     def render(
         self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int, focal: float | None = None
-    ) -> DifferentiableImage:
+    ) -> gsplat.DifferentiableImage:
         values = _coefficients(parameters, sh_degree)
         return gsplat.draw(parameters, values, camera, replace(self._settings, focal=focal), sh_degree)
 
@@ -146,13 +140,11 @@ def renderer_for(backend: Backend, settings: RasterSettings = INRIA) -> Differen
 
     Raises BackendError when `cuda` is asked for and cannot work.
     """
-    if backend == "cpu" or (backend == "auto" and not torch.cuda.is_available()):
-        return CpuRenderer(settings)
+    if backend != "auto":
+        return CudaRenderer(settings) if backend == "cuda" else CpuRenderer(settings)
     try:
         return CudaRenderer(settings)
     except BackendError:
-        if backend == "cuda":
-            raise
         return CpuRenderer(settings)
 
 
