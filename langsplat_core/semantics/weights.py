@@ -63,10 +63,9 @@ def open_weights(model: str, path: Path, device: str) -> Weights:
         converted = layout(model, file)
         if converted is not None:
             return Weights(model, file.parent, device, converted)
-    known = "; ".join(layouts) or "none"
     raise EncoderError(
-        f"{model}: its weights are of no layout known here ({known}); for another model pass a folder or hub "
-        "id in Hugging Face layout"
+        f"{model}: its weights are of no layout known here ({'; '.join(layouts) or 'none'}); for another model "
+        "pass a folder or hub id in Hugging Face layout"
     )
 
 
@@ -132,6 +131,7 @@ def _from_hub(model: str, option: str) -> Path:
     raise EncoderError(
         f"{shown(model)}: neither a folder nor in the local cache, and the hub {supply} ({reason}); "
         f"run `hf download {shown(model)}` where there is a network, or pass `{option} {give}`"
+        + (", or `--clip.model demo` to try without weights" if option == "--clip.model" else "")
     )
 
 
