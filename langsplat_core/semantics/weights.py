@@ -64,8 +64,8 @@ def open_weights(model: str, path: Path, device: str) -> Weights:
         if converted is not None:
             return Weights(model, file.parent, device, converted)
     raise EncoderError(
-        f"{model}: its weights are of no layout known here ({'; '.join(layouts) or 'none'}); for another model "
-        "pass a folder or hub id in Hugging Face layout"
+        f"{model}: its weights are of no layout known here ({'; '.join(layouts) or 'none'}); for another "
+        "model pass a folder or hub id in Hugging Face layout"
     )
 
 
