@@ -21,7 +21,7 @@ from langsplat_core.scene.language import LanguageField
 class Intrinsics:
     """Focal lengths and principal point. Sizes may be fractions where no image is meant."""
 
-    width: float  # pixels, > 0
+    width: float  # pixels, > 0, finite
     height: float
     fx: float  # pixels, > 0
     fy: float
@@ -29,7 +29,7 @@ class Intrinsics:
     cy: float  # pixels from the top edge
 
     def __post_init__(self) -> None:
-        if not (self.width > 0 and self.height > 0):
+        if not (0 < self.width < math.inf and 0 < self.height < math.inf):
             raise ValueError(f"a picture of {self.width}x{self.height} pixels")
         if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and min(self.fx, self.fy) > 0):
             raise ValueError("focal lengths must be positive and the principal point finite")

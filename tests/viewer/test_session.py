@@ -511,6 +511,8 @@ def test_project_with_impossible_values_is_refused(saved):
         {"keyframes": session["keyframes"] * 2},
     ]
     broken = [{**top, "session": {**session, **change}} for change in changes]
+    endless = {"width": 160, "height": float("inf"), "fx": 128, "fy": 128, "cx": 80, "cy": 60}
+    broken.append({**top, "intrinsics": endless})
     for content in ({"format": "other"}, {**top, "version": 3}, [], {**top, "gaussians": 10**12}, *broken):
         saved.write_text(json.dumps(content))
         with pytest.raises(LangSplatError) as raised:
