@@ -585,8 +585,8 @@ def test_transformed_scene_is_saved_as_seen(opened, tmp_path):
 def test_cropping_keeps_earlier_deletions(opened):
     chosen = selected_mug(opened)
     editing.delete_selected(opened)
-    editing.select_all(opened)
-    for _ in range(2):  # first the box is shown
+    for form in (EditForm(), EditForm(low=(-99.0,) * 3, high=(99.0,) * 3)):  # first the box is shown
+        opened.state.edit_form = form
         editing.crop(opened)
         np.testing.assert_array_equal(opened.state.marks.deleted, chosen)
 
