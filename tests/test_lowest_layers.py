@@ -513,6 +513,7 @@ def test_options_beside_a_file_win(tmp_path: Path) -> None:
         ("[radiance]\nsteps = 0", "--radiance.steps 0: must be 1 to"),
         ("phrases = ['--out', 'x']", "phrases"),
         ("config = 'other.toml'", "config"),
+        ("44 = 'quick'", "44"),
         ("steps = ", "Invalid value"),
         ("\x01", "cannot be used as --config"),
         (None, "no such file"),

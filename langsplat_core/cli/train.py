@@ -158,8 +158,8 @@ def _words(table: Mapping[str, Any], before: str = "") -> Iterator[str]:
     """Yield a TOML table as words of a command line; ValueError for what cannot be told from an option."""
     for key, value in table.items():
         values = list(map(str, value)) if isinstance(value, list) else []
-        if f"{before}{key}" == "config" or any(text.startswith("-") for text in values):
-            raise ValueError(f"{key}: names another file, or begins with a dash")
+        if f"{before}{key}" == "config" or key[:1].isdigit() or any(text[:1] == "-" for text in values):
+            raise ValueError(f"{key}: names another file, is a number, or begins with a dash")
         if isinstance(value, dict):
             yield from _words(value, f"{before}{key}.")
         elif isinstance(value, bool):

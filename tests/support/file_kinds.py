@@ -883,7 +883,7 @@ def few_and_many(kinds: dict[str, FileKind]) -> tuple[Callable[..., None], Calla
         for used in SEEDS if seed is None else (seed,):
             folder = tmp_path / str(used)
             folder.mkdir()
-            outcome = fuzz(kinds[name], folder, int(kinds[name].share * MUTANTS), used)
+            outcome = fuzz(kinds[name], folder, 20 + int(kinds[name].share * MUTANTS), used)
             print(f"| {name}, seed {used} | {outcome.tried} | {outcome.loaded} | {outcome.warned} |")
 
     return few, many
