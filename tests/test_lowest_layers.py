@@ -501,8 +501,7 @@ def test_options_beside_a_file_win(tmp_path: Path) -> None:
     assert (other.preset, other.config.radiance.steps, other.config.phrases) == ("good", 8, ("c",))
     flags = "[dataset]\nallow_few_cameras = true"
     assert trained(file=file, text=flags).config.dataset.allow_few_cameras
-    other = trained("--dataset.no-allow-few-cameras", file=file, text=flags)
-    assert not other.config.dataset.allow_few_cameras
+    assert not trained("--dataset.no-allow-few-cameras", file=file, text=flags).config.dataset.allow_few_cameras
 
 
 @pytest.mark.parametrize(
