@@ -196,5 +196,5 @@ class Workers:
 
 @cache
 def shared_workers(threads: int | None = None) -> Workers:
-    """One pool per number of threads for the whole process, however many rasterizers there are."""
+    """Return the process's only pool of so many threads, however many rasterizers there are."""
     return Workers(threads)

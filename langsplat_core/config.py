@@ -251,7 +251,7 @@ CodecKind = Literal["codebook", "autoencoder", "linear"]
 
 @dataclass(frozen=True)
 class CodecConfig:
-    """How a Gaussian keeps a CLIP vector; each kind has settings of its own."""
+    """Settings of the codec, by which a Gaussian keeps a CLIP vector; each kind has some of its own."""
 
     # the number of a codeword, latents of the paper's autoencoder (section 3.2), or coordinates in a linear
     # basis of the scene's vectors

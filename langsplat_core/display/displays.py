@@ -286,7 +286,7 @@ def full_ranges(ranges: Ranges) -> Array:
 
 @dataclass(frozen=True)
 class DisplayRow:
-    """One display."""
+    """A way of showing a scene, with what it needs to be drawn."""
 
     name: Display
     label: str  # on its button

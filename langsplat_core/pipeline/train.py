@@ -319,7 +319,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training of a capture came to."""
+    """A row of the table of captures: how the training of one ended."""
 
     name: str
     code: int  # as an exit code: 0; 2: refused; 130: interrupted; 1: whatever else happened

@@ -145,7 +145,7 @@ def tangent_limits(camera: Camera, settings: RasterSettings) -> tuple[float, flo
 
 
 class Dilation(NamedTuple):
-    """How a footprint becomes one of pixels, px^2."""
+    """Widening of a footprint to one of pixels, px^2."""
 
     added: float  # to both variances
     # The part of it that opacities were fitted with: they fade by sqrt(det with this / det with all of it)

@@ -52,7 +52,7 @@ def view_of(
 
 @cache
 def _cpu() -> protocol.LiftingRasterizer:
-    """One for the process, since views of one rasterizer use its memory again."""
+    """Return the process's CPU rasterizer: one, since views of it use its memory again."""
     return load_lifting_rasterizer("cpu")
 
 

@@ -266,7 +266,7 @@ def test_drawn_images_lie_by_their_names_on_the_set(space, tmp_path, rule):
     texts = encoder.encode_texts([THINGS[row] for row in named])
     cosines = np.median(vectors[:, named] @ texts.T, axis=0)  # one mask in seven shows another region
     centred = cosines - cosines.mean(axis=0) - cosines.mean(axis=1, keepdims=True)
-    assert np.diag(centred).mean() > centred.mean() + 3 * centred.std() / np.sqrt(len(named))  # 3 errors
+    assert np.diag(centred).mean() > centred.mean() + 3 * centred.std() / np.sqrt(len(named))  # 3 std. errors
     codec = autoencoder_from(load_torch(space), space)
     points = unit(np.random.default_rng(0).normal(size=(500, 3))).astype(np.float32)
     axes = np.linalg.svd(codec.decode(points).astype(float), full_matrices=False)[2][:24]

@@ -87,7 +87,7 @@ def scene_files(place: Path) -> dict[str, Path]:
 
 
 class Door:
-    """What an agent may ask of some scenes.
+    """The tools by which an agent asks some scenes.
 
     Answers are ready for JSON, lengths in metres where the scene says how long its unit is. One question at a
     time; scenes and encoders are kept once they are loaded.

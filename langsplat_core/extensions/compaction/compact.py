@@ -232,7 +232,7 @@ class Weight:
 
 @dataclass(frozen=True)
 class Loss:
-    """What a smaller scene costs, over the measuring views, dB; negative for a gain."""
+    """Losses of a smaller scene over the measuring views, dB; negative for a gain."""
 
     budget: float
     loss: float  # mean
@@ -250,7 +250,7 @@ class Loss:
 
     @property
     def lines(self) -> list[str]:
-        """What people read of it."""
+        """The losses in lines for people."""
         how = (
             "measured on photographs"
             if self.assumed_psnr is None

@@ -336,7 +336,7 @@ def _basis_gradient(x: float, y: float, z: float, h: Array) -> tuple[float, floa
 
 @helper
 def _channel(sh: Array, b: Array, channel: int) -> float:
-    """One colour channel before the clamp."""
+    """Return one colour channel before the clamp."""
     value = 0.5
     for k in range(b.shape[0]):
         value += b[k] * sh[k, channel]

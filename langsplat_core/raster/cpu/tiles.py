@@ -73,7 +73,7 @@ class Tiles(NamedTuple):
 
 @helper
 def _pack(rank: int, tile: int, low: int, high: int) -> int:
-    """One intersection, rows [low, high) of a tile, as one number; within a tile they rise as ranks do."""
+    """Return an intersection, rows [low, high) of a tile, as one number; in a tile they rise as ranks do."""
     return (rank << _PLACE | tile) << _SPAN | high << 5 | low
 
 

@@ -262,7 +262,7 @@ class _Run:
         return after
 
     def step(self, state: TrainingState) -> float:
-        """One photograph, one update; the loss before it."""
+        """Update the Gaussians by one photograph; return the loss before."""
         config, schedule, step = self.config, self.schedule, state.step + 1
         if not state.queue:
             state.queue = [int(index) for index in state.rng.permutation(len(self.views))]
