@@ -11,7 +11,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageCms
+from PIL import ExifTags, Image, ImageCms
 
 from langsplat_core.arrays import Array, linear_light
 from langsplat_core.errors import Tell
@@ -47,7 +47,9 @@ def as_srgb(image: Image.Image, coded: tuple[float, Any] | None, tell: Tell) -> 
         except (ImageCms.PyCMSError, OSError, ValueError):
             tell("its colour profile cannot be used, and sRGB is taken")
     rgb = image.convert("RGB")
-    if coded is None and not profile and exif.get_ifd(0xA005).get(1) == "R03":  # as cameras mark Adobe RGB
+    parts = exif.get_ifd(ExifTags.IFD.Exif)  # Pillow before 13 raises KeyError for one that is not there
+    interop = exif.get_ifd(ExifTags.IFD.Interop) if ExifTags.IFD.Interop in parts else {}
+    if coded is None and not profile and interop.get(1) == "R03":  # as cameras mark Adobe RGB
         coded = -563 / 256, ADOBE
     return rgb if coded is None else Image.fromarray(to_srgb(np.asarray(rgb), *coded, tell))
 

@@ -13,7 +13,7 @@ from typing import Any
 from unicodedata import normalize
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
@@ -162,7 +162,6 @@ def unique_names(labels: Sequence[str]) -> list[str]:
 
 # EXIF data: the focal length, as COLMAP learns of it, and when, where (GPS) and by what it was taken.
 
-EXIF_IFD, GPS_IFD = 0x8769, 0x8825
 _MAKER, _MODEL, _CHANGED, _TAKEN = 0x010F, 0x0110, 0x0132, 0x9003
 _FOCAL, _FOCAL_ON_FILM = 0x920A, 0xA405  # mm; mm of a lens with the same view on film of 36 x 24 mm
 _PLANE_X, _PLANE_UNIT, _WIDTH = 0xA20E, 0xA210, 0xA002  # pixels per unit on the sensor; the unit; pixels
@@ -181,11 +180,10 @@ def optics(path: Path) -> Image.Exif:
         with hostile.opened(path) as image:
             source = image.getexif()
             kept.update({tag: source[tag] for tag in (_MAKER, _MODEL) if tag in source})
-            inner = source.get_ifd(EXIF_IFD)
-            lens = {tag: inner[tag] for tag in (_FOCAL, _FOCAL_ON_FILM) if tag in inner}
-            if not lens.get(_FOCAL_ON_FILM):
-                lens |= _on_film(inner, image.size)
-            kept.get_ifd(EXIF_IFD).update(lens)
+            inner = source.get_ifd(ExifTags.IFD.Exif)
+            lens = {tag: inner[tag] for tag in (_FOCAL, _FOCAL_ON_FILM) if inner.get(tag)}
+            lens = _on_film(inner, image.size) | lens
+            kept.get_ifd(ExifTags.IFD.Exif).update(lens)
             kept.tobytes()
     except hostile.PictureError:
         return Image.Exif()
@@ -218,7 +216,7 @@ def exif_facts(path: Path) -> ExifFacts:
     with suppress(hostile.PictureError), hostile.opened(path) as image:
         if image.format != "PNG" or "exif" in image.info:  # behind a PNG's pixels it is read by decoding them
             exif = image.getexif()
-            inner, places = exif.get_ifd(EXIF_IFD), exif.get_ifd(GPS_IFD)
+            inner, places = exif.get_ifd(ExifTags.IFD.Exif), exif.get_ifd(ExifTags.IFD.GPSInfo)
     taken, place = None, (math.nan, math.nan)
     with suppress(TypeError, ValueError):  # absent, or not what the standard says
         taken = datetime.strptime(str(inner.get(_TAKEN) or exif.get(_CHANGED)), "%Y:%m:%d %H:%M:%S")

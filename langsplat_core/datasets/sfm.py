@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy
-from PIL import Image
+from PIL import ExifTags, Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
@@ -158,7 +158,7 @@ def _small_copies(
                     image.save(temporary, quality=95, exif=photos.optics(path))
             with opened(folder / name) as copy:
                 exif, size = copy.getexif(), copy.size
-                lens = str(dict(exif) | dict(exif.get_ifd(photos.EXIF_IFD)))
+                lens = str(dict(exif) | dict(exif.get_ifd(ExifTags.IFD.Exif)))
             if any_masks:
                 mask = photos.mask_beside(path)
                 given = Image.new("RGB", size, "white") if mask is None else photos.read_photo(mask, False)
