@@ -117,24 +117,30 @@ class GsplatView(LiftingView):
         self.camera, self.count, workers = camera, len(gaussians), shared_workers()
         kernel_camera = projection.kernel_camera(camera, settings)
         found = projection.project_all(projection.rows_of(gaussians), kernel_camera, workers)
-        self._rows = depth_order(found.depths, np.flatnonzero(found.drawn).astype(np.int32), workers)
-        self.depths, geometry = found.depths, found.geometry[self._rows]
-        covariances = np.zeros((len(self._rows), 3, 3))
-        covariances[:, :2, :2] = projection.covariances(geometry)
+        rows = depth_order(found.depths, np.flatnonzero(found.drawn).astype(np.int32), workers)
+        self.depths, self._rows = found.depths, torch.from_numpy(rows).to(DEVICE).long()
+        # The device picks rows, of values too, many times as fast as the processor.
+        geometry = torch.from_numpy(found.geometry).to(DEVICE)[self._rows]
+        x, y, a, k, c, log2_opacity = geometry[:, : projection.HALF_WIDTH].unbind(1)
+        xx, yy = projection.HALF_LOG2_E / a**2, projection.HALF_LOG2_E / c**2  # the factors solved for them
         # gsplat sorts by a float32 depth: the place in our order, in place of a depth, keeps the order.
-        means = np.column_stack([geometry[:, :2], np.arange(1, len(self._rows) + 1)])
-        opacities = np.exp2(geometry[:, projection.LOG2_OPACITY])
-        of_one = {"viewmats": np.eye(4)[None], "Ks": np.eye(3)[None]}
-        arrays = {"means": means, "covars": covariances, "opacities": opacities, **of_one}
-        tensors = {name: to_device(array) for name, array in arrays.items()}
-        self._flat = {**tensors, "quats": None, "scales": None}
+        place, xy, none = torch.arange(1, len(rows) + 1, device=DEVICE), k * yy, torch.zeros_like(k)
+        self._means, self._opacities = torch.stack([x, y, place], 1).float(), log2_opacity.exp2().float()
+        covariances = torch.stack([xx + k * xy, xy, none, xy, yy, none, none, none, none], 1)
+        self._covariances = covariances.reshape(-1, 3, 3).float()
 
     def _draw(self, values: Tensor) -> tuple[Tensor, Tensor]:
         from gsplat import rasterization
 
         images, alphas, _ = rasterization(
-            **self._flat,
+            means=self._means,
+            quats=None,
+            scales=None,
+            covars=self._covariances,
+            opacities=self._opacities,
             colors=values,
+            viewmats=torch.eye(4, device=DEVICE)[None],
+            Ks=torch.eye(3, device=DEVICE)[None],
             width=self.camera.width,
             height=self.camera.height,
             eps2d=0.0,  # footprints are dilated
@@ -148,20 +154,20 @@ class GsplatView(LiftingView):
         if len(self._rows) == 0:
             nothing = np.zeros((self.camera.height, self.camera.width, channels + 1), np.float32)
             return nothing[..., 1:], nothing[..., 0]
-        drawn = values[self._rows] if channels else np.zeros((len(self._rows), 1))  # gsplat needs one
+        drawn = values if channels else np.zeros((self.count, 1))  # gsplat needs one
         with torch.no_grad():
-            image, alpha = self._draw(to_device(drawn))
+            image, alpha = self._draw(to_device(drawn)[self._rows])
         return image[..., :channels].cpu().numpy(), alpha.cpu().numpy()
 
     def gather(self, image: Array) -> Array:
         """Return W^T image as the derivative of <splat(values), image> by values; (N, C) float32."""
         channels = check_array("image", image, (self.camera.height, self.camera.width, "C"))["C"]
-        gathered = np.zeros((self.count, channels), np.float32)
+        gathered = torch.zeros(self.count, channels, device=DEVICE)
         if len(self._rows) > 0:
             values = torch.zeros(len(self._rows), channels, device=DEVICE, requires_grad=True)
             (grad,) = torch.autograd.grad(self._draw(values)[0], values, to_device(image))
-            gathered[self._rows] = grad.cpu().numpy()
-        return gathered
+            gathered[self._rows] = grad
+        return gathered.cpu().numpy()
 
 
 class GsplatRasterizer:

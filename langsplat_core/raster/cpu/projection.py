@@ -273,13 +273,6 @@ def project_all(
     return found
 
 
-def covariances(geometry: Array) -> Array:
-    """Return the (M, 2, 2) covariances of (M, 8) footprints, px^2: the module's factors solved for them."""
-    xx, k, yy = (geometry[:, column] for column in (FACTOR_A, FACTOR_K, FACTOR_C))
-    xx, yy = HALF_LOG2_E / xx**2, HALF_LOG2_E / yy**2
-    return np.stack([xx + k * k * yy, k * yy, k * yy, yy], -1).reshape(-1, 2, 2)
-
-
 # View-dependent colours on the CPU: the compiled twin of `reference.colours`, and its adjoint.
 
 _C20, _C21, _C22 = C2

@@ -122,10 +122,11 @@ class CudaRenderer:
 def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor], camera: Camera) -> Array:
     """Return the (GRID, GRID) mean depths of what a camera sees of the `values`, NaN where little is."""
     small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
-    z = camera.project(values["means"].detach().cpu().numpy())[1].clip(0).astype(np.float32)
-    length = near_power(max(float(np.median(z)), 1e-30))  # of a unit in which colours keep depths' digits
-    shade = np.repeat((z[:, None, None] / np.float32(length) - 0.5) / C0, 3, axis=2)
-    grey = torch.from_numpy(shade.astype(np.float32)).to(values["means"].device)
+    means = values["means"].detach().double()
+    *forward, offset = camera.world_to_camera[2].tolist()
+    z = (means @ means.new_tensor(forward) + offset).clamp(min=0).float()
+    length = near_power(max(float(z.median()), 1e-30))  # of a unit in which colours keep depths' digits
+    grey = ((z / length - 0.5) / C0)[:, None, None].repeat(1, 1, 3)
     with torch.no_grad():
         rendered = renderer.render({**values, "sh_dc": grey}, small, 0)
     depth, alpha = patch_means(rendered.image)[..., 0], patch_means(rendered.alpha[..., None])[..., 0]

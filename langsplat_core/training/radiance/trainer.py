@@ -5,7 +5,6 @@ opacity resets follow the `Schedule`. On the CPU a run is deterministic given it
 checkpoint exactly where it stopped.
 """
 
-import logging
 import math
 import signal
 from collections.abc import Sequence
@@ -28,8 +27,6 @@ from langsplat_core.training.radiance import differentiable, losses
 from langsplat_core.training.radiance import state as training
 from langsplat_core.training.radiance.state import TrainingState
 from langsplat_core.training.radiance.stereo import DepthMap, find_depths, in_free_space
-
-log = logging.getLogger("langsplat")
 
 STAGE = "training Gaussians"
 JUDGED = 3  # held-out views that are drawn while a training runs
@@ -323,7 +320,6 @@ class _Run:
             # One pixel in seven tells the exposure.
             pairs.append((image[counted].reshape(-1, 3)[::7], target[counted].reshape(-1, 3)[::7]))
         exposures, gain = losses.fit_exposures(pairs)
-        log.debug("exposures of the photographs explain %.2f dB", gain)
         return exposures if gain >= 0.35 or self.config.exposure == "on" else exposures[:0]
 
     def observe_transients(
@@ -336,8 +332,11 @@ class _Run:
         judged = state.step == self.schedule.transients_from and self.config.transients == "auto"
         if judged and state.transients.explained() < 0.24:
             state.transients = losses.no_transients(0)
+        every = max(self.config.steps // (64 * len(self.views)), 1)  # passes: long runs look less often
         # Of older observations a sixteenth would be left: each new one counts as much as all before.
-        if len(state.transients.moving) and state.step >= self.schedule.transients_from - 4 * len(self.views):
+        since = self.schedule.transients_from - 4 * every * len(self.views)
+        looks = state.step >= since and state.step // len(self.views) % every == 0
+        if len(state.transients.moving) and looks:
             rendered = losses.patch_means(image)
             if mask is not None:
                 rendered[losses.patch_means(mask[..., None].float())[..., 0] < 0.5] = np.nan
