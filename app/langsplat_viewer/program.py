@@ -10,6 +10,8 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from langsplat_core.arrays import Array, length_text
 from langsplat_core.cli.run import main, parsed
 from langsplat_core.display.displays import MAX_QUERIES
@@ -25,6 +27,7 @@ from langsplat_core.scene.language import split_phrases
 from langsplat_viewer import output
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera, spanning
 from langsplat_viewer.camera.flight import turntable
+from langsplat_viewer.camera.overlays import unit_of
 from langsplat_viewer.options import (
     ViewerOptions,
     check_display,
@@ -143,7 +146,10 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
         size = f"{camera.width}x{camera.height}"
         with output.in_one_line(out, size), open_renderer(options.backend) as renderer:
             output.save_png(out, output.draw_something(request, renderer))
-        lines = [f"{out}: {size}, {options.shown_display}"]
+        unit, scale = unit_of(scene.metres_per_unit)
+        ends = length_text(scale * np.array(request.depths), " to ", 2)
+        shown = f"depth from {ends} {unit}" if options.shown_display == "depth" else options.shown_display
+        lines = [f"{out}: {size}, {shown}"]
     for reason in scene.unread:
         if SUFFIX in reason:  # of the cameras it was said when they were read
             log.warning("opened without its language field: %s", reason)

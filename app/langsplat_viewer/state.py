@@ -151,6 +151,7 @@ class FrameStats:
     height: int = 0
     scale: float = 1.0  # of the window's resolution, below 1 while the camera moves on a slow machine
     merged: bool = False  # drawn from fewer, merged Gaussians, then, too
+    depths: tuple[float, float] = (0.0, 1.0)  # camera z drawn as near and as far, where depth is shown
 
 
 @dataclass(eq=False)

@@ -402,6 +402,16 @@ def say_what_is_not_here(s: Any) -> None:
     middle = int(area.top + area.height / 2)
     said = s.shot("beside")[middle - 8 : middle + 8, int(0.6 * area.width) : int(0.9 * area.width)]
     assert (said.min(-1) > 200).sum() > 50  # words
+    settings.set_display(viewer, "depth")
+    s.settle()
+    left, right = map(imgui.internal.find_window_by_name, ("left legend", "legend"))
+    assert left.active
+    assert right.active
+    s.key("F")  # the plant, from which no mug is seen
+    assert "nothing of the scene" in viewer.beside.state.nothing
+    assert left.active
+    assert not right.active
+    settings.set_display(viewer, "relevancy")
     settings.compare(viewer, "off")
     s.drop("mugs.ply")
     s.shows("mugs.ply")
@@ -552,12 +562,17 @@ def large_letters(s: Any) -> None:
     assert abs(s.state.size[0] - narrow) < 0.15 * narrow
     settings.prefer(s.viewer, ui_scale=1.5, panels=("Display",))
     s.search("mug or plant", stay=True)
-    card, legend = map(imgui.internal.find_window_by_name, ("Search", "relevancy"))
+    card, legend = map(imgui.internal.find_window_by_name, ("Search", "legend"))
     assert legend.active
     assert card.pos.x + card.size.x <= legend.pos.x
-    settings.toggle_wipe(s.viewer)  # depth is right of the line, heat left of it
+    settings.toggle_wipe(s.viewer)  # depth is right of the line, heat left of it: a legend in each
     s.settle()
-    assert legend.pos.x + legend.size.x <= scene_area().left + 0.5 * scene_area().width
+    low, left = legend.size.y, imgui.internal.find_window_by_name("left legend")
+    assert left.pos.x + left.size.x <= scene_area().left + 0.5 * scene_area().width <= legend.pos.x
+    s.open_panel("Timeline")  # the search reaches down to where the left one was
+    assert not left.active
+    assert legend.size.y > 1.5 * low
+    assert card.pos.x + card.size.x <= legend.pos.x
 
 
 def use_the_outline(s: Any) -> None:

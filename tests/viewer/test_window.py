@@ -101,7 +101,12 @@ def test_headless_query_prints_and_paints_answers(run_viewer, folder):
 
 
 def test_transparent_image_in_another_colour_map(run_viewer, folder):
-    draw(run_viewer, "a.png", "--display", "depth")
+    (line,) = draw(run_viewer, "a.png", "--display", "depth")
+    near, far = map(
+        float, line.removeprefix("a.png: 160x120, depth from ").removesuffix(" units").split(" to ")
+    )
+    _, depths = blob_scene().cameras[0].project(np.array([MUG, BOOK, PLANT]))
+    assert near < depths.min() < depths.max() < far < 1.5 * depths.max()
     draw(run_viewer, "b.png", "--display", "depth", "--colour-map", "cividis", "--transparent")
     plain, clear = picture(folder / "a.png"), picture(folder / "b.png")
     assert (plain.shape[2], clear.shape[2]) == (3, 4)

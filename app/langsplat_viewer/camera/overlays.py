@@ -134,6 +134,11 @@ def measured(units: float, metres_per_unit: float | None) -> str:
     return text if metres_per_unit is None else f"{units * metres_per_unit:.4g} m ({text})"
 
 
+def unit_of(metres_per_unit: float | None) -> tuple[str, float]:
+    """Return the unit that lengths are best said in, and how many of it a world unit has."""
+    return ("units", 1.0) if metres_per_unit is None else ("m", metres_per_unit)
+
+
 @dataclass(frozen=True, eq=False)
 class Grid:
     """Lines on the ground."""

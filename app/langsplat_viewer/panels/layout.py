@@ -214,7 +214,7 @@ def draw_titles(viewer: Viewer) -> None:
 
 # What lies over the scene.
 
-CARD_EM, CARD_SHARE, MARGIN_EM = 22.0, 0.55, 0.8  # width of the search, at most of the scene's; around it
+CARD_EM, CARD_SHARE, MARGIN_EM = 22.0, 0.55, 0.8  # width of the search, its least share; around it
 
 
 def draw_over(
@@ -232,7 +232,7 @@ def draw_over(
         overlays.say(said, free)
     elif not state.show_start:
         overlays.draw_legends(viewer, area, free)
-        outline.draw_legend(viewer, area)
+        outline.draw_legend(viewer, area, free)
         overlays.draw_pointing(viewer)
         select.draw_stroke(viewer, area)
         select.draw_hint(viewer, free)
@@ -252,7 +252,8 @@ def _float_search(viewer: Viewer, area: ui.Area, left: float) -> ui.Area:
     if not viewer.state.show_panel or viewer.state.show_start:
         return area
     margin = hello_imgui.em_size(MARGIN_EM)
-    width = min(hello_imgui.em_size(CARD_EM), CARD_SHARE * area.width)
+    room = area.width - left - margin - hello_imgui.em_size(overlays.LEAST_EM + overlays.AROUND_EM)
+    width = min(hello_imgui.em_size(CARD_EM), max(CARD_SHARE * area.width, room))  # a legend fits beside it
     at = ImVec2(area.left + left + margin, area.top + margin)
     if search.TITLE not in opened(viewer.state):
         with ui.floating("Folded search", at, padding_em=0.3):

@@ -10,7 +10,7 @@ from langsplat_core.query.inventory import Outline
 from langsplat_viewer.actions import outline
 from langsplat_viewer.actions.outline import Target
 from langsplat_viewer.panels import theme, ui
-from langsplat_viewer.panels.overlays import clicked, legend
+from langsplat_viewer.panels.overlays import beside_search, clicked, legend, parts_of
 from langsplat_viewer.viewer import Viewer
 
 LEGEND_ROWS, LEGEND_EM = 8, 9.0
@@ -157,7 +157,7 @@ def _things_menu(viewer: Viewer, target: Target) -> None:
 # The legend of displays that have a colour for each thing.
 
 
-def draw_legend(viewer: Viewer, area: ui.Area) -> None:
+def draw_legend(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
     """Draw colours and names of the largest things in the image, where latents or the tree are shown."""
     state = viewer.state
     if state.session.picture.display not in ("latent", "tree") or state.session.split.columns > 1:
@@ -174,7 +174,9 @@ def draw_legend(viewer: Viewer, area: ui.Area) -> None:
             break
     if not seen:
         return
-    with legend("things in colours", area):
+    split = state.session.split
+    part = parts_of(area, split)[0] if split.has_line else area
+    with legend("things in colours", beside_search(part, free, 2 * len(seen))):
         for name, colour in seen.items():
             _swatch(colour, imgui.get_text_line_height())
             imgui.same_line()

@@ -12,7 +12,6 @@ from imgui_bundle import ImVec2, hello_imgui, imgui, imgui_ctx
 from langsplat_core.arrays import Array, length_text
 from langsplat_core.config import ColourMap
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, Drawing, mapped, painted
-from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import LevelWords
 from langsplat_core.scene import LEVELS, NO_ORIGIN, Camera
 from langsplat_viewer.actions import settings, viewpoint
@@ -50,8 +49,7 @@ def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Textur
         if place:
             paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), SHADE, 4.0)
             paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), WHITE, 1.5)
-    cards = map(imgui.internal.find_window_by_name, ("Search", "Folded search"))  # open, or folded
-    gap, card = hello_imgui.em_size(0.6), next((card for card in cards if card and card.active), None)
+    gap, card = hello_imgui.em_size(0.6), _search_card()
     for place, (part, name) in enumerate(zip(parts, names, strict=False) if len(parts) > 1 else ()):
         is_left = split.has_line and not place  # and ends at the line
         x = part.left + (part.width - gap - ui.width_of(name) if is_left else gap)
@@ -60,6 +58,12 @@ def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Textur
         if card is not None and x < card.pos.x + card.size.x:
             top = card.pos.y + card.size.y
         text_on_shade(name, x, top + gap, area)
+
+
+def _search_card() -> Any:
+    """Return the window of the search, open or folded; None where there is none."""
+    cards = map(imgui.internal.find_window_by_name, ("Search", "Folded search"))
+    return next((card for card in cards if card and card.active), None)
 
 
 def parts_of(area: ui.Area, split: Split) -> list[ui.Area]:
@@ -288,7 +292,7 @@ def _names(named: list[Named], area: ui.Area) -> None:
         wanted.append(PlacedText(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
     taken = [
         PlacedText(low.x - area.left, low.y - area.top, high.x - low.x, high.y - low.y)
-        for low, high in ui.lying_over("Search", "Folded search", "Tools", "relevancy")
+        for low, high in ui.lying_over("Search", "Folded search", "Tools", "legend", "left legend")
     ]
     found = placed(wanted, (area.width, area.height), taken)
     for name, alone, label in zip(named, wanted, found, strict=True):
@@ -334,42 +338,87 @@ def _notes(notes: Sequence[Note], pen: Pen) -> None:
     _names(named, pen.area)
 
 
-# The legend of relevancy, and words in place of an image.
+# Legends, and words in place of an image.
 
 STEPS = 32  # of a colour bar
-BAR_EM, BAR_HEIGHT_EM, LEAST_EM, AROUND_EM = 11.0, 0.8, 6.0, 3.0  # least: beside the search; around the bar
+BAR_EM, BAR_HEIGHT_EM, LEAST_EM, AROUND_EM = 11.0, 0.8, 6.0, 2.4  # least: beside the search; around the bar
+
+
+@dataclass(frozen=True, eq=False)
+class Bar:
+    """What a row of colours means."""
+
+    text: str
+    colours: Array  # (STEPS, 3)
+    ends: tuple[float, float]
+    tick: float | None = None  # a value that is marked
 
 
 def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
-    """Draw the legend where it is `free`, or left of the line where only that has heat; of two scenes two."""
-    if viewer.beside is None:
-        is_left = [pane.row.drawing is Drawing.HEAT for pane in viewer.state.panes()] == [True, False]
-        draw_legend(viewer, parts_of(area, viewer.state.session.split)[0] if is_left else free)
-        return
-    sides = ((viewer, "left"), (viewer.beside, "right"))
-    for (side, name), part in zip(sides, parts_of(area, viewer.state.session.split), strict=False):
-        draw_legend(side, part, f"relevancy {name}")
-        query = side.state.session.query(viewer.state.session.chosen)
-        result = None if query is None else side.state.result(query)
-        if result is not None and result.verdict == "not here":
-            say(f"'{result.phrase}': {result.said}", part, f"{name} side")
+    """Draw what the colours of each image mean in its lower right corner.
+
+    What has no room there, because of the search, is drawn with what the next image has.
+    """
+    other, bars = viewer.beside, list[Bar]()
+    images = [(viewer, pane.row.drawing, "") for pane in viewer.state.panes()]
+    if other is not None:
+        sides = (viewer, ", left"), (other, ", right")
+        images = [(side, side.state.panes()[0].row.drawing, name) for side, name in sides]
+    parts = parts_of(area, viewer.state.session.split) if len(images) > 1 else [free]
+    for place, ((side, drawing, name), part) in enumerate(zip(images, parts, strict=False)):
+        is_last = place + 1 == len(images)
+        if other is not None and (said := _missing(side, viewer.state.session.chosen)):
+            say(said, part, f"side{name}")
+        shows_it_next = other is None and not is_last and drawing is images[place + 1][1]
+        if not (side.state.nothing or shows_it_next):
+            bars += _bars(side, drawing, name)
+        at = beside_search(part, free, 3 * len(bars))
+        if bars and (is_last or at is part):
+            ems = min(BAR_EM, max(at.width / hello_imgui.em_size(1) - AROUND_EM, LEAST_EM))
+            with legend("legend" if is_last else "left legend", at):
+                for bar in bars:
+                    _bar(bar, hello_imgui.em_size(ems))
+            bars = []
 
 
-def draw_legend(viewer: Viewer, area: ui.Area, name: str = "relevancy") -> None:
-    """Draw a colour bar with numbers for every query that is painted."""
+def _missing(side: Viewer, phrase: str) -> str:
+    """Return why one of two scenes shows nothing, or not what is asked for."""
+    query, said = side.state.session.query(phrase), side.state.nothing
+    result = None if query is None else side.state.result(query)
+    return (
+        f"'{result.phrase}': {result.said}" if not said and result and result.verdict == "not here" else said
+    )
+
+
+def beside_search(part: ui.Area, free: ui.Area, rows: int) -> ui.Area:
+    """Return where an image's legend of so many rows can be: all of it, or what the search leaves."""
+    em, card, (left, _) = hello_imgui.em_size(1), _search_card(), free.corners
+    is_free = card is None or card.pos.y + card.size.y < part.corners[1].y - (AROUND_EM + rows) * em
+    return part if (is_free or part.left >= left.x) and part.width > (LEAST_EM + AROUND_EM) * em else free
+
+
+def _bars(viewer: Viewer, drawing: Drawing, of: str) -> list[Bar]:
+    """Return one for depth, and one for each query that is painted as heat."""
     state, picture, shown = viewer.state, viewer.state.session.picture, viewer.state.shown_results()
-    slots = painted(shown)
-    is_hot = any(pane.row.drawing is Drawing.HEAT for pane in state.panes())
-    if state.scene is None or not slots or not is_hot:
-        return
-    with legend(name, area):
-        for slot in slots:
-            result = shown[slot]
-            if result is not None:
-                by = picture.colour_map if len(slots) == 1 else slot
-                colours = bar_colours(STRENGTH[result.verdict], by)
-                width = min(BAR_EM, max(area.width / hello_imgui.em_size(1) - AROUND_EM, LEAST_EM))
-                _bar(result, colours, picture.heat_scale or result.heat_range, hello_imgui.em_size(width))
+    slots = painted(shown) if drawing is Drawing.HEAT else []
+    if state.scene is None:
+        return []
+    if drawing is Drawing.DEPTH:
+        unit, scale = overlays.unit_of(state.scene.metres_per_unit)
+        near, far = state.stats.depths
+        colours = bar_colours(1.0, picture.colour_map)[::-1]  # the nearest is the hottest
+        return [Bar(f"depth, {unit}{of}", colours, (scale * near, scale * far))]
+    by = [picture.colour_map] if len(slots) == 1 else slots
+    return [
+        Bar(
+            f"{result.phrase}{of}",
+            bar_colours(STRENGTH[result.verdict], colour),
+            picture.heat_scale or result.heat_range,
+            result.cut,
+        )
+        for result, colour in zip((shown[slot] for slot in slots), by, strict=True)
+        if result is not None
+    ]
 
 
 def legend(name: str, area: ui.Area) -> AbstractContextManager[None]:
@@ -400,21 +449,21 @@ def bar_colours(strength: float, by: ColourMap | int) -> Array:
     return (0.5 + 0.5 * heat)[:, None] * QUERY_COLOURS[by] if isinstance(by, int) else mapped(heat, by)
 
 
-def _bar(result: QueryResult, colours: Array, ends: tuple[float, float], width: float) -> None:
-    """Phrase, bar with a tick at the threshold, and the relevancies at its ends and in its middle."""
-    height = hello_imgui.em_size(BAR_HEIGHT_EM)
-    imgui.text_unformatted(ui.elided(result.phrase, width))
-    start, (low, high) = imgui.get_cursor_screen_pos(), ends
-    draw_bar(start, width, height, colours)
-    x = start.x + width * min(max((result.cut - low) / (high - low), 0.0), 1.0)
-    for colour, thick in ((SHADE, 4.0), (WHITE, 2.0)):
-        imgui.get_window_draw_list().add_line(
-            ImVec2(x, start.y - 2), ImVec2(x, start.y + height), colour, thick
-        )
+def _bar(bar: Bar, width: float) -> None:
+    """Text, bar with its tick, and the values at its ends and in its middle."""
+    height, (low, high) = hello_imgui.em_size(BAR_HEIGHT_EM), bar.ends
+    imgui.text_unformatted(ui.elided(bar.text, width))
+    start = imgui.get_cursor_screen_pos()
+    draw_bar(start, width, height, bar.colours)
+    if bar.tick is not None:
+        x = start.x + width * min(max((bar.tick - low) / (high - low), 0.0), 1.0)
+        for colour, thick in ((SHADE, 4.0), (WHITE, 2.0)):
+            imgui.get_window_draw_list().add_line(
+                ImVec2(x, start.y - 2), ImVec2(x, start.y + height), colour, thick
+            )
     imgui.dummy(ImVec2(width, height))
-    x = imgui.get_cursor_pos_x()
-    for place, value in ((0.0, low), (0.5, (low + high) / 2), (1.0, high)):
-        text = f"{value:.2f}"
+    x, values = imgui.get_cursor_pos_x(), (low, (low + high) / 2, high)
+    for place, text in zip((0.0, 0.5, 1.0), length_text(values, least=2).split(), strict=True):
         if place:
             imgui.same_line(x + place * (width - ui.width_of(text)))
         imgui.text_unformatted(text)

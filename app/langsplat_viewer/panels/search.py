@@ -128,6 +128,7 @@ def histogram(result: QueryResult) -> tuple[float, float, Array]:
 
 # The list of queries.
 
+LEAST_EM = 4.0  # of a phrase beside a long verdict
 MOST_ROWS = 5.5  # that are seen at a time: the half one says that there are more
 HIDDEN = (0.25, 0.25, 0.25)
 
@@ -150,8 +151,10 @@ def _line(viewer: Viewer, query: Query) -> None:
     spacing, side = imgui.get_style().item_spacing.x, imgui.get_frame_height()
     result, left = viewer.state.result(query), imgui.get_cursor_pos_x()
     right = imgui.get_content_region_avail().x
-    verdict_width = min(ui.width_of(result.said if result else "unknown"), 0.5 * right)
-    room = right - 2 * side - verdict_width - 3 * spacing
+    room = right - 2 * side - 3 * spacing
+    least = min(ui.width_of(query.phrase), hello_imgui.em_size(LEAST_EM))
+    verdict_width = min(ui.width_of(result.said if result else "unknown"), room - least)
+    room -= verdict_width
     _swatch(viewer, query, side)
     imgui.same_line()
     chosen = viewer.state.session.chosen == query.phrase

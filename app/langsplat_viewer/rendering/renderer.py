@@ -46,7 +46,6 @@ from langsplat_viewer.rendering.request import (
     VISIBLE_ALPHA,
     Pane,
     RenderRequest,
-    depth_range,
     image_formation,
     with_splats,
 )
@@ -231,7 +230,7 @@ def _distinct(channels: Sequence[Channel]) -> tuple[Channel, ...]:
 def _ranges(request: RenderRequest, pane: Pane) -> Ranges:
     """Return the values of the pane's channel that are drawn as 0 and as 1."""
     if pane.row.channel == "depth":
-        return (depth_range(request.gaussians, request.camera, request.clip),)
+        return (request.depths,)
     return pane.ranges
 
 

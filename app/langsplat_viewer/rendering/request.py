@@ -7,6 +7,7 @@ The canvas of the window, saved images, films and `--headless` each fill one in;
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -232,6 +233,11 @@ class RenderRequest:
     def gaussians(self) -> Gaussians:
         """Gaussians that are drawn, before `splats` changes them."""
         return self.scene.scene.gaussians if self.merged is None else self.merged.gaussians
+
+    @cached_property
+    def depths(self) -> tuple[float, float]:
+        """Camera z that is drawn as near and as far, see `depth_range`."""
+        return depth_range(self.gaussians, self.camera, self.clip)
 
     @property
     def projection(self) -> tuple[object, ...]:
