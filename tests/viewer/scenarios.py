@@ -12,7 +12,7 @@ from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.inventory import Suggestions
 from langsplat_core.semantics.features import ImageFeatures
-from langsplat_viewer.actions import editing, opening, saving, settings, viewpoint
+from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import from_side, pan
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.panels import select
@@ -117,6 +117,17 @@ def toasts_offer_what_follows(s: Any) -> None:
     s.window.toasts.seconds = 0.0
     s.rest(2)
     assert not s.ctx.item_exists("//toasts/**/Show in folder")
+    s.window.toasts.seconds, foot = 60.0, imgui.internal.find_window_by_name("toasts")
+    s.search("mugg", stay=True)
+    assert answer(s, -1).problem  # the search says it
+    assert not foot.active
+    s.fold()
+    queries.ask_listed(s.viewer)  # as when a project is opened
+    s.settle()
+    assert not foot.active
+    queries.ask(s.viewer, "mugg")
+    s.settle()
+    assert foot.active
 
 
 def begin_at_the_start_page(s: Any) -> None:

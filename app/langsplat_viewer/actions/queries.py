@@ -84,9 +84,9 @@ def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = (), *, alike
         if shown_with:
             painted = found.result is not None and found.result.verdict != "not here"
             state.session = state.session.answering(phrase, painted, shown_with)
-        if found.result is None:
+        if found.result is None and shown_with:  # else it is known: the list is asked again
             viewer.say_error(found.problem)
-        elif found.result.found:
+        elif found.result is not None and found.result.found:
             _tell_apart(viewer, engine, phrase, found.result)
 
     def failed(reason: str) -> None:

@@ -122,12 +122,15 @@ class Toasts:
         self._shown: list[tuple[Message, float]] = []  # and since when
         self._last: Message | None = None
 
-    def draw(self, viewer: Viewer, area: ui.Area) -> None:
-        """Draw them at the foot of the scene; one that is pointed at stays, a click sends them away."""
+    def draw(self, viewer: Viewer, area: ui.Area, read: str) -> None:
+        """Draw them at the foot of the scene; one that is pointed at stays, a click sends them away.
+
+        read: what another panel says at the moment, which is not said twice.
+        """
         now, said = imgui.get_time(), viewer.state.messages
         new = [*takewhile(lambda message: message is not self._last, reversed(said))][::-1]
         self._last = said[-1] if said else None
-        since = (*self._shown, *((message, now) for message in new))
+        since = (*self._shown, *((message, now) for message in new if message.text != read))
         self._shown = [(message, at) for message, at in since if now - at < self.seconds][-MOST_TOASTS:]
         writes = viewer.recorder.current
         if not self._shown and writes is None:

@@ -238,7 +238,9 @@ def draw_over(
         select.draw_hint(viewer, free)
         select.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
-    toasts.draw(viewer, area)
+    toasts.draw(
+        viewer, area, search.why(viewer) if search.TITLE in opened(state) and state.show_panel else ""
+    )
     dialogs.draw_changed(viewer, free)
     dialogs.draw_unsaved(viewer)
     dialogs.draw_export(viewer)

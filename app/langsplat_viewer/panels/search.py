@@ -267,6 +267,14 @@ LEVEL_TIPS: dict[LevelChoice, str] = {
 }
 
 
+def why(viewer: Viewer) -> str:
+    """Return why nothing can be searched, or why the chosen query was not answered, in one line."""
+    state = viewer.state
+    query, scene = state.session.query(state.session.chosen), state.scene
+    problem = "" if query is None else state.answer(query).problem
+    return " ".join((no_field(scene) if scene is not None and scene.language is None else problem).split())
+
+
 def draw(viewer: Viewer) -> None:
     """Draw the search box, the level and the list of queries."""
     scene = viewer.state.scene
