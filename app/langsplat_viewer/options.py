@@ -1,7 +1,7 @@
 """The program's arguments: options, sizes, cameras, displays. Imports no windowing library."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,8 +27,10 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_viewer.camera.flight import SPAN_LIMITS
+from langsplat_viewer.marks import unmarked
 from langsplat_viewer.projects import BUNDLED
-from langsplat_viewer.rendering.renderer import Backend
+from langsplat_viewer.rendering.renderer import Backend, renderer_for
+from langsplat_viewer.rendering.request import RenderRequest, edited_scene
 from langsplat_viewer.viewer import Services
 
 DisplayChoice = Literal["auto", Display]
@@ -186,16 +188,16 @@ def latent_level(level: LevelChoice) -> int:
 
 
 def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
-    """Have the CPU rasterizer compiled before the window first draws with it, and say so."""
+    """Have all that draws on the CPU compiled before the window first draws with it, and say so."""
     if backend == "cpu":
         say_compiling(progress)
-        from langsplat_core.raster.render import splat_colours, view_of
-
         few = Scene(scene.gaussians.take(np.arange(min(len(scene.gaussians), WARMING))))
-        camera = few.framing_camera((16, 16))
-        view = view_of(few, camera)
-        splat_colours(view, few.gaussians)
-        view.depth_at(8, 8)
+        marks, renderer = unmarked(len(few.gaussians)), renderer_for(None, "cpu")
+        edited = edited_scene(few, replace(marks, selected=~marks.selected))
+        for display in DISPLAYS:
+            request = RenderRequest(edited, few.framing_camera((16, 16)), 16, PictureConfig(display))
+            renderer.read(request)
+        renderer.depth_at(request, 8, 8)
 
 
 def say_compiling(progress: Progress) -> None:
