@@ -186,10 +186,8 @@ class Canvas:
             gaussians = request.gaussians
             self._merger.want(gaussians, lambda report: merged(gaussians, report))
         self.textures = textures
-        has_depth = any(pane.row.channel == "depth" for pane in drawn.panes)
-        depths = drawn.depths if has_depth else (0.0, 1.0)
         size = camera.width, camera.height
-        state.stats = FrameStats(milliseconds, *size, detail.scale, detail.merged, depths)
+        state.stats = FrameStats(milliseconds, *size, detail.scale, detail.merged, drawn.depths)
         state.nothing, self._unsure = "", True
 
     def _targets(self, width: int, height: int, panes: int) -> tuple[moderngl.Texture, ...]:

@@ -422,6 +422,10 @@ def say_what_is_not_here(s: Any) -> None:
     assert "nothing of the scene" in viewer.beside.state.nothing
     assert left.active
     assert not right.active
+    s.open_panel("Search")
+    card, said = map(imgui.internal.find_window_by_name, ("Search", "side, right"))
+    assert said.pos.x > card.pos.x + card.size.x or said.pos.y > card.pos.y + card.size.y
+    s.fold()
     settings.set_display(viewer, "relevancy")
     settings.compare(viewer, "off")
     s.drop("mugs.ply")

@@ -20,7 +20,7 @@ from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import PlacedText, placed
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.panels import theme, ui
-from langsplat_viewer.rendering.request import Split
+from langsplat_viewer.rendering.request import NO_DEPTHS, Split
 from langsplat_viewer.session import Note, Point, Ruler
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
@@ -368,7 +368,11 @@ def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
     for place, ((side, drawing, name), part) in enumerate(zip(images, parts, strict=False)):
         is_last = place + 1 == len(images)
         if other is not None and (said := _missing(side, viewer.state.session.chosen)):
-            say(said, part, f"side{name}")
+            card, at = _search_card(), part
+            if card is not None and card.pos.x + card.size.x > part.left:
+                low = card.pos.y + card.size.y - part.top
+                at = replace(part, top=part.top + low, height=max(part.height - low, 1.0))
+            say(said, at, f"side{name}")
         shows_it_next = other is None and not is_last and drawing is images[place + 1][1]
         if not (side.state.nothing or shows_it_next):
             bars += _bars(side, drawing, name)
@@ -406,6 +410,8 @@ def _bars(viewer: Viewer, drawing: Drawing, of: str) -> list[Bar]:
     if drawing is Drawing.DEPTH:
         unit, scale = overlays.unit_of(state.scene.metres_per_unit)
         near, far = state.stats.depths
+        if (near, far) == NO_DEPTHS:
+            return []
         colours = bar_colours(1.0, picture.colour_map)[::-1]  # the nearest is the hottest
         return [Bar(f"depth, {unit}{of}", colours, (scale * near, scale * far))]
     by = [picture.colour_map] if len(slots) == 1 else slots
