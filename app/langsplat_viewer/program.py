@@ -146,10 +146,9 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
         size = f"{camera.width}x{camera.height}"
         with output.in_one_line(out, size), open_renderer(options.backend) as renderer:
             output.save_png(out, output.draw_something(request, renderer))
-        unit, scale = unit_of(scene.metres_per_unit)
-        ends = length_text(scale * np.array(request.depths), " to ", 2)
-        shown = f"depth from {ends} {unit}" if options.shown_display == "depth" else options.shown_display
-        lines = [f"{out}: {size}, {shown}"]
+        (unit, scale), depths = unit_of(scene.metres_per_unit), request.depths
+        ends = "" if depths is None else f" from {length_text(scale * np.array(depths), ' to ', 2)} {unit}"
+        lines = [f"{out}: {size}, {options.shown_display}{ends}"]
     for reason in scene.unread:
         if SUFFIX in reason:  # of the cameras it was said when they were read
             log.warning("opened without its language field: %s", reason)

@@ -21,15 +21,7 @@ from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, unmarked
-from langsplat_viewer.rendering.request import (
-    NO_DEPTHS,
-    EditedScene,
-    Pane,
-    RenderRequest,
-    edited_scene,
-    panes,
-    widget,
-)
+from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes, widget
 from langsplat_viewer.session import OF_PROJECT, Move, Note, Point, Preferences, Query, Session
 
 # Camera path and film: the panel "Record".
@@ -159,7 +151,7 @@ class FrameStats:
     height: int = 0
     scale: float = 1.0  # of the window's resolution, below 1 while the camera moves on a slow machine
     merged: bool = False  # drawn from fewer, merged Gaussians, then, too
-    depths: tuple[float, float] = NO_DEPTHS  # camera z drawn as near and as far, where depth is shown
+    depths: tuple[float, float] | None = None  # camera z drawn as near and as far, where depth is shown
 
 
 @dataclass(eq=False)

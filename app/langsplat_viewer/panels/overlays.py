@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import moderngl
 import numpy as np
@@ -20,7 +20,7 @@ from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import PlacedText, placed
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.panels import theme, ui
-from langsplat_viewer.rendering.request import NO_DEPTHS, Split
+from langsplat_viewer.rendering.request import Split
 from langsplat_viewer.session import Note, Point, Ruler
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
@@ -344,8 +344,7 @@ STEPS = 32  # of a colour bar
 BAR_EM, BAR_HEIGHT_EM, LEAST_EM, AROUND_EM = 11.0, 0.8, 6.0, 2.4  # least: beside the search; around the bar
 
 
-@dataclass(frozen=True, eq=False)
-class Bar:
+class Bar(NamedTuple):
     """What a row of colours means."""
 
     text: str
@@ -355,9 +354,9 @@ class Bar:
 
 
 def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
-    """Draw what the colours of each image mean in its lower right corner.
+    """Draw what the colours of each image mean in its lower right corner, or why a scene shows nothing.
 
-    What has no room there, because of the search, is drawn with what the next image has.
+    A legend that has no room there, because of the search, is drawn with that of the next image.
     """
     other, bars = viewer.beside, list[Bar]()
     images = [(viewer, pane.row.drawing, "") for pane in viewer.state.panes()]
@@ -366,17 +365,11 @@ def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
         images = [(side, side.state.panes()[0].row.drawing, name) for side, name in sides]
     parts = parts_of(area, viewer.state.session.split) if len(images) > 1 else [free]
     for place, ((side, drawing, name), part) in enumerate(zip(images, parts, strict=False)):
-        is_last = place + 1 == len(images)
-        if other is not None and (said := _missing(side, viewer.state.session.chosen)):
-            card, at = _search_card(), part
-            if card is not None and card.pos.x + card.size.x > part.left:
-                low = card.pos.y + card.size.y - part.top
-                at = replace(part, top=part.top + low, height=max(part.height - low, 1.0))
-            say(said, at, f"side{name}")
-        shows_it_next = other is None and not is_last and drawing is images[place + 1][1]
-        if not (side.state.nothing or shows_it_next):
+        if name and (said := side.state.nothing or _not_here(side, viewer.state.session.chosen)):
+            say(said, _below_search(part), f"side{name}")
+        if not side.state.nothing and (side, drawing, name) not in images[place + 1 :]:  # nothing twice
             bars += _bars(side, drawing, name)
-        at = beside_search(part, free, 3 * len(bars))
+        at, is_last = beside_search(part, free, 3 * len(bars)), place + 1 == len(images)
         if bars and (is_last or at is part):
             ems = min(BAR_EM, max(at.width / hello_imgui.em_size(1) - AROUND_EM, LEAST_EM))
             with legend("legend" if is_last else "left legend", at):
@@ -385,46 +378,42 @@ def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
             bars = []
 
 
-def _missing(side: Viewer, phrase: str) -> str:
-    """Return why one of two scenes shows nothing, or not what is asked for."""
-    query, said = side.state.session.query(phrase), side.state.nothing
+def _not_here(side: Viewer, phrase: str) -> str:
+    query = side.state.session.query(phrase)
     result = None if query is None else side.state.result(query)
-    return (
-        f"'{result.phrase}': {result.said}" if not said and result and result.verdict == "not here" else said
-    )
+    return f"'{phrase}': {result.said}" if result is not None and result.verdict == "not here" else ""
+
+
+def _below_search(part: ui.Area) -> ui.Area:
+    card = _search_card()
+    if card is None or card.pos.x + card.size.x < part.left:
+        return part
+    low = card.pos.y + card.size.y - part.top
+    return replace(part, top=part.top + low, height=max(part.height - low, 1.0))
 
 
 def beside_search(part: ui.Area, free: ui.Area, rows: int) -> ui.Area:
     """Return where an image's legend of so many rows can be: all of it, or what the search leaves."""
-    em, card, (left, _) = hello_imgui.em_size(1), _search_card(), free.corners
-    is_free = card is None or card.pos.y + card.size.y < part.corners[1].y - (AROUND_EM + rows) * em
-    return part if (is_free or part.left >= left.x) and part.width > (LEAST_EM + AROUND_EM) * em else free
+    em = hello_imgui.em_size(1)
+    is_free = part.left >= free.left or _below_search(part).height > (AROUND_EM + rows) * em
+    return part if is_free and part.width > (LEAST_EM + AROUND_EM) * em else free
 
 
 def _bars(viewer: Viewer, drawing: Drawing, of: str) -> list[Bar]:
     """Return one for depth, and one for each query that is painted as heat."""
     state, picture, shown = viewer.state, viewer.state.session.picture, viewer.state.shown_results()
-    slots = painted(shown) if drawing is Drawing.HEAT else []
-    if state.scene is None:
-        return []
-    if drawing is Drawing.DEPTH:
+    depths, slots = state.stats.depths, painted(shown) if drawing is Drawing.HEAT else []
+    if drawing is Drawing.DEPTH and depths is not None and state.scene is not None:
         unit, scale = overlays.unit_of(state.scene.metres_per_unit)
-        near, far = state.stats.depths
-        if (near, far) == NO_DEPTHS:
-            return []
         colours = bar_colours(1.0, picture.colour_map)[::-1]  # the nearest is the hottest
-        return [Bar(f"depth, {unit}{of}", colours, (scale * near, scale * far))]
-    by = [picture.colour_map] if len(slots) == 1 else slots
-    return [
-        Bar(
-            f"{result.phrase}{of}",
-            bar_colours(STRENGTH[result.verdict], colour),
-            picture.heat_scale or result.heat_range,
-            result.cut,
-        )
-        for result, colour in zip((shown[slot] for slot in slots), by, strict=True)
-        if result is not None
-    ]
+        return [Bar(f"depth, {unit}{of}", colours, (scale * depths[0], scale * depths[1]))]
+    bars = []
+    for slot, result in ((slot, shown[slot]) for slot in slots):
+        if result is not None:
+            colours = bar_colours(STRENGTH[result.verdict], picture.colour_map if len(slots) == 1 else slot)
+            ends = picture.heat_scale or result.heat_range
+            bars.append(Bar(f"{result.phrase}{of}", colours, ends, result.cut))
+    return bars
 
 
 def legend(name: str, area: ui.Area) -> AbstractContextManager[None]:

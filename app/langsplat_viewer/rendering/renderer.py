@@ -230,7 +230,7 @@ def _distinct(channels: Sequence[Channel]) -> tuple[Channel, ...]:
 def _ranges(request: RenderRequest, pane: Pane) -> Ranges:
     """Return the values of the pane's channel that are drawn as 0 and as 1."""
     if pane.row.channel == "depth":
-        return (request.depths,)
+        return (request.depths or (0.0, 1.0),)
     return pane.ranges
 
 

@@ -235,10 +235,10 @@ class RenderRequest:
         return self.scene.scene.gaussians if self.merged is None else self.merged.gaussians
 
     @cached_property
-    def depths(self) -> tuple[float, float]:
-        """Camera z that is drawn as near and as far, see `depth_range`; `NO_DEPTHS` where none is shown."""
+    def depths(self) -> tuple[float, float] | None:
+        """Camera z that is drawn as near and as far, see `depth_range`; None where no depth is shown."""
         is_shown = any(pane.row.channel == "depth" for pane in self.panes)
-        return depth_range(self.gaussians, self.camera, self.clip) if is_shown else NO_DEPTHS
+        return depth_range(self.gaussians, self.camera, self.clip) if is_shown else None
 
     @property
     def projection(self) -> tuple[object, ...]:
@@ -286,20 +286,17 @@ def image_formation(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> Ras
     return replace(settings, near=max(near, clip.near), far=None if math.isinf(clip.far) else clip.far)
 
 
-NO_DEPTHS = (0.0, 1.0)
-
-
-def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) -> tuple[float, float]:
+def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) -> tuple[float, float] | None:
     """Return the 2 % and 98 % quantiles of camera z of what is in the image and in `clip`, world units.
 
-    `NO_DEPTHS` where nothing is.
+    None where nothing is.
     """
     some = gaussians.means[:: max(len(gaussians) // 20_000, 1)]  # quantiles need no more
     with np.errstate(invalid="ignore", over="ignore"):
         pixels, depths = camera.project(some.astype(np.float64))
         inside = camera.in_image(pixels, depths) & clip.keeps(depths)
     if not inside.any():
-        return NO_DEPTHS
+        return None
     near, far = np.quantile(depths[inside], [0.02, 0.98])
     return float(near), float(far)
 
