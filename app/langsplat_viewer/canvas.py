@@ -174,20 +174,19 @@ class Canvas:
         if before is not None and before.scene.source is not request.scene.source:
             self._merger.drop()  # of another scene
         self._wanted, self._drawn = (request, detail), drawn  # also where it fails: it is not tried again
-        camera = drawn.camera
-        textures = self._targets(camera.width, camera.height, len(drawn.panes))
+        size = drawn.camera.width, drawn.camera.height
+        textures = self._targets(*size, len(drawn.panes))
         began = self._clock()
         self._renderer.draw(drawn, textures)
         self._ctx.finish()
-        milliseconds = 1e3 * (self._clock() - began) + earlier
+        taken = 1e3 * (self._clock() - began) + earlier
         if before is None or drawn.projection != before.projection:
-            self._resolution.drew(detail, milliseconds)
+            self._resolution.drew(detail, taken)
         if self.backend == "cpu" and self._resolution.is_slow:  # a device draws them as they are
             gaussians = request.gaussians
             self._merger.want(gaussians, lambda report: merged(gaussians, report))
         self.textures = textures
-        size = camera.width, camera.height
-        state.stats = FrameStats(milliseconds, *size, detail.scale, detail.merged, drawn.depths)
+        state.stats = FrameStats(taken, *size, detail.scale, detail.merged, drawn.depths)
         state.nothing, self._unsure = "", True
 
     def _targets(self, width: int, height: int, panes: int) -> tuple[moderngl.Texture, ...]:

@@ -4,6 +4,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from glob import escape, glob
 from itertools import islice
 from pathlib import Path
@@ -41,11 +42,10 @@ def stamps(files: tuple[Path, ...]) -> Stamps:
     """Return the times of change and sizes of files."""
     found: list[tuple[Path, Stamp]] = []
     for file in files:
-        try:
-            stat = file.stat()
-            found.append((file, (stat.st_mtime_ns, stat.st_size)))
-        except OSError:
-            found.append((file, None))
+        stamp = None
+        with suppress(OSError):
+            stamp = (stat := file.stat()).st_mtime_ns, stat.st_size
+        found.append((file, stamp))
     return tuple(found)
 
 

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from queue import SimpleQueue
@@ -142,12 +142,17 @@ class Worker:
             give_memory_back()
 
     def poll(self) -> None:
-        """Deliver what has finished, in the order of submission. Call once per frame."""
+        """Call `done` or `failed` of what has finished, in the order of submission; once per frame."""
         finished = [job for job in self._jobs if job.future.done()]
         self._jobs = [job for job in self._jobs if job not in finished]
         for job in finished:
             self.delivered += 1
-            deliver(job)
+            if job.stopped.is_set() or job.future.cancelled():
+                continue
+            if (error := job.future.exception()) is None:
+                job.done(job.future.result())
+            else:
+                job.failed(one_line(error))
 
     def cancel(self) -> None:
         """Drop everything queued and stop the running job where it next reports progress."""
@@ -177,20 +182,6 @@ class Worker:
         self._waiting.put(None)
         if self._thread is not None and patience > 0:
             self._thread.join(patience)
-
-
-def deliver(job: Job) -> None:
-    """Call the right callback of a finished job; a cancelled one gets none."""
-    if job.stopped.is_set():
-        return
-    try:
-        error = job.future.exception()
-    except CancelledError:
-        return
-    if error is None:
-        job.done(job.future.result())
-    else:
-        job.failed(one_line(error))
 
 
 def one_line(error: BaseException) -> str:

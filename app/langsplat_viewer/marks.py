@@ -69,11 +69,6 @@ COMBINED: dict[Mode, Callable[[Array, Array], Array]] = {
 }
 
 
-def hiding(marks: Marks) -> Marks:
-    """Return the marks with the selection hidden, and nothing selected."""
-    return Marks(np.zeros_like(marks.selected), marks.hidden | marks.selected, marks.deleted)
-
-
 @dataclass(frozen=True)
 class Stroke:
     """A stroke of the mouse. Places are fractions of the image, (0, 0) its top left corner."""

@@ -76,16 +76,6 @@ def in_one_line(out: Path, size: str) -> Iterator[None]:
 Draw = Callable[[int], Array]  # (H, W, 3) uint8 image by its number from 0
 
 
-@dataclass(frozen=True)
-class Film:
-    """A film to be written."""
-
-    out: Path  # .mp4, else a folder
-    count: int  # images
-    size: tuple[int, int]  # width and height, pixels
-    fps: float
-
-
 def has_video() -> bool:
     """Return whether videos can be written: PyAV is installed."""
     return find_spec("av") is not None
@@ -94,11 +84,6 @@ def has_video() -> bool:
 def is_folder(out: Path) -> bool:
     """Return whether a film of this name is a folder of images."""
     return out.is_dir() or not out.suffix
-
-
-def frame_name(number: int) -> str:
-    """Return the name of an image in a folder, by its number from 0."""
-    return f"frame-{number:05d}.png"
 
 
 def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
@@ -131,49 +116,50 @@ def _check_own(folder: Path) -> None:
             raise InputError(f"--out {folder}: holds {stranger} of another program; choose another folder")
 
 
-def write_film(film: Film, draw: Draw) -> None:
-    """Draw and write all images.
+def write_film(out: Path, count: int, fps: float, draw: Draw) -> None:
+    """Draw `count` images and write them as a video, or into a folder.
 
     Raises InputError where PyAV fails, OSError where nothing can be written, and what
     `draw` does; a file is then as it was before.
     """
-    if is_folder(film.out):
-        _write_folder(film, draw)
-        return
-    with atomic_path(film.out) as temporary:
-        _write_video(film, draw, temporary)
+    write = _write_folder if is_folder(out) else _write_video
+    write(out, count, fps, draw)
 
 
-def _write_folder(film: Film, draw: Draw) -> None:
-    film.out.mkdir(parents=True, exist_ok=True)
-    _check_own(film.out)
-    with atomic_path(film.out / SETTINGS) as temporary:
-        temporary.write_text(json.dumps({"pictures": film.count, "fps": film.fps}), encoding="utf-8")
-    for number in range(film.count):
+def _write_folder(out: Path, count: int, fps: float, draw: Draw) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    _check_own(out)
+    with atomic_path(out / SETTINGS) as temporary:
+        temporary.write_text(json.dumps({"pictures": count, "fps": fps}), encoding="utf-8")
+    for number in range(count):
         image = draw(number)
         if number == 0:  # only now there is something in the place of an earlier film
-            for path in filter(lambda path: FRAME.fullmatch(path.name), list(film.out.iterdir())):
+            for path in filter(lambda path: FRAME.fullmatch(path.name), list(out.iterdir())):
                 path.unlink()
-        save_png(film.out / frame_name(number), image)
+        save_png(out / f"frame-{number:05d}.png", image)
 
 
-def _write_video(film: Film, draw: Draw, path: Path) -> None:
+def _write_video(out: Path, count: int, fps: float, draw: Draw) -> None:
     """Write H.264 that every player plays."""
     import av
 
+    options = {"movflags": "faststart"}
     try:
-        with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
-            rate = Fraction(film.fps).limit_denominator(1001)
+        with atomic_path(out) as temporary, av.open(str(temporary), "w", "mp4", options) as container:
+            rate = Fraction(fps).limit_denominator(1001)
             stream = container.add_stream("libx264", rate=rate, options={"crf": "18"})
-            (stream.width, stream.height), stream.pix_fmt = film.size, "yuv420p"
-            for number in range(film.count):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(draw(number), format="rgb24")))
+            stream.pix_fmt = "yuv420p"
+            for number in range(count):
+                image = draw(number)
+                if number == 0:
+                    stream.height, stream.width = image.shape[:2]
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
             container.mux(stream.encode())
     except av.error.FFmpegError as error:
         if isinstance(error, OSError):
             raise
         reason = printable_line(error, 160)
-        raise InputError(f"{film.out}: no video can be written ({reason}); use --out folder/") from None
+        raise InputError(f"{out}: no video can be written ({reason}); use --out folder/") from None
 
 
 # A film of the scene.
@@ -203,7 +189,6 @@ def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:
     may raise to stop it.
     """
     (width, height), cameras, empty = shot.request.size, shot.cameras, 0
-    film = Film(out, len(cameras), (width, height), shot.fps)
     with in_one_line(out, f"{width}x{height}"), open_renderer(shot.backend) as renderer:
 
         def draw(number: int) -> Array:
@@ -219,8 +204,8 @@ def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:
                 )
             return image
 
-        write_film(film, draw)
-    name = f"{out}/" if is_folder(out) else str(out)
-    pictures = "picture" if film.count == 1 else "pictures"
-    nothing = [f"{empty} of {film.count} pictures show nothing of the scene"] if empty else []
-    return [f"{name}: {width}x{height}, {film.count} {pictures}, {film.fps:g} a second", *nothing]
+        write_film(out, len(cameras), shot.fps, draw)
+    name, count = f"{out}/" if is_folder(out) else str(out), len(cameras)
+    pictures = "picture" if count == 1 else "pictures"
+    nothing = [f"{empty} of {count} pictures show nothing of the scene"] if empty else []
+    return [f"{name}: {width}x{height}, {count} {pictures}, {shot.fps:g} a second", *nothing]

@@ -6,11 +6,9 @@ Without one neither glfw nor imgui is imported.
 import logging
 import sys
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from langsplat_core.arrays import Array, length_text
 from langsplat_core.cli.run import main, parsed
@@ -27,7 +25,7 @@ from langsplat_core.scene.language import split_phrases
 from langsplat_viewer import output
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera, spanning
 from langsplat_viewer.camera.flight import turntable
-from langsplat_viewer.camera.overlays import unit_of
+from langsplat_viewer.camera.overlays import measured
 from langsplat_viewer.options import (
     ViewerOptions,
     check_display,
@@ -67,10 +65,7 @@ class ViewerCommand(ViewerOptions):
 
     def _without_window(self, path: Path) -> None:
         check_options(self)
-        bars: AbstractContextManager[Progress] = nullcontext(silent)
-        if sys.stderr.isatty():
-            bars = TerminalProgress()
-        with bars as progress:
+        with TerminalProgress() if sys.stderr.isatty() else nullcontext(silent) as progress:
             lines = draw(self, path, services(self.encoder), progress)
         print("\n".join(lines))
 
@@ -146,9 +141,8 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
         size = f"{camera.width}x{camera.height}"
         with output.in_one_line(out, size), open_renderer(options.backend) as renderer:
             output.save_png(out, output.draw_something(request, renderer))
-        (unit, scale), depths = unit_of(scene.metres_per_unit), request.depths
-        ends = "" if depths is None else f" from {length_text(scale * np.array(depths), ' to ', 2)} {unit}"
-        lines = [f"{out}: {size}, {options.shown_display}{ends}"]
+        ends = " to ".join(measured(end, scene.metres_per_unit) for end in request.depths or ())
+        lines = [f"{out}: {size}, {options.shown_display} {ends}".rstrip()]
     for reason in scene.unread:
         if SUFFIX in reason:  # of the cameras it was said when they were read
             log.warning("opened without its language field: %s", reason)

@@ -166,10 +166,6 @@ class Ruler:
         """World units; None before there are two points."""
         return math.dist(*self.points) if len(self.points) > 1 else None
 
-    def with_point(self, point: Point) -> "Ruler":
-        """Set the second point, or the first of a new measurement."""
-        return replace(self, points=(*self.points, point) if len(self.points) == 1 else (point,))
-
 
 @dataclass(frozen=True, eq=False)
 class Bookmark:

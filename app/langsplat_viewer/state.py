@@ -240,9 +240,7 @@ class SceneState:
     hover: Hover | None = None
     fresh_note: Note | None = None  # just pinned, to be written now
     outline: OutlineView | None = None  # once it was wanted
-    uncovered: tuple[
-        Instance, ...
-    ] = ()  # what was found last that the view had to move aside for, or had not
+    uncovered: tuple[Instance, ...] = ()  # found last, and the view has moved aside for them or need not
     evidence: tuple[str, Array] | None = None  # a phrase, and what its answer stands on: (H, W, 3) uint8
     suggestions: Suggestions = field(default_factory=Suggestions)
     offered: tuple[str, tuple[str, tuple[str, ...]]] = ("", ("", ()))  # what was typed, and its offers

@@ -187,7 +187,6 @@ class Window:
         self._titled: tuple[Path | None, str] = None, ""  # the scene that the window's title names, its mark
         self._start_page, self.toasts = dialogs.StartPage(folder), dialogs.Toasts()
         self.files = dialogs.FileDialogs(glfw.post_empty_event)
-        self._folder = folder
 
     def params(self) -> hello_imgui.RunnerParams:
         """Everything hello_imgui wants to know. Raises BackendError where no window can be opened."""
@@ -382,7 +381,7 @@ class Window:
         """Keep the image on screen as that of the files in `paths`, for the start page."""
         image = None if self._canvas is None else self._canvas.thumbnail()
         for path in paths:
-            kept = None if path is None else projects.thumbnail_of(self._folder, path)
+            kept = None if path is None else projects.thumbnail_of(self.viewer.folder, path)
             if image is None or kept is None or path == projects.BUNDLED:
                 continue
             with suppress(OSError):

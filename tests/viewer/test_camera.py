@@ -66,7 +66,7 @@ def test_there_and_back(view, there, back):
     assert_same(back(moved), view)
 
 
-def test_thousand_small_drags_keep_a_rotation_about_up(view):
+def test_small_drags_and_glides_keep_a_rotation(view):
     rolled = controls.adopt_up(controls.roll(view, math.pi / 2))  # what is up in the picture
     assert_allclose(rolled.up, -rolled.rotation[1])
     assert_same(controls.orbit(controls.orbit(rolled, 0.5, 0.1), -0.5, -0.1), rolled)
@@ -74,9 +74,15 @@ def test_thousand_small_drags_keep_a_rotation_about_up(view):
         rolled = controls.orbit(rolled, 0.01, 0.002 * (-1) ** step)
     assert_allclose(rolled.rotation @ rolled.rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rolled.rotation) == pytest.approx(1)
+    end = controls.focus(controls.orbit(view, 2.0, 0.3), np.array([1.0, 0, 0]), 0.7)
+    assert_same(controls.between(view, end, 0.0), view)
+    assert controls.between(view, end, 1.0) is end
+    half = controls.between(view, end, 0.5)
+    assert view.distance > half.distance > end.distance
+    assert_allclose(half.rotation @ half.rotation.T, np.eye(3), atol=1e-12)
 
 
-def test_things_go_where_the_hand_goes(view):
+def test_things_go_where_the_hand_goes_and_zoom_never_sticks(view):
     middle = np.array(SIZE) / 2
     assert_allclose(pixel(controls.orbit(view, 1.1, 0.2), view.target), middle, atol=1e-6)
     assert_allclose(pixel(controls.pan(view, 30, -12, SIZE), view.target), middle + (30, -12), atol=1e-6)
@@ -86,23 +92,6 @@ def test_things_go_where_the_hand_goes(view):
     assert pixel(controls.orbit(view, 0, 0.1), near)[1] > y + 1
     right = view.target + 0.1 * view.rotation[0]
     assert pixel(controls.roll(view, 0.3), right)[1] > middle[1] + 1  # clockwise
-
-
-def test_orbit_stops_before_the_pole(view):
-    for pitch in (10.0, -10.0):
-        turned = controls.orbit(view, 0, pitch)
-        assert turned.elevation == pytest.approx(-np.sign(pitch) * controls.MAX_ELEVATION)
-        assert turned.rotation[1] @ view.up < 0  # the picture never turns over: down stays down
-
-
-def test_look_keeps_the_eye_and_turns_right(view):
-    turned = controls.look(view, 0.2, 0)
-    assert_allclose(turned.eye, view.eye, atol=1e-12)
-    assert pixel(turned, view.target)[0] < SIZE[0] / 2 - 1  # what was ahead is now to the left
-    assert pixel(controls.look(view, 0, 0.1), view.target)[1] < SIZE[1] / 2 - 1
-
-
-def test_zoom_never_sticks(view):
     start = view
     for _ in range(60):
         view = controls.zoom(view, 0.8, 0.1)
@@ -111,13 +100,15 @@ def test_zoom_never_sticks(view):
     assert gone > start.distance + 0.5  # on and through where the target was
 
 
-def test_between_starts_and_ends_at_its_ends(view):
-    end = controls.focus(controls.orbit(view, 2.0, 0.3), np.array([1.0, 0, 0]), 0.7)
-    assert_same(controls.between(view, end, 0.0), view)
-    assert controls.between(view, end, 1.0) is end
-    half = controls.between(view, end, 0.5)
-    assert view.distance > half.distance > end.distance
-    assert_allclose(half.rotation @ half.rotation.T, np.eye(3), atol=1e-12)
+def test_turning_stops_before_the_pole_and_looking_keeps_the_eye(view):
+    for pitch in (10.0, -10.0):
+        turned = controls.orbit(view, 0, pitch)
+        assert turned.elevation == pytest.approx(-np.sign(pitch) * controls.MAX_ELEVATION)
+        assert turned.rotation[1] @ view.up < 0  # the picture never turns over: down stays down
+    turned = controls.look(view, 0.2, 0)
+    assert_allclose(turned.eye, view.eye, atol=1e-12)
+    assert pixel(turned, view.target)[0] < SIZE[0] / 2 - 1  # what was ahead is now to the left
+    assert pixel(controls.look(view, 0, 0.1), view.target)[1] < SIZE[1] / 2 - 1
 
 
 def test_from_camera_is_the_photograph_to_the_pixel():

@@ -287,9 +287,6 @@ def test_outlines_follow_the_stroke():
     (brush,) = outlines(drawn("brush", [(0.2, 0.3), (0.6, 0.5)]))
     assert len(brush) == 2
     assert outlines(drawn("thing", [(0.2, 0.3)])) == []
-
-
-def test_sphere_outline_goes_through_the_mouse():
     end = (0.6, 0.5)
     (circle,) = outlines(drawn("sphere", [(0.5, 0.5), end], (0.0, 0.0, 0.0)))
     np.testing.assert_allclose(np.abs(circle - end).max(1).min(), 0, atol=1e-9)

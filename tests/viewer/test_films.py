@@ -31,9 +31,8 @@ from langsplat_viewer.camera.flight import (
     stretched,
     tangents,
     turntable,
-    with_keyframe,
 )
-from langsplat_viewer.output import Film, Shot, cameras_of, make_film, write_film
+from langsplat_viewer.output import Shot, cameras_of, make_film, write_film
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight, write_flight
 from langsplat_viewer.rendering.request import RenderRequest, plain_request
 from langsplat_viewer.viewer import Viewer
@@ -150,13 +149,14 @@ def test_extreme_paths_stay_finite(scale):
         assert np.isfinite(pose.rotation).all()
 
 
-def test_keyframes_are_added_in_order_and_stretched():
-    keys = with_keyframe(with_keyframe((key(2),), key(0.5)), key(2, (1, 1, 1)))
-    assert [k.seconds for k in keys] == [0.5, 2]
-    assert_allclose(keys[1].pose.position, 1)
-    assert [k.seconds for k in stretched(keys, 6)] == [1.5, 6]
+def test_keyframes_are_stretched_and_tangents_those_of_a_parabola():
+    assert [k.seconds for k in stretched((key(0.5), key(2)), 6)] == [1.5, 6]
     assert stretched((), 3) == ()
     assert [k.seconds for k in stretched((key(0),), 3)] == [0]
+    times, start, speed, bend = np.array([0.0, 1.0, 3.0, 3.5]), *np.random.default_rng(1).normal(size=(3, 3))
+    places = start + times[:, None] * speed + times[:, None] ** 2 * bend
+    found = tangents(times, np.diff(places, axis=0), 1e-9)
+    assert_allclose(found[1:-1], (speed + 2 * times[:, None] * bend)[1:-1])
 
 
 def test_a_turntable_goes_once_around_as_a_drag_does():
@@ -227,13 +227,6 @@ def test_path_with_impossible_values_is_refused(tmp_path, top):
     (tmp_path / "path.json").write_text(json.dumps(top))
     with pytest.raises(InputError, match="no camera path"):
         read_flight(tmp_path / "path.json")
-
-
-def test_tangents_of_uneven_keyframes_are_those_of_a_parabola():
-    times, start, speed, bend = np.array([0.0, 1.0, 3.0, 3.5]), *np.random.default_rng(1).normal(size=(3, 3))
-    places = start + times[:, None] * speed + times[:, None] ** 2 * bend
-    found = tangents(times, np.diff(places, axis=0), 1e-9)
-    assert_allclose(found[1:-1], (speed + 2 * times[:, None] * bend)[1:-1])
 
 
 # In the window.
@@ -500,9 +493,8 @@ def test_a_video_has_the_images_at_their_rate(program, folder):
 
 def test_a_video_that_cannot_be_written_is_one_line(folder):
     (folder / "a.mp4").write_bytes(b"old")
-    film = Film(folder / "a.mp4", 2, (33, 25), 4.0)
     with pytest.raises(InputError, match=r"a\.mp4: no video .*; use --out folder/"):
-        write_film(film, lambda number: np.zeros((25, 33, 3), np.uint8))
+        write_film(folder / "a.mp4", 2, 4.0, lambda number: np.zeros((25, 33, 3), np.uint8))
     assert (folder / "a.mp4").read_bytes() == b"old"
     assert not [path for path in folder.iterdir() if path.name.startswith(".a")]
 
@@ -542,13 +534,13 @@ def test_impossible_options_are_one_line(program, folder, arguments, reason):
 
 
 def test_failed_film_leaves_the_earlier_one_in_its_folder(tmp_path):
-    write_film(Film(tmp_path, 2, (4, 3), 2.0), lambda number: np.zeros((3, 4, 3), np.uint8))
+    write_film(tmp_path, 2, 2.0, lambda number: np.zeros((3, 4, 3), np.uint8))
 
     def fails(number: int) -> np.ndarray:
         raise InputError("nothing to draw")
 
     with pytest.raises(InputError):
-        write_film(Film(tmp_path, 1, (4, 3), 2.0), fails)
+        write_film(tmp_path, 1, 2.0, fails)
     assert len(list(tmp_path.glob("frame-*.png"))) == 2
-    write_film(Film(tmp_path, 1, (4, 3), 2.0), lambda number: np.zeros((3, 4, 3), np.uint8))
+    write_film(tmp_path, 1, 2.0, lambda number: np.zeros((3, 4, 3), np.uint8))
     assert len(list(tmp_path.glob("frame-*.png"))) == 1

@@ -319,16 +319,13 @@ def test_outline_row_is_named_and_selects_its_thing(outlined):
     assert sum(row.count for row in outlined.state.outline.roots) == 360
 
 
-def test_clicked_thing_is_selected(outlined):
+def test_a_clicked_thing_is_selected_and_a_hidden_row_keeps_the_selection(outlined, nodes):
     for choose, centre, word in (
         (outline.select, CENTRES[2], "plant"),
         (outline.find_alike, CENTRES[0], "mug"),
     ):
         act(choose, outlined, centre)
         assert marked(outlined)[0] == word
-
-
-def test_hidden_row_keeps_the_selection(outlined, nodes):
     mug, book, _ = nodes
     take(outlined, blob("plant"))
     act(outline.hide, outlined, mug)

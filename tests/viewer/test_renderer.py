@@ -294,14 +294,6 @@ def test_every_size(renderer, size):
     assert renderer.read(replace(request, split=Split("levels"))).shape == (size[1], 3 * size[0], 3)
 
 
-def test_an_empty_scene_is_the_background(renderer):
-    empty = Scene(SCENE.gaussians.take(np.zeros(COUNT, bool)))
-    for display in ("rgb", "depth"):
-        request = plain_request(empty, CAMERA, replace(PICTURE, display=display))
-        assert np.abs(renderer.read(request) - np.round(255 * np.array(PICTURE.background))).max() <= 1
-    assert renderer.depth_at(request, 3, 3) is None
-
-
 # Depths: the near plane, the range of the depth display, and why nothing is seen.
 
 SIZE = (160, 120)
@@ -356,12 +348,17 @@ def test_why_nothing_names_the_reason():
     assert "nothing of the scene lies in this picture" in reason
 
 
-def test_shows_nothing_tells_an_empty_image(renderer):
+def test_an_empty_image_is_told_and_an_empty_scene_is_the_background(renderer):
     assert not renderer.shows_nothing()  # nothing was drawn yet
     for made in (renderer, ArrayRenderer(load_rasterizer("cpu"))):
         for camera, nothing in ((blob_scene().cameras[0], False), (looking_away(), True)):
             made.read(plain_request(blob_scene(), camera, PictureConfig()))
             assert made.shows_nothing() == nothing
+    empty = Scene(SCENE.gaussians.take(np.zeros(COUNT, bool)))
+    for display in ("rgb", "depth"):
+        request = plain_request(empty, CAMERA, replace(PICTURE, display=display))
+        assert np.abs(renderer.read(request) - np.round(255 * np.array(PICTURE.background))).max() <= 1
+    assert renderer.depth_at(request, 3, 3) is None
 
 
 # The near and the far cut.

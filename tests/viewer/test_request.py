@@ -10,7 +10,6 @@ from PIL import Image
 from langsplat_core.config import PictureConfig
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Scene
-from langsplat_viewer import output
 from langsplat_viewer.actions import editing, queries, saving, settings, viewpoint
 from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.canvas import Canvas
@@ -105,7 +104,7 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
     opened.state.record.film_file = "film"
     saving.save_film(opened, tmp_path)
     recorded(opened)
-    images["film"] = image(tmp_path / "film" / output.frame_name(0))
+    images["film"] = image(tmp_path / "film" / "frame-00000.png")
     expected = ArrayRenderer(ReferenceRasterizer()).read(request).astype(int)
     bare = ArrayRenderer(ReferenceRasterizer()).read(replace(request, scene=edited_scene(state.scene)))
     assert np.abs(bare - expected).max() > 60  # the edits are seen
@@ -233,7 +232,7 @@ def test_panes_are_joined_at_the_line(opened):
 # The edited scene.
 
 
-def test_hidden_and_deleted_gaussians_are_left_out():
+def test_edited_scenes_leave_out_what_is_hidden_and_share_the_rest():
     edited = edited_scene(SCENE, Marks(NOTHING, blob("mug"), blob("plant")))
     np.testing.assert_array_equal(edited.rows, np.flatnonzero(blob("book")))
     np.testing.assert_array_equal(edited.scene.gaussians.means, SCENE.gaussians.means[blob("book")])
@@ -243,9 +242,6 @@ def test_hidden_and_deleted_gaussians_are_left_out():
     assert len(edited_scene(SCENE, Marks(NOTHING, everything, NOTHING)).scene.gaussians) == 0
     for other in (everything[:0], everything[:-1]):  # marks of another scene count as none
         assert edited_scene(SCENE, Marks(other, other, other)).scene is SCENE
-
-
-def test_edited_scenes_share_what_did_not_change():
     marks = Marks(NOTHING, blob("mug"), NOTHING)
     first = edited_scene(SCENE, marks)
     assert edited_scene(SCENE, marks, first) is first

@@ -22,7 +22,7 @@ from langsplat_viewer import options
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.marks import Marks, hiding, unmarked
+from langsplat_viewer.marks import Marks, unmarked
 from langsplat_viewer.projects import (
     NO_GROUPS,
     NOT_COMPARED,
@@ -223,7 +223,7 @@ def test_undo_of_a_setting_keeps_the_same_mask_objects(opened):
 def changed(marks: Marks, rng: np.random.Generator, step: int) -> Marks:
     """Selected and hidden in turn."""
     if step % 2:
-        return hiding(marks)
+        return replace(marks, selected=marks.selected & False, hidden=marks.hidden | marks.selected)
     return replace(marks, selected=(rng.uniform(size=len(marks.selected)) < 0.02) & marks.shown)
 
 

@@ -150,7 +150,7 @@ def test_training_command_is_parsed_by_the_program():
     assert parsed.gaussians == Path("trained.ply")
 
 
-def test_other_output_is_kept_as_words():
+def test_other_output_is_kept_as_words_and_metrics_once_per_report():
     progress = ProcessProgress()
     for line in ("plain words\n", '{"stage": 3}', '"text"', "", "[1]", '{"stage": "a", "fraction": 0.5}'):
         progress.hear(line)
@@ -159,9 +159,6 @@ def test_other_output_is_kept_as_words():
     for number in range(100):
         progress.hear(f"line {number}")
     assert len(progress.said) < 30
-
-
-def test_metrics_are_heard_once_per_report():
     progress, both = ProcessProgress(), {"loss": 0.125, "psnr": 21.5}
     for fraction, metrics in ((0.0, {}), (0.1, {"loss": 0.25}), (0.11, {"loss": 0.25}), (0.2, both)):
         progress.hear(json.dumps({"stage": "training Gaussians", "fraction": fraction, "metrics": metrics}))

@@ -8,6 +8,7 @@ that undoing them all gives exactly what was there.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from operator import methodcaller
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -53,9 +54,7 @@ def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
     mark(viewer, marks.combined(state.marks, found, mode or state.tools.mode))
 
 
-def has_scene(viewer: Viewer) -> bool:
-    """Return whether there is a scene to select in; say so where there is none."""
-    return viewer.has_scene("select in it")
+has_scene = methodcaller("has_scene", "select in it")  # whether there is one; it says so where there is none
 
 
 def has_selection(viewer: Viewer) -> bool:
@@ -89,7 +88,7 @@ def _nothing(marks: Marks) -> Array:
 select_all = _verb(lambda marks: replace(marks, selected=marks.shown), has_scene)
 select_none = _verb(lambda marks: replace(marks, selected=_nothing(marks)), has_scene)
 invert_selection = _verb(lambda marks: replace(marks, selected=marks.shown & ~marks.selected), has_scene)
-hide_selected = _verb(marks.hiding)
+hide_selected = _verb(lambda marks: Marks(_nothing(marks), marks.hidden | marks.selected, marks.deleted))
 isolate_selected = _verb(lambda marks: replace(marks, hidden=marks.kept & ~marks.selected))
 show_hidden = _verb(lambda marks: replace(marks, hidden=_nothing(marks)), has_scene)
 # The file that was opened stays as it is.

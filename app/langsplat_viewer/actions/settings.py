@@ -119,10 +119,10 @@ def toggle_measuring(viewer: Viewer) -> None:
 
 
 def measure_at(viewer: Viewer, u: float, v: float) -> None:
-    """Set a point of the ruler on the surface; (u, v) are fractions of the scene's area."""
-    point = viewer.point_at(u, v, "measure from")
+    """Set the second point of the ruler, or the first anew; (u, v) are fractions of the scene's area."""
+    point, ruler = viewer.point_at(u, v, "measure from"), viewer.state.session.ruler
     if point is not None:
-        viewer.put(ruler=viewer.state.session.ruler.with_point(point))
+        viewer.put(ruler=replace(ruler, points=(*ruler.points[: len(ruler.points) % 2], point)))
 
 
 def toggle_pinning(viewer: Viewer) -> None:
@@ -211,8 +211,7 @@ def _switch(name: str) -> Callable[[Viewer], None]:
     return lambda viewer: setattr(viewer.state, name, not getattr(viewer.state, name))
 
 
-toggle_panels, toggle_help = _switch("show_panel"), _switch("show_help")
-toggle_start = _switch("show_start")
+toggle_panels, toggle_help, toggle_start = map(_switch, ("show_panel", "show_help", "show_start"))
 
 
 def toggle_palette(viewer: Viewer) -> None:

@@ -331,7 +331,7 @@ def put_keyframe(viewer: Viewer, key: Keyframe, new: Keyframe | None = None) -> 
         while any(abs(other.seconds - seconds) < flight.SAME_TIME for other in kept):
             seconds += 0.01
         new = replace(new, seconds=seconds)
-        kept = flight.with_keyframe(kept, new)
+        kept = tuple(sorted((*kept, new), key=lambda key: key.seconds))
     set_path(viewer, kept, new)
 
 

@@ -154,12 +154,6 @@ def frame_times(flight: Flight, fps: float) -> Array:
     return np.arange(max(count, 1)) / fps
 
 
-def with_keyframe(keyframes: tuple[Keyframe, ...], added: Keyframe) -> tuple[Keyframe, ...]:
-    """Return the keyframes in the order of time, with `added` in place of one at the same time."""
-    others = [key for key in keyframes if abs(key.seconds - added.seconds) >= SAME_TIME]
-    return tuple(sorted((*others, added), key=lambda key: key.seconds))
-
-
 def stretched(keyframes: tuple[Keyframe, ...], seconds: float) -> tuple[Keyframe, ...]:
     """Return the path in another time, `seconds` > 0, in proportion; one of no duration stays."""
     if not keyframes or keyframes[-1].seconds <= 0:

@@ -134,24 +134,13 @@ def measured(units: float, metres_per_unit: float | None) -> str:
     return text if metres_per_unit is None else f"{units * metres_per_unit:.4g} m ({text})"
 
 
-def unit_of(metres_per_unit: float | None) -> tuple[str, float]:
-    """Return the unit that lengths are best said in, and how many of it a world unit has."""
-    return ("units", 1.0) if metres_per_unit is None else ("m", metres_per_unit)
+def ground_grid(
+    extent: Extent, up: Array, metres_per_unit: float | None, origin: Array = NO_ORIGIN
+) -> tuple[Array, float]:
+    """Return (M, 2, 3) lines, and their spacing, of a level grid below almost all of a scene.
 
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Lines on the ground."""
-
-    segments: Array  # (M, 2, 3) world units
-    spacing: float  # world units
-
-
-def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None, origin: Array = NO_ORIGIN) -> Grid:
-    """Return a level grid below almost all of a scene with an `origin` (3,).
-
-    Its lines are round lengths apart and at round distances from the world's zero: in metres where the scene
-    has a scale, else in world units.
+    They are round lengths apart and at round distances from the world's zero, `origin` (3,) away: in metres
+    where the scene has a scale, else in world units.
     """
     scale = metres_per_unit or 1.0
     frame = frame_of(up)
@@ -171,4 +160,4 @@ def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None, origin
 
     lines = [(point(x, ahead[0]), point(x, ahead[-1])) for x in across]
     lines += [(point(across[0], z), point(across[-1], z)) for z in ahead]
-    return Grid(np.array(lines), spacing)
+    return np.array(lines), spacing

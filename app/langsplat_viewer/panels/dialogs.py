@@ -123,10 +123,7 @@ class Toasts:
         self._last: Message | None = None
 
     def draw(self, viewer: Viewer, area: ui.Area, read: str) -> None:
-        """Draw them at the foot of the scene; one that is pointed at stays, a click sends them away.
-
-        read: what another panel says at the moment, which is not said twice.
-        """
+        """Draw all but what is `read` in a panel; one that is pointed at stays, a click sends them away."""
         now, said = imgui.get_time(), viewer.state.messages
         new = [*takewhile(lambda message: message is not self._last, reversed(said))][::-1]
         self._last = said[-1] if said else None

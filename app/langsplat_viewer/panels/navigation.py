@@ -63,6 +63,7 @@ NAMED = {  # keys whose name in imgui is another
     "PageDown": "page_down",
     **{name: f"{name.lower()}_arrow" for name in ("Left", "Right", "Up", "Down")},
 }
+MODIFIERS = {name: imgui.Key[f"mod_{name.lower()}"] for name in ("Ctrl", "Shift", "Alt")}
 WHILE_TYPING = ("F1", "Esc")  # beside those with Ctrl
 
 
@@ -72,9 +73,7 @@ class Chord:
 
     key: imgui.Key | None = None
     character: str = ""
-    ctrl: bool = False  # on a Mac the command key, as imgui has it
-    shift: bool = False
-    alt: bool = False
+    held: int = 0  # the bits of imgui's modifiers; Ctrl is on a Mac the command key
     is_plain: bool = True  # not while something is typed
 
 
@@ -85,8 +84,8 @@ def chord(text: str) -> Chord:
     if not name.isalnum():
         return Chord(character=name)
     key = imgui.Key[f"_{name}" if name.isdigit() else NAMED.get(name, name.lower())]
-    ctrl, shift, alt = (name in held for name in ("Ctrl", "Shift", "Alt"))
-    return Chord(key, "", ctrl, shift, alt, is_plain=not ctrl and name not in WHILE_TYPING)
+    bits = sum(int(MODIFIERS[name]) for name in held)
+    return Chord(key, "", bits, is_plain="Ctrl" not in held and name not in WHILE_TYPING)
 
 
 def handle_keys(viewer: Viewer) -> None:
@@ -106,10 +105,7 @@ def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool
         return False
     if wanted.key is None:
         return not io.key_ctrl and wanted.character in map(chr, io.input_queue_characters)
-    held = (io.key_ctrl, io.key_shift, io.key_alt)
-    if io.key_super or held != (wanted.ctrl, wanted.shift, wanted.alt):
-        return False
-    return imgui.is_key_pressed(wanted.key, command.repeats)
+    return int(io.key_mods) == wanted.held and imgui.is_key_pressed(wanted.key, command.repeats)
 
 
 # Mouse and held keys over the scene.

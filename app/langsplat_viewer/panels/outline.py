@@ -174,9 +174,8 @@ def draw_legend(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
             break
     if not seen:
         return
-    split = state.session.split
-    part = parts_of(area, split)[0] if split.has_line else area
-    with legend("things in colours", beside_search(part, free, 2 * len(seen))):
+    place = beside_search(parts_of(area, state.session.split)[0], free, 2 * len(seen))
+    with legend("things in colours", place):
         for name, colour in seen.items():
             _swatch(colour, imgui.get_text_line_height())
             imgui.same_line()

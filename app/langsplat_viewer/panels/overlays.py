@@ -1,9 +1,10 @@
 """The images of the scene behind the panels, and the overlays on them with their panels."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -49,21 +50,22 @@ def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Textur
         if place:
             paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), SHADE, 4.0)
             paint.add_line(part.corners[0], ImVec2(part.left, area.top + area.height), WHITE, 1.5)
-    gap, card = hello_imgui.em_size(0.6), _search_card()
+    gap = hello_imgui.em_size(0.6)
     for place, (part, name) in enumerate(zip(parts, names, strict=False) if len(parts) > 1 else ()):
         is_left = split.has_line and not place  # and ends at the line
         x = part.left + (part.width - gap - ui.width_of(name) if is_left else gap)
         x = max(x, area.left + hello_imgui.em_size(TOOLS_EM))
-        top = area.top
-        if card is not None and x < card.pos.x + card.size.x:
-            top = card.pos.y + card.size.y
-        text_on_shade(name, x, top + gap, area)
+        text_on_shade(name, x, below_search(replace(area, left=x)).top + gap, area)
 
 
-def _search_card() -> Any:
-    """Return the window of the search, open or folded; None where there is none."""
+def below_search(part: ui.Area) -> ui.Area:
+    """Return what of an area lies lower than the search, open or folded; all of it beside that."""
     cards = map(imgui.internal.find_window_by_name, ("Search", "Folded search"))
-    return next((card for card in cards if card and card.active), None)
+    card = next((card for card in cards if card and card.active), None)
+    if card is None or card.pos.x + card.size.x < part.left:
+        return part
+    top = card.pos.y + card.size.y
+    return replace(part, top=top, height=max(part.top + part.height - top, 1.0))
 
 
 def parts_of(area: ui.Area, split: Split) -> list[ui.Area]:
@@ -186,7 +188,7 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
         pen = Pen(part, state.view.camera(*part.size), overlays.LEAST_DEPTH * state.extent.radius)
         paint.push_clip_rect(*part.corners, True)
         if grid is not None:
-            _lines(pen.segments(grid.segments)[0], GRID, 1.0)
+            _lines(pen.segments(grid[0])[0], GRID, 1.0)
         if "cameras" in shown:
             _cameras(viewer, viewpoint.camera_frusta(viewer), pen)
         if "things" in shown:  # after the lines, so that its words are readable
@@ -196,7 +198,7 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
         paint.pop_clip_rect()
     if "cube" in shown:  # as files call them
         _axes(state.view, area)
-    foot = [] if grid is None else [f"grid {overlays.measured(grid.spacing, metres)}"]
+    foot = [] if grid is None else [f"grid {overlays.measured(grid[1], metres)}"]
     if state.view.orthographic:
         span = overlays.measured(state.view.span_in(*state.size), metres)
         foot.append(f"orthographic, {span} across the shorter side")
@@ -344,21 +346,15 @@ STEPS = 32  # of a colour bar
 BAR_EM, BAR_HEIGHT_EM, LEAST_EM, AROUND_EM = 11.0, 0.8, 6.0, 2.4  # least: beside the search; around the bar
 
 
-class Bar(NamedTuple):
-    """What a row of colours means."""
-
-    text: str
-    colours: Array  # (STEPS, 3)
-    ends: tuple[float, float]
-    tick: float | None = None  # a value that is marked
-
-
 def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
     """Draw what the colours of each image mean in its lower right corner, or why a scene shows nothing.
 
     A legend that has no room there, because of the search, is drawn with that of the next image.
     """
-    other, bars = viewer.beside, list[Bar]()
+    other, bars = (
+        viewer.beside,
+        list[Callable[[float], None]](),
+    )  # of this image, and of those before that had no room
     images = [(viewer, pane.row.drawing, "") for pane in viewer.state.panes()]
     if other is not None:
         sides = (viewer, ", left"), (other, ", right")
@@ -366,7 +362,7 @@ def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
     parts = parts_of(area, viewer.state.session.split) if len(images) > 1 else [free]
     for place, ((side, drawing, name), part) in enumerate(zip(images, parts, strict=False)):
         if name and (said := side.state.nothing or _not_here(side, viewer.state.session.chosen)):
-            say(said, _below_search(part), f"side{name}")
+            say(said, below_search(part), f"side{name}")
         if not side.state.nothing and (side, drawing, name) not in images[place + 1 :]:  # nothing twice
             bars += _bars(side, drawing, name)
         at, is_last = beside_search(part, free, 3 * len(bars)), place + 1 == len(images)
@@ -374,7 +370,7 @@ def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
             ems = min(BAR_EM, max(at.width / hello_imgui.em_size(1) - AROUND_EM, LEAST_EM))
             with legend("legend" if is_last else "left legend", at):
                 for bar in bars:
-                    _bar(bar, hello_imgui.em_size(ems))
+                    bar(hello_imgui.em_size(ems))
             bars = []
 
 
@@ -384,35 +380,27 @@ def _not_here(side: Viewer, phrase: str) -> str:
     return f"'{phrase}': {result.said}" if result is not None and result.verdict == "not here" else ""
 
 
-def _below_search(part: ui.Area) -> ui.Area:
-    card = _search_card()
-    if card is None or card.pos.x + card.size.x < part.left:
-        return part
-    low = card.pos.y + card.size.y - part.top
-    return replace(part, top=part.top + low, height=max(part.height - low, 1.0))
-
-
 def beside_search(part: ui.Area, free: ui.Area, rows: int) -> ui.Area:
     """Return where an image's legend of so many rows can be: all of it, or what the search leaves."""
     em = hello_imgui.em_size(1)
-    is_free = part.left >= free.left or _below_search(part).height > (AROUND_EM + rows) * em
+    is_free = part.left >= free.left or below_search(part).height > (AROUND_EM + rows) * em
     return part if is_free and part.width > (LEAST_EM + AROUND_EM) * em else free
 
 
-def _bars(viewer: Viewer, drawing: Drawing, of: str) -> list[Bar]:
-    """Return one for depth, and one for each query that is painted as heat."""
+def _bars(viewer: Viewer, drawing: Drawing, of: str) -> list[Callable[[float], None]]:
+    """Return what draws a bar, so wide: one for depth, or one for each query that is painted as heat."""
     state, picture, shown = viewer.state, viewer.state.session.picture, viewer.state.shown_results()
     depths, slots = state.stats.depths, painted(shown) if drawing is Drawing.HEAT else []
     if drawing is Drawing.DEPTH and depths is not None and state.scene is not None:
-        unit, scale = overlays.unit_of(state.scene.metres_per_unit)
+        scale, unit = (1.0, "units") if (metres := state.scene.metres_per_unit) is None else (metres, "m")
         colours = bar_colours(1.0, picture.colour_map)[::-1]  # the nearest is the hottest
-        return [Bar(f"depth, {unit}{of}", colours, (scale * depths[0], scale * depths[1]))]
-    bars = []
+        return [partial(_bar, f"depth, {unit}{of}", colours, (scale * depths[0], scale * depths[1]), None)]
+    bars: list[Callable[[float], None]] = []
     for slot, result in ((slot, shown[slot]) for slot in slots):
         if result is not None:
             colours = bar_colours(STRENGTH[result.verdict], picture.colour_map if len(slots) == 1 else slot)
             ends = picture.heat_scale or result.heat_range
-            bars.append(Bar(f"{result.phrase}{of}", colours, ends, result.cut))
+            bars.append(partial(_bar, f"{result.phrase}{of}", colours, ends, result.cut))
     return bars
 
 
@@ -444,14 +432,14 @@ def bar_colours(strength: float, by: ColourMap | int) -> Array:
     return (0.5 + 0.5 * heat)[:, None] * QUERY_COLOURS[by] if isinstance(by, int) else mapped(heat, by)
 
 
-def _bar(bar: Bar, width: float) -> None:
-    """Text, bar with its tick, and the values at its ends and in its middle."""
-    height, (low, high) = hello_imgui.em_size(BAR_HEIGHT_EM), bar.ends
-    imgui.text_unformatted(ui.elided(bar.text, width))
+def _bar(text: str, colours: Array, ends: tuple[float, float], tick: float | None, width: float) -> None:
+    """Text, bar with a tick at a value, and the values at its ends and in its middle."""
+    height, (low, high) = hello_imgui.em_size(BAR_HEIGHT_EM), ends
+    imgui.text_unformatted(ui.elided(text, width))
     start = imgui.get_cursor_screen_pos()
-    draw_bar(start, width, height, bar.colours)
-    if bar.tick is not None:
-        x = start.x + width * min(max((bar.tick - low) / (high - low), 0.0), 1.0)
+    draw_bar(start, width, height, colours)
+    if tick is not None:
+        x = start.x + width * min(max((tick - low) / (high - low), 0.0), 1.0)
         for colour, thick in ((SHADE, 4.0), (WHITE, 2.0)):
             imgui.get_window_draw_list().add_line(
                 ImVec2(x, start.y - 2), ImVec2(x, start.y + height), colour, thick

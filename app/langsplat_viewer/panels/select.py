@@ -118,10 +118,9 @@ def handle_stroke(viewer: Viewer, area: ui.Area) -> None:
     if tools.stroke is None:
         if imgui.is_mouse_clicked(imgui.MouseButton_.left) and not io.want_capture_mouse:
             editing.begin_stroke(viewer, *place)
-    elif imgui.is_mouse_down(imgui.MouseButton_.left):
-        editing.extend_stroke(viewer, *place)
-    else:
-        editing.extend_stroke(viewer, *place)
+        return
+    editing.extend_stroke(viewer, *place)
+    if not imgui.is_mouse_down(imgui.MouseButton_.left):
         editing.end_stroke(viewer, held_mode())
 
 
