@@ -128,6 +128,7 @@ def toasts_offer_what_follows(s: Any) -> None:
     queries.ask(s.viewer, "mugg")
     s.settle()
     assert foot.active
+    assert not s.ctx.item_exists("//toasts/**/Show in folder")  # of what was said before
 
 
 def begin_at_the_start_page(s: Any) -> None:

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from itertools import takewhile
 from os.path import exists
 from pathlib import Path
 from typing import Any
@@ -120,13 +119,13 @@ class Toasts:
     def __init__(self) -> None:
         self.seconds = 6.0
         self._shown: list[tuple[Message, float]] = []  # and since when
-        self._last: Message | None = None
+        self._said: list[Message] = []  # as they were in the last frame
 
     def draw(self, viewer: Viewer, area: ui.Area, read: str) -> None:
         """Draw all but what is `read` in a panel; one that is pointed at stays, a click sends them away."""
         now, said = imgui.get_time(), viewer.state.messages
-        new = [*takewhile(lambda message: message is not self._last, reversed(said))][::-1]
-        self._last = said[-1] if said else None
+        new = [message for message in said if all(message is not known for known in self._said)]
+        self._said = said
         since = (*self._shown, *((message, now) for message in new if message.text != read))
         self._shown = [(message, at) for message, at in since if now - at < self.seconds][-MOST_TOASTS:]
         writes = viewer.recorder.current
