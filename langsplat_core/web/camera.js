@@ -64,7 +64,6 @@ export class Controls {
     };
     element.addEventListener("wheel", wheel, { passive: false });
     element.addEventListener("contextmenu", (event) => event.preventDefault());
-    element.addEventListener("keydown", (event) => this.key(event));
     addEventListener("keyup", (event) => this.held.delete(event.key));
     addEventListener("blur", () => this.held.clear());
   }
@@ -114,11 +113,9 @@ export class Controls {
     }
   }
 
+  // Move by a key that was pressed; returns whether it is one that does.
   key(event) {
     const arrow = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
-    if (event.ctrlKey || event.metaKey || event.altKey) {
-      return;
-    }
     if (arrow) {
       this[event.shiftKey ? "pan" : "orbit"](STEP * arrow[0], STEP * arrow[1]);
     } else if (event.key === "+" || event.key === "=") {
@@ -129,9 +126,9 @@ export class Controls {
       this.held.add(event.key);
       this.run();
     } else {
-      return;
+      return false;
     }
-    event.preventDefault();
+    return true;
   }
 
   // Turn the scene on and on, or no longer; returns which.
@@ -165,7 +162,7 @@ export class Controls {
   }
 
   pose(rotation, position) {
-    this.view = { ...this.view, rotation, position };
+    this.view = this.end = { ...this.view, rotation, position };
     this.page.moved();
   }
 
@@ -238,7 +235,7 @@ export class Controls {
     const from = this.view;
     const turn = ++this.moving;
     const begun = performance.now();
-    this.distance = distance;
+    Object.assign(this, { distance, end: view }); // where it goes, or is
     if (!from || this.calm.matches) {
       this.view = view;
       return this.page.moved();

@@ -170,17 +170,15 @@ class Page {
       this.panel(byId("controls").hidden);
     } else if (BUTTONS[event.key]) {
       byId(BUTTONS[event.key]).click();
-    } else if (!this.language) {
-      return;
-    } else if (event.key === "/") {
+    } else if (this.language && event.key === "/") {
       byId("phrase").focus();
       byId("phrase").select();
-    } else if ("0123".includes(event.key)) {
+    } else if (this.language && "0123".includes(event.key)) {
       this.choose("levels", ["auto", ...this.meta.language.levels][event.key]);
-    } else if (KEYS[event.key]) {
+    } else if (this.language && KEYS[event.key]) {
       this.choose("displays", KEYS[event.key]);
-    } else {
-      return;
+    } else if (event.target.matches("input") || !this.controls.key(event)) {
+      return; // arrows choose among radio buttons
     }
     event.preventDefault();
   }
@@ -203,7 +201,7 @@ class Page {
   // leaves out is as at first.
   state() {
     const { phrase, level, display, current } = this;
-    const { rotation, position } = this.controls.view;
+    const { rotation, position } = this.controls.end;
     const own = this.meta.views[current];
     const said = { phrase, level, show: display, view: current || "" };
     if (position.some((length, i) => length !== own.position[i]) || rotation !== own.rotation) {

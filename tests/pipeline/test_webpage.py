@@ -231,7 +231,7 @@ def same_reading(tab: Tab, engine: QueryEngine, phrases: str) -> None:
         assert count <= found["members"] <= 1.12 * count, phrase
 
 
-def test_several_phrases_are_answered_side_by_side(browser: Any, thin: Path) -> None:
+def test_several_phrases_are_answered_side_by_side_and_boxes_go_with_them(browser: Any, thin: Path) -> None:
     with open_tab(browser, thin) as tab:
         lines = {"teddy bear, banana; candle": 3, "candle and teapot": 1, "red and blue ball": 1}
         for line, count in lines.items():
@@ -243,6 +243,12 @@ def test_several_phrases_are_answered_side_by_side(browser: Any, thin: Path) -> 
             tab.page.click("#verdict button")  # did you mean
         assert tab.page.input_value("#phrase") == "teddy bear on the table"
         assert tab.page.inner_text("#verdict").startswith("found")
+        marks = tab.page.locator("#marks")
+        assert tab.page.get_attribute("#phrase", "placeholder") != "what to look for"  # what is here
+        for phrase, visible in (("teddy bear", True), ("banana", False), ("teddy bear", True), ("", False)):
+            tab.run(f"async () => (await langsplat).page.search({phrase!r})")
+            tab.page.wait_for_timeout(100)
+            assert marks.is_visible() == visible, phrase
         assert tab.faults == []
 
 
@@ -369,8 +375,12 @@ def test_keyboard_alone_searches_and_moves(browser: Any, thin: Path) -> None:
         keys.press("Enter")
         assert tab.page.inner_text("#verdict").startswith("found")
         assert tab.run(STATE)["display"] == "relevancy"
-        tab.page.focus("#scene")
         before = tab.run(STATE)
+        tab.page.focus("#levels [value=auto]")
+        keys.press("ArrowRight")  # the next of them
+        assert tab.page.locator("#levels [value=subpart]").is_checked()
+        assert tab.run(STATE)["rotation"] == before["rotation"]
+        tab.run("() => document.activeElement.blur()")  # as when the page is opened
         keys.press("ArrowLeft")
         assert tab.run(STATE)["rotation"] != before["rotation"]
         keys.press("Shift+ArrowLeft")
@@ -513,6 +523,8 @@ def test_page_says_how_much_is_unpacked_before_its_first_image(browser: Any, thi
         assert shares == sorted(shares)
         assert shares[-1] == 100
         assert all(pictures == 1 for text, pictures in said if "%" in text)
+        said = "async () => { const { page } = await langsplat; page.view(1); return location.hash; }"
+        assert tab.run(said) == "#view=1"  # where the camera goes, not where it is on its way
         tab.page.locator("#still").wait_for(state="hidden")
 
 
@@ -547,16 +559,6 @@ def test_address_opens_exactly_what_is_shown(browser: Any, thin: Path) -> None:
             else:
                 assert (state["display"], state["current"]) == ("rgb", 0)
         assert tab.faults == []
-
-
-def test_page_hides_boxes_with_their_answer(browser: Any, thin: Path) -> None:
-    with open_tab(browser, thin, viewport={"width": 800, "height": 600}) as tab:
-        marks = tab.page.locator("#marks")
-        assert tab.page.get_attribute("#phrase", "placeholder") != "what to look for"  # what is here
-        for phrase, visible in (("teddy bear", True), ("banana", False), ("teddy bear", True), ("", False)):
-            tab.run(f"async () => (await langsplat).page.search({phrase!r})")
-            tab.page.wait_for_timeout(100)
-            assert marks.is_visible() == visible, phrase
 
 
 # A headset as a browser offers it: `read` draws two eyes, W x H each, side by side.
