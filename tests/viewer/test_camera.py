@@ -111,12 +111,22 @@ def test_turning_stops_before_the_pole_and_looking_keeps_the_eye(view):
     assert pixel(controls.look(view, 0, 0.1), view.target)[1] < SIZE[1] / 2 - 1
 
 
-def test_from_camera_is_the_photograph_to_the_pixel():
+def test_from_camera_is_the_photograph_to_the_pixel_with_a_target_ahead():
     camera = random_camera(3)  # principal point off centre, fx differs from fy
     extent = controls.extent_of(Scene(random_gaussians(50)))
     same = controls.from_camera(camera, extent).camera(camera.width, camera.height)
     assert_allclose(same.world_to_camera, camera.world_to_camera, atol=1e-12)
     assert (same.fx, same.fy, same.cx, same.cy) == pytest.approx((camera.fx, camera.fy, camera.cx, camera.cy))
+    scene = blob_scene()
+    away = scene.cameras[0].world_to_camera.copy()
+    away[[0, 2]] *= -1  # turned by 180 degrees about its vertical axis
+    camera = Camera(160, 120, 100, 100, 80, 60, away)
+    view = controls.from_camera(camera, controls.extent_of(scene))
+    assert view.distance > 0
+    assert_allclose(view.eye, camera.position, atol=1e-9)
+    empty = scene.take(np.zeros(360, bool))
+    view = controls.default_view(empty, controls.extent_of(empty), SIZE)
+    assert np.isfinite(view.camera(64, 48).world_to_camera).all()
 
 
 @pytest.mark.parametrize("size", [(400, 100), (100, 400), (37, 23)])
@@ -142,19 +152,6 @@ def test_default_view_shows_the_scene_upright(view):
     assert ((pixels > 0) & (pixels < SIZE)).all(1).mean() > 0.98
     assert pixel(view, view.target + 0.1 * scene.up())[1] < SIZE[1] / 2
     assert view.elevation < 0  # looks down a little
-
-
-def test_camera_that_looks_away_has_a_target_ahead():
-    scene = blob_scene()
-    away = scene.cameras[0].world_to_camera.copy()
-    away[[0, 2]] *= -1  # turned by 180 degrees about its vertical axis
-    camera = Camera(160, 120, 100, 100, 80, 60, away)
-    view = controls.from_camera(camera, controls.extent_of(scene))
-    assert view.distance > 0
-    assert_allclose(view.eye, camera.position, atol=1e-9)
-    empty = scene.take(np.zeros(360, bool))
-    view = controls.default_view(empty, controls.extent_of(empty), SIZE)
-    assert np.isfinite(view.camera(64, 48).world_to_camera).all()
 
 
 # Where buttons and keys take the camera.
