@@ -14,7 +14,7 @@ import json
 import re
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
@@ -115,12 +115,12 @@ def make_page(
     """
     gaussians = scene.gaussians
     rows = np.flatnonzero(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= 1 / 255))
+    if len(rows) == 0:
+        raise InputError(f"{scene.path}: no Gaussian of this scene can be drawn; there is nothing to export")
     seen_from = views(scene, first)
     if at_most is not None and len(rows) > at_most:
         rows = rows[np.argsort(-covered(scene, seen_from)[rows], kind="stable")[:at_most]]
     rows = rows[np.argsort(along_curve(gaussians.means[rows]), kind="stable")]
-    if len(rows) == 0:
-        raise InputError(f"{scene.path}: no Gaussian of this scene can be drawn; there is nothing to export")
     centre, radius = scene.bounds()
     progress("packing the Gaussians", 0.1)
     tensors, quad = pack_gaussians(gaussians.take(rows), centre), shader("fullscreen.vert", WEB)
@@ -158,7 +158,10 @@ def make_page(
         },
     }
     tensors["colour_maps"] = np.stack(list(COLOUR_MAPS.values()))
-    why_not, language = no_field(scene) if engine is None else unsearchable(engine), dict[str, Any]()
+    why_not, language = (
+        unsearchable(engine) if engine else no_field(scene).partition(": ")[2],
+        dict[str, Any](),
+    )
     if engine is not None and not why_not:
         language, own = language_tables(engine, rows, progress)
         tensors |= own
@@ -223,11 +226,19 @@ def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
 
 
 def views(scene: Scene, first: Sequence[Camera] = ()) -> tuple[Camera, ...]:
-    """Return the views of a page: `first` and the scene's cameras; without any, one that frames it."""
+    """Return the views of a page: `first` and the scene's cameras; without any, one that holds it."""
     step = -(-len(scene.cameras) // 200)  # views at most
     others = (camera for camera in scene.cameras[:: step or 1] if camera not in first)
     kept = tuple(camera for camera in (*first, *others) if not camera.orthographic)
-    return kept or (scene.framing_camera((1280, 800)),)
+    if kept:
+        return kept
+    camera = scene.framing_camera((1280, 800))
+    matrix = camera.world_to_camera.copy()
+    places = scene.gaussians.means[scene.gaussians.valid()] @ matrix[:3, :3].T + matrix[:3, 3]
+    middle = np.quantile(places, (0.005, 0.995), axis=0).mean(0)[:2]  # without floaters
+    sides = np.abs(places[:, :2] - middle) * (camera.fx / camera.width, camera.fy / camera.height) / 0.45
+    matrix[:3, 3] += *-middle, np.quantile(sides.max(1) - places[:, 2], 0.99)  # with a margin
+    return (replace(camera, world_to_camera=matrix),)
 
 
 # The language field.

@@ -90,19 +90,19 @@ export class Language {
   // Answers to the phrases of a line, in their order, three at most. camera: from where left, right, nearest and
   // so on are said. PhraseError where one of them cannot be asked.
   answers(line, levelName, camera) {
-    return splitPhrases(line)
-      .slice(0, 3)
-      .map((phrase) => {
-        try {
-          const tree = parse(this.withNames(phrase), this.lists);
-          return this.drawn({ ...this.follow(tree, levelName, camera), phrase });
-        } catch (error) {
-          if (error instanceof PhraseError && this.keys.has(phraseKey(phrase))) {
-            return this.drawn(this.ask(phrase, levelName));
-          }
-          throw error;
+    const phrases = splitPhrases(line);
+    const answers = phrases.slice(0, 3).map((phrase) => {
+      try {
+        const tree = parse(this.withNames(phrase), this.lists);
+        return this.drawn({ ...this.follow(tree, levelName, camera), phrase });
+      } catch (error) {
+        if (error instanceof PhraseError && this.keys.has(phraseKey(phrase))) {
+          return this.drawn(this.ask(phrase, levelName));
         }
-      });
+        throw error;
+      }
+    });
+    return Object.assign(answers, { left: phrases.slice(3) });
   }
 
   // A phrase with each taught name in it as one word, by spaces that do not break, the longest first.

@@ -18,7 +18,7 @@ const OF_ANSWERS = ["relevancy", "segmentation"]; // displays that need one
 const HEATS = { smooth: "Smoothed", own: "Each Gaussian", node: "Each node", everywhere: "Everywhere" };
 const OUTCOMES = { found: "found", "weak match": "weak", "not here": "none" }; // their styles
 const KEYS = { c: "rgb", r: "relevancy", f: "segmentation", l: "latent" };
-const BUTTONS = { t: "spin", p: "picture", b: "boxes" };
+const BUTTONS = { t: "spin", p: "picture", b: "boxes", h: "fold", "[": "before", "]": "after" };
 const SLOW = 60; // ms of an image while the camera moves, above which fewer pixels are drawn until it rests
 const COARSEST = 0.3;
 const REST = 180; // ms
@@ -124,11 +124,7 @@ class Page {
         this.search(input.value); // one of the list was chosen
       }
     });
-    input.addEventListener("keydown", (event) => {
-      if (event.key === "Escape") {
-        this.search("");
-      }
-    });
+    input.addEventListener("keydown", ({ key }) => key === "Escape" && this.search(""));
     byId("clear").addEventListener("click", () => {
       this.search("");
       input.focus();
@@ -164,11 +160,7 @@ class Page {
     if (event.ctrlKey || event.metaKey || event.altKey || typing) {
       return;
     }
-    if (event.key === "[" || event.key === "]") {
-      this.view(this.current + (event.key === "]" ? 1 : -1));
-    } else if (event.key === "h") {
-      this.panel(byId("controls").hidden);
-    } else if (BUTTONS[event.key]) {
+    if (BUTTONS[event.key]) {
       byId(BUTTONS[event.key]).click();
     } else if (this.language && event.key === "/") {
       byId("phrase").focus();
@@ -319,7 +311,8 @@ class Page {
     if (hot.length === 1) {
       this.legend(hot[0]);
     }
-    said.append(problem?.message ?? "");
+    const left = answers.left?.join(", ");
+    said.append(problem?.message ?? (left ? element("small", `Three at a time; not asked: ${left}`) : ""));
     if (problem?.near) {
       const meant = this.phrase.toLowerCase().replace(problem.word, problem.near);
       said.append(" ", this.asking(`Did you mean “${meant}”?`, meant));

@@ -24,7 +24,7 @@ from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats, latent_colours
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.pipeline.webpage import covered, make_page, write_page
+from langsplat_core.pipeline.webpage import covered, make_page, views, write_page
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
@@ -237,6 +237,8 @@ def test_several_phrases_are_answered_side_by_side_and_boxes_go_with_them(browse
         for line, count in lines.items():
             tab.run("async (line) => (await langsplat).page.search(line)", line)
             assert tab.run("async () => (await langsplat).page.answers.length") == count
+        tab.run("async () => (await langsplat).page.search('teddy bear, duck, candle, laptop')")
+        assert tab.page.inner_text("#verdict").endswith("not asked: laptop")
         tab.page.fill("#phrase", "teddy bera on the tabble")
         for _ in range(2):
             tab.page.press("#phrase", "Enter")
@@ -691,6 +693,10 @@ def test_page_turns_fills_the_screen_saves_and_prints(browser: Any, thin: Path) 
 def test_unsearchable_scenes_are_shown(browser: Any, tmp_path: Path) -> None:
     cameras = tuple(random_camera(seed) for seed in range(2))
     scene = Scene(random_gaussians(40), random_field(40), cameras)
+    (alone,) = views(replace(scene, cameras=()))
+    pixels, depths = alone.project(scene.gaussians.means)
+    assert alone.in_image(pixels, depths).mean() > 0.9  # all but floaters, and no smaller than they must be
+    assert (np.ptp(pixels, axis=0) > 0.7 * np.array([alone.width, alone.height])).any()
     report = write_page(tmp_path / "a.html", make_page(scene, QueryEngine(scene, no_encoder), "A"))
     assert "autoencoder" in report.why_not
     with open_tab(browser, tmp_path / "a.html") as tab:
@@ -699,7 +705,7 @@ def test_unsearchable_scenes_are_shown(browser: Any, tmp_path: Path) -> None:
         assert tab.faults == []
 
 
-def test_export_errors_are_one_line(tmp_path: Path) -> None:
+def test_export_command_writes_a_page_or_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_scene(tmp_path / "s.ply", Scene(random_gaussians(4)))
     with pytest.raises(InputError, match=r"written as \.html"):
         Export(tmp_path / "s.ply", tmp_path / "room.png").run()
@@ -708,9 +714,6 @@ def test_export_errors_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing to export"):
         Export(tmp_path / "h.ply", tmp_path / "room.html").run()
     assert not list(tmp_path.glob("*.html"))
-
-
-def test_export_command_writes_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_scene(tmp_path / "s.ply", Scene(random_gaussians(40)))
     parse(["export", str(tmp_path / "s.ply"), str(tmp_path / "room.html"), "--title", "Über <b>"]).run()
     assert "40 Gaussians" in capsys.readouterr().out

@@ -303,7 +303,7 @@ def opening(scene: Scene) -> Camera:
     return default_view(scene, extent_of(scene), SIZE).camera(*SIZE)
 
 
-def test_the_near_plane_comes_nearer_with_the_camera():
+def test_the_near_plane_comes_nearer_with_the_camera_and_clips_move_it_away():
     scene = blob_scene()
     assert [image_formation(scene, camera).near for camera in scene.cameras] == [scene.near] * 3
     ahead, seen = scene.cameras[0], []
@@ -312,6 +312,14 @@ def test_the_near_plane_comes_nearer_with_the_camera():
         matrix[:3, 3] *= left
         seen.append(image_formation(scene, replace(ahead, world_to_camera=matrix)).near)
     assert scene.near == seen[0] > seen[1] > seen[2] > 0
+    scene = blob_scene()
+    plain = image_formation(scene, SIDE)
+    assert image_formation(scene, SIDE, Clip(0.01, 7.0)) == replace(plain, far=7.0)
+    assert image_formation(scene, SIDE, Clip(3.0)) == replace(plain, near=3.0)
+    assert (plain.far, farthest(plain)) == (None, np.inf)
+    assert image_formation(replace(scene, antialiased=True), SIDE) == replace(plain, antialiased=True)
+    near, far = depth_range(scene.gaussians, SIDE, BOOK_ALONE)  # of what is left
+    assert 4.4 < near < far < 5.6
 
 
 def looking_away() -> Camera:
@@ -381,17 +389,6 @@ def test_clipped_gaussians_are_not_drawn(renderer, display, clip):
     np.testing.assert_allclose(seen[1], expected, atol=1)
     assert np.abs(seen[1] - seen[0]).max() > 20
     np.testing.assert_array_equal(seen[2], seen[0])
-
-
-def test_clip_moves_the_near_plane_only_away_from_the_eye():
-    scene = blob_scene()
-    plain = image_formation(scene, SIDE)
-    assert image_formation(scene, SIDE, Clip(0.01, 7.0)) == replace(plain, far=7.0)
-    assert image_formation(scene, SIDE, Clip(3.0)) == replace(plain, near=3.0)
-    assert (plain.far, farthest(plain)) == (None, np.inf)
-    assert image_formation(replace(scene, antialiased=True), SIDE) == replace(plain, antialiased=True)
-    near, far = depth_range(scene.gaussians, SIDE, BOOK_ALONE)  # of what is left
-    assert 4.4 < near < far < 5.6
 
 
 def test_the_far_cut_is_not_nearer_than_the_near_one(opened):
