@@ -117,7 +117,7 @@ class GsplatView(LiftingView):
         self.camera, self.count, workers = camera, len(gaussians), shared_workers()
         kernel_camera = projection.kernel_camera(camera, settings)
         found = projection.project_all(projection.rows_of(gaussians), kernel_camera, workers)
-        rows = depth_order(found.depths, np.flatnonzero(found.drawn).astype(np.int32), workers)
+        rows = depth_order(found.depths, found.drawn, workers)
         self.depths, self._rows = found.depths, torch.from_numpy(rows).to(DEVICE).long()
         # The device picks rows, of values too, many times as fast as the processor.
         geometry = torch.from_numpy(found.geometry).to(DEVICE)[self._rows]

@@ -4,7 +4,7 @@ A tile is 16 pixels wide, so one row of it is one `<16 x float>` of LLVM: a sing
 AVX or four SSE/NEON ones. Writing rows as values of that type, instead of as loops that an optimiser may
 or may not vectorise, makes the kernels' speed a property of their source. Eight Gaussians are projected as
 one value of doubles, which round at every step as numbers do. Lanes are added, subtracted, multiplied and
-divided with `+ - * /`, scalars broadcast, `min` and `max` take them, and `np.sqrt` doubles; the rest are the
+divided with `+ - * /`, scalars broadcast, and `min`, `max`, `abs` and `np.sqrt` take them; the rest are the
 functions below, used in kernels.
 """
 
@@ -49,11 +49,16 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, numba_type, numba_type.kind)
 
 
+def _of_llvm(builder: Any, name: str, x: Any) -> Any:
+    """Return a function of LLVM's, of floats or doubles, at each lane."""
+    name = f"llvm.{name}.v{x.type.count}f{32 if x.type == FLOATS else 64}"
+    kind = ir.FunctionType(x.type, [x.type])
+    return builder.call(builder.module.declare_intrinsic(name, (), kind), [x])
+
+
 def _kept(builder: Any, value: float, kind: Any = FLOATS) -> Any:
     """Return a constant that loops keep in a register; LLVM would fetch it from memory at every use."""
-    name = f"llvm.arithmetic.fence.v{kind.count}f{32 if kind == FLOATS else 64}"
-    fence = builder.module.declare_intrinsic(name, (), ir.FunctionType(kind, [kind]))
-    return builder.call(fence, [ir.Constant(kind, [float(value)] * kind.count)])
+    return _of_llvm(builder, "arithmetic.fence", ir.Constant(kind, [float(value)] * kind.count))
 
 
 def as_lanes(builder: Any, value: Any, kind: Any = FLOATS) -> Any:
@@ -103,6 +108,8 @@ lanewise(lambda builder, a, b: builder.fsub(a, b, flags=_flags(a)), operator.sub
 lanewise(lambda builder, a, b: builder.fmul(a, b, flags=_flags(a)), operator.mul)
 lanewise(lambda builder, a, b: builder.fdiv(a, b), operator.truediv)
 lanewise(lambda builder, a: builder.fneg(a), operator.neg)
+lanewise(lambda builder, a: _of_llvm(builder, "fabs", a), abs)
+lanewise(lambda builder, a: _of_llvm(builder, "sqrt", a), np.sqrt)
 lanewise(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b), min)
 lanewise(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b), max)
 
@@ -168,14 +175,6 @@ def log2(builder: Any, x: Any) -> Any:
     ratio = builder.fdiv(builder.fsub(m, one), builder.fadd(m, one))
     series = _polynomial(builder, builder.fmul(ratio, ratio), _LOG2_SERIES)
     return builder.fadd(builder.sitofp(k, DOUBLES), builder.fmul(ratio, series))
-
-
-def _root(builder: Any, x: Any) -> Any:
-    kind = ir.FunctionType(DOUBLES, [DOUBLES])
-    return builder.call(builder.module.declare_intrinsic(f"llvm.sqrt.v{EIGHT}f64", (), kind), [x])
-
-
-lanewise(_root, np.sqrt)
 
 
 def shuffle(builder: Any, a: Any, b: Any, picks: list[int]) -> Any:

@@ -58,7 +58,7 @@ class Projection(NamedTuple):
 
     geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; only where drawn
     depths: Array  # (N,) float64 camera z; only where drawn
-    drawn: Array  # (N,) bool
+    drawn: Array  # (M,) int32 rising rows of those that are drawn
 
 
 class KernelCamera(NamedTuple):
@@ -243,24 +243,25 @@ def _footprints(rows: Rows, which: Array, camera: KernelCamera, each: Array, out
 
 
 @kernel
-def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projection) -> None:
-    """Fill `out` for rows [first, last).
+def project(first: int, last: int, rows: Rows, camera: KernelCamera, geometry: Array, depths: Array) -> Array:
+    """Fill geometry and depths, as in `Projection`, for rows [first, last), and return those that are drawn.
 
     A Gaussian whose alpha = alpha_min contour meets no pixel centre is not drawn.
     """
-    rows, camera, out = borrowed((rows, camera, out))
+    rows, camera, geometry, depths = borrowed((rows, camera, geometry, depths))
     which, each, found = np.empty(8, np.int64), np.arange(8), np.empty((8, COLUMNS + 2))
+    drawn, number = np.empty(last - first, np.int32), 0
     for start in range(first, last, 8):
         for j in range(8):
             which[j] = min(start + j, last - 1)
         _footprints(rows, which, camera, each, found)
         for j in range(min(8, last - start)):
             i = start + j
-            out.drawn[i] = rows.valid[i] and found[j, COLUMNS + 1] >= 0
-            if out.drawn[i]:
-                out.depths[i] = found[j, COLUMNS]
-                for n in range(COLUMNS):
-                    out.geometry[i, n] = found[j, n]
+            drawn[number], depths[i] = i, found[j, COLUMNS]
+            number += rows.valid[i] and found[j, COLUMNS + 1] >= 0
+            for n in range(COLUMNS):
+                geometry[i, n] = found[j, n]
+    return drawn[:number]
 
 
 def project_all(
@@ -268,9 +269,9 @@ def project_all(
 ) -> Projection:
     """Return `project` of all rows; empty: gives the memory of their geometry."""
     n = len(rows.valid)
-    found = Projection(empty((n, COLUMNS), np.float64), np.empty(n), np.empty(n, bool))
-    workers.run(project, n, rows, camera, found)
-    return found
+    geometry, depths = empty((n, COLUMNS), np.float64), np.empty(n)
+    drawn = workers.run(project, n, rows, camera, geometry, depths)
+    return Projection(geometry, depths, np.concatenate([np.empty(0, np.int32), *drawn]))
 
 
 # View-dependent colours on the CPU: the compiled twin of `reference.colours`, and its adjoint.
@@ -328,12 +329,12 @@ def _basis_gradient(x: float, y: float, z: float, h: Array) -> tuple[float, floa
 
 
 @helper
-def _channel(sh: Array, b: Array, channel: int) -> float:
-    """Return one colour channel before the clamp."""
-    value = 0.5
+def _channels(sh: Array, b: Array) -> Point:
+    """Return three colour channels before the clamp."""
+    red = green = blue = 0.5
     for k in range(b.shape[0]):
-        value += b[k] * sh[k, channel]
-    return value
+        red, green, blue = red + b[k] * sh[k, 0], green + b[k] * sh[k, 1], blue + b[k] * sh[k, 2]
+    return red, green, blue
 
 
 @kernel
@@ -352,8 +353,7 @@ def _forward(
         n = rows[place]
         x, y, z, _ = _direction(means[n], position)
         _basis(x, y, z, b)
-        for channel in range(3):
-            value = _channel(sh[n], b, channel)
+        for channel, value in enumerate(_channels(sh[n], b)):
             out[place, channel] = max(value, 0.0) if np.isfinite(value) else 0.0
 
 
@@ -378,8 +378,7 @@ def _backward(
         x, y, z, inverse = _direction(means[n], position)
         _basis(x, y, z, b)
         h[:] = 0
-        for channel in range(3):
-            value = _channel(sh[n], b, channel)
+        for channel, value in enumerate(_channels(sh[n], b)):
             grad = np.float64(colour_grad[n, channel]) if np.isfinite(value) and value > 0 else 0.0
             for k in range(b.shape[0]):
                 sh_grad[n, k, channel] = b[k] * grad if grad != 0 else 0.0

@@ -277,8 +277,7 @@ class CpuView(LiftingView):
         self._kernel_camera = projection.kernel_camera(camera, settings)
         self._rows = projection.rows_of(gaussians)
         found = projection.project_all(self._rows, self._kernel_camera, workers, self._empty)
-        drawn = np.flatnonzero(found.drawn).astype(np.int32)
-        self.order = tiling.depth_order(found.depths, drawn, workers)  # (M,)
+        self.order = tiling.depth_order(found.depths, found.drawn, workers)  # (M,)
         self.depths = found.depths
         size = camera.width, camera.height
         self.tiles = tiling.bin_tiles(found.geometry, self.order, size, settings, workers, self._empty)

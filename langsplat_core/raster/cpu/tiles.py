@@ -122,7 +122,7 @@ def _sort_depths(rows: Array, depths: Array, middle: float, near: bool) -> tuple
 
 def depth_order(depths: Array, rows: Array, workers: Workers) -> Array:
     """Return (M,) int32 rising rows by their depths, (N,) positive float64, ties by row."""
-    sample = np.sort(depths[rows[::64]])
+    sample = np.sort(depths[rows[::512]])
     middle = sample[len(sample) // 2] if len(sample) else 0.0
     halves = workers.each(_sort_depths, [(rows, depths, middle, near) for near in (True, False)])
     if all(done for _, done in halves):
@@ -225,14 +225,16 @@ def _touch(
 
 
 @kernel
-def _place(first: int, last: int, touched: Array, places: Array, start: int, tiles: Tiles) -> None:
-    """Write intersections that `_touch` found, touched[first:last], into their tiles.
+def _place(first: int, last: int, found: tuple[Array, int], places: Array, start: int, tiles: Tiles) -> None:
+    """Write intersections that `_touch` found of ranks [first, last) into their tiles.
 
     Those of a tile go to places[tile] and on: within a tile ranks ascend, whoever runs which piece. They are
     the view's from `start` on.
     """
-    touched, places, tiles = borrowed((touched, places, tiles))
-    for n in range(first, last, 2):
+    (touched, used), places, tiles = borrowed((found, places, tiles))
+    for rank in range(first, last):
+        tiles.firsts[rank + 1] += start
+    for n in range(0, used, 2):
         met, high = touched[n], touched[n + 1]
         tile = met >> _SPAN & (1 << _PLACE) - 1
         while high > 0:
@@ -256,13 +258,13 @@ def bin_tiles(
 
     `empty` makes arrays as `numpy.empty` does.
     """
-    geometry, firsts = empty((len(order), cp.COLUMNS), np.float64), np.zeros(len(order) + 1, np.int64)
+    geometry, firsts = empty((len(order), cp.COLUMNS), np.float64), np.empty(len(order) + 1, np.int64)
+    firsts[0] = 0
     pieces = list(pairwise(len(order) * i // _PIECES for i in range(_PIECES + 1)))
     shared = order, footprints, size, geometry, firsts
     found = workers.each(_touch, [(*piece, *shared) for piece in pieces])
-    for first, last in pieces:
-        firsts[first + 1 : last + 1] += firsts[first]
-    total = int(firsts[-1])
+    starts = np.cumsum([0, *(firsts[last] if first < last else 0 for first, last in pieces)])
+    total = int(starts[-1])
     if max(total, 4 * len(order)) > _MOST:  # ranks have two bits less, see `_pack`
         raise BackendError(
             f"{total} overlaps of Gaussians and tiles are too many for the CPU rasterizer: "
@@ -288,10 +290,8 @@ def bin_tiles(
         height=size[1],
         cutoffs=Cutoffs(least, float(settings.alpha_max), float(settings.transmittance_min)),
     )
-    calls = []
-    for (first, _), (touched, used, _), places_of_it in zip(pieces, found, places, strict=True):
-        calls.append((0, used, touched, places_of_it, int(firsts[first]), tiles))
-    workers.each(_place, calls)
+    of_each = zip(pieces, found, places, starts, strict=False)  # behind the last start is the total
+    workers.each(_place, [(*piece, done[:2], to, int(at), tiles) for piece, done, to, at in of_each])
     return tiles
 
 
@@ -311,6 +311,10 @@ padded_inside = helper(padded)
 @helper
 def add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -> None:
     """sums[at + 16 channel : + 16] += weight x[channel]."""
+    if channels == 3:  # a constant, for images: nothing is asked at a row
+        for channel in range(3):
+            store(sums, at + channel * TILE, load(sums, at + channel * TILE) + weight * x[channel])
+        return
     for channel in range(0, channels & ~3, 4):
         store(sums, at, load(sums, at) + weight * x[channel])
         store(sums, at + TILE, load(sums, at + TILE) + weight * x[channel + 1])
@@ -470,8 +474,7 @@ def blend_row(
     before, power = load(transmittance, at), log2_height - w * w
     alpha = where_at_least(power, cutoffs.log2_alpha_min, min(exp2(power), cutoffs.alpha_max), 0.0)
     after = before - alpha * before
-    stopped = min(before, 0.0 - before)
-    store(transmittance, at, where_at_least(cutoffs.transmittance_min, after, stopped, after))
+    store(transmittance, at, where_at_least(cutoffs.transmittance_min, after, -abs(before), after))
     return where_at_least(cutoffs.transmittance_min, after, 0.0, alpha), before
 
 
