@@ -13,6 +13,9 @@ from types import FrameType
 from typing import NoReturn
 
 SAID = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+# Modules in which nothing may be raised: LLVM drops it, numba's caller gets a SystemError, and a pool waits
+# at exit for the thread that it was starting.
+LATER = ("numba.", "llvmlite.", "concurrent.futures.thread")
 Handler = Callable[[int, FrameType | None], object]
 
 
@@ -54,11 +57,14 @@ def raised(program: str, more: str) -> contextlib.AbstractContextManager[None]:
     """Raise KeyboardInterrupt and `Terminated` inside the block, so that what is finished is kept."""
 
     def stop(number: int, frame: FrameType | None) -> None:
-        # What is raised while a module is imported may be swallowed, or come out as an ImportError.
-        while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
+        while frame is not None:
+            # What is raised while a module is imported may be swallowed, or come out as an ImportError.
+            if (module := str(frame.f_globals.get("__name__"))) == "importlib._bootstrap":
+                end(program, number, more)
+            if module.startswith(LATER):
+                threading.Timer(0.05, signal.raise_signal, [number]).start()
+                return
             frame = frame.f_back
-        if frame is not None:
-            end(program, number, more)
         raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
     return handled(stop)

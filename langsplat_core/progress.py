@@ -63,11 +63,6 @@ class Progress:
 silent = Progress(lambda report: None)
 
 
-def is_quiet() -> bool:
-    """Return True where only errors are wanted."""
-    return log.getEffectiveLevel() >= logging.ERROR
-
-
 @dataclass
 class TimeLeft:
     """The time until a stage ends, by the work that it was seen to do; its text counts down.
@@ -128,7 +123,7 @@ def line_progress() -> Progress:
         fraction = round(min(max(report.fraction, 0.0), 1.0), 3)
         stated = {"stage": report.stage, "fraction": fraction, "note": report.note, "metrics": metrics}
         line = json.dumps(stated)
-        if line != last and not is_quiet():
+        if line != last and log.isEnabledFor(logging.WARNING):
             last = line
             print(line, file=sys.stderr, flush=True)
 
@@ -153,7 +148,7 @@ class TerminalProgress:
             TimeElapsedColumn(),
             TextColumn("{task.fields[left]}"),
             console=Console(file=sys.stderr),
-            disable=is_quiet(),
+            disable=not log.isEnabledFor(logging.WARNING),
         )
         self._tasks: dict[str, tuple[TaskID, TimeLeft]] = {}
         self._stage = ""  # the last one

@@ -119,7 +119,7 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
     results = _answers(engine, options, camera, progress)
     if out.suffix.lower() == output.VIDEO:  # whose sides are even, those of a training camera need not be
         width, height = (max(side - side % 2, 2) for side in (camera.width, camera.height))
-        camera = camera.with_intrinsics(camera.intrinsics.fitted(width, height))
+        camera = camera.fitted(width, height)
     request = plain_request(
         scene,
         camera,
@@ -157,7 +157,7 @@ def _first_camera(scene: Scene, options: ViewerOptions) -> Camera:
     if camera is None:
         camera = default_view(scene, extent_of(scene), size or DEFAULT_SIZE).camera(*(size or DEFAULT_SIZE))
     elif size is not None and size != (camera.width, camera.height):
-        camera = camera.with_intrinsics(camera.intrinsics.fitted(*size))
+        camera = camera.fitted(*size)
     if options.orthographic is not None:  # at the same eye
         view = spanning(from_camera(camera, extent_of(scene)), options.orthographic)
         camera = view.camera(camera.width, camera.height)

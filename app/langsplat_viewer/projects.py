@@ -24,10 +24,9 @@ from msgspec import Meta
 
 from langsplat_core.config import check_settings
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted
-from langsplat_core.io.cameras import is_rotation
 from langsplat_core.io.files import atomic_path, locked
 from langsplat_core.io.hostile import read_json_file
-from langsplat_core.scene import FARTHEST, Intrinsics
+from langsplat_core.scene import FARTHEST, Intrinsics, is_rotation
 from langsplat_core.scene.transform import similarity
 from langsplat_viewer.camera.flight import FOV_LIMITS, LONGEST, SAME_TIME, SPAN_LIMITS, Flight, Keyframe, Pose
 from langsplat_viewer.session import (

@@ -7,15 +7,17 @@ from difflib import get_close_matches
 from importlib import import_module
 from itertools import takewhile
 from types import MappingProxyType
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Union, get_type_hints
 
 import tyro
 
 from langsplat_core import registry
 from langsplat_core.cli.arguments import Runnable, check_codec
 from langsplat_core.cli.run import main, parsed
+from langsplat_core.config import annotations
 from langsplat_core.errors import InputError
 
+(PLACED,) = tyro.conf.Positional[str].__metadata__  # type: ignore[attr-defined]  # the mark that it is
 FLAGS = ("-q", "--quiet", "-v", "--verbose", "--strict")  # may precede a command
 # Name -> class, imported when the command line needs it; those of extensions follow.
 CORE: Mapping[str, str] = MappingProxyType({
@@ -42,6 +44,10 @@ def parse(args: list[str]) -> Runnable:
     elif name in command_names():
         check_codec(args)
         commands = {name: load_command(name)}
+        marks = annotations(get_type_hints(commands[name], include_extras=True).get("out"))
+        if "--out" in args and (PLACED in marks or name == "convert"):  # what others take as an option
+            at = args.index("--out")
+            args = [*args[:at], *args[at + 2 :], "--", *args[at + 1 : at + 2]]
     elif name in groups:
         commands = {name: _group(name, args[1:2])}
     else:  # all of them, but for those of extensions that are broken

@@ -218,7 +218,11 @@ class Teach:
             here = len(engine.instances(engine.run(word.name)))
             times = "once" if len(word.vectors) == 1 else f"{len(word.vectors)} times"
             said = f"{word.name}: {members.sum()} Gaussians, shown {times}; things like it here: {here}"
-        self._write(scene, field, list(known.values()))
+        words = tuple(known.values())
+        if self.into is not None:
+            files.write_words(target, files.Words(field.encoder_id, field.canonical, words))
+        else:
+            files.write_language(target, replace(field, taught=words), scene.gaussians.means, scene.origin)
         print(f"{said}\n{target}: taught words: {len(known)}")
 
     def _known(self, field: LanguageField) -> Sequence[TaughtWord]:
@@ -232,14 +236,6 @@ class Teach:
         except EncoderError as error:
             raise EncoderError(f"{self.into}: {error}") from None
         return words.words
-
-    def _write(self, scene: Scene, field: LanguageField, taught: Sequence[TaughtWord]) -> None:
-        if self.into is not None:
-            files.write_words(self.into, files.Words(field.encoder_id, field.canonical, tuple(taught)))
-        else:
-            path = companion_path(self.scene, files.SUFFIX)
-            learned = replace(field, taught=tuple(taught))
-            files.write_language(path, learned, scene.gaussians.means, scene.origin)
 
 
 def _pointed(engine: QueryEngine, camera: int, at: str, level: Level) -> Array:

@@ -125,10 +125,6 @@ class Convert:
         """The file or folder that is written."""
         return self.rest[-1]
 
-    @property
-    def _reads_spz(self) -> bool:
-        return self.source.suffix.lower() == ".spz"
-
     def run(self) -> None:
         """Read, and write a scene or what an exporter makes of it."""
         if not self.rest:
@@ -138,7 +134,7 @@ class Convert:
             return
         rematched = () if self.rematch is None else (self.rematch,)
         row = check_writable(self.out, *self.sources, *rematched)  # before minutes are spent on reading
-        files = self._reads_spz + (row.suffix == ".spz")
+        files = (self.source.suffix.lower() == ".spz") + (row.suffix == ".spz")
         if len(self.axes) > files or (self.spz_version != 3 and row.suffix != ".spz"):
             raise InputError("--axes, a word for each, and --spz-version are of an .spz; leave them out")
         scene = self._read()
@@ -169,7 +165,7 @@ class Convert:
                 "--levels, --phrases and --codec are for checkpoints; leave them out for a scene"
             )
         spz = partial(read_spz_scene, axes=(self.axes or ("",))[0], note=print)
-        read = spz if self._reads_spz else None
+        read = spz if self.source.suffix.lower() == ".spz" else None
         if self.rematch is None:
             return load_scene(self.source, read)
         scene = load_without_language(self.source, read)

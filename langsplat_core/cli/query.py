@@ -439,7 +439,11 @@ class Select:
 
     def run(self) -> None:
         """Select, write the file, and print what is in it."""
-        self._check()
+        if not self.texts:
+            raise InputError("no phrase given; say: langsplat select scene.ply 'blue gift' --out gift.ply")
+        check_writable(self.out, self.scene)
+        if not self.out.parent.is_dir():
+            raise InputError(f"{self.out.parent}: no such folder for {self.out.name}; make it first")
         scene = searchable(self.scene)
         unit = Unit(self.scale or scene.metres_per_unit, scene.origin)
         engine = _engine(scene, load_text_encoder, self.encoder, self.taught)
@@ -453,15 +457,6 @@ class Select:
         rows = np.flatnonzero(~selected if self.remove else selected)
         save_scene(self.out, replace(scene.take(rows), path=self.out))
         self._print(found, unit, int(selected.sum()), len(rows))
-
-    def _check(self) -> None:
-        """InputError for what needs no scene to be known: it should not cost the loading of one."""
-        if not self.texts:
-            raise InputError("no phrase given; say: langsplat select scene.ply 'blue gift' --out gift.ply")
-        check_writable(self.out, self.scene)
-        folder = self.out.parent
-        if not folder.is_dir():
-            raise InputError(f"{folder}: no such folder for {self.out.name}; make it first")
 
     def _print(self, found: Sequence[Instance], unit: Unit, selected: int, written: int) -> None:
         if self.json:

@@ -83,12 +83,8 @@ class SparseModel:
     points: Array
 
 
-def has_model(folder: Path) -> bool:
-    """Return True where cameras and images lie in `folder`, both binary or both text."""
-    return _suffix(folder) is not None
-
-
-def _suffix(folder: Path) -> str | None:
+def model_suffix(folder: Path) -> str | None:
+    """Return the suffix of both cameras and images in `folder`, None without such; binary is preferred."""
     parts = ("cameras", "images")
     kinds = (".bin", ".txt")
     return next((k for k in kinds if all((folder / f"{part}{k}").is_file() for part in parts)), None)
@@ -96,7 +92,7 @@ def _suffix(folder: Path) -> str | None:
 
 def read_model(folder: Path) -> SparseModel:
     """Return the model in `folder`; binary is preferred. FormatError names the file that is broken."""
-    suffix = _suffix(folder)
+    suffix = model_suffix(folder)
     if suffix is None:
         raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
     lenses, images = _content(folder / f"cameras{suffix}"), _content(folder / f"images{suffix}")
@@ -306,9 +302,9 @@ def find_model(folder: Path) -> Path | None:
     """
     sparse = folder / "sparse"
     inside = sorted(sparse.iterdir(), key=lambda f: (len(f.name), f.name)) if sparse.is_dir() else []
-    found = [f for f in inside if has_model(f)]
+    found = [f for f in inside if model_suffix(f)]
     if len(found) < 2:
-        return next((f for f in (*found, sparse) if has_model(f)), None)
+        return next((f for f in (*found, sparse) if model_suffix(f)), None)
     best = max(found, key=_photographs_of)
     name = printable_line(best.name, 60)
     report_loss("%s has %d models; %s is taken, with most photographs", shown(sparse), len(found), name)
@@ -318,7 +314,7 @@ def find_model(folder: Path) -> Path | None:
 def _photographs_of(model_folder: Path) -> int:
     """Return the number of photographs with a camera in a model; 0 if it is damaged."""
     try:
-        images = _content(model_folder / f"images{_suffix(model_folder)}", quiet=True)
+        images = _content(model_folder / f"images{model_suffix(model_folder)}", quiet=True)
         return len({image.name for image in images})
     except FormatError:
         return 0

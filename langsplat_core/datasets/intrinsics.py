@@ -6,7 +6,7 @@ at +0.5. Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fish
 Everything here is float64; it is the reference that resampling follows.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -85,10 +85,6 @@ class PhotoIntrinsics(Intrinsics):
         if self.distortion == BrownDistortion():  # all zero, as many files write a pinhole
             object.__setattr__(self, "distortion", None)
 
-    def regridded(self, width: int, height: int) -> "PhotoIntrinsics":
-        """Return the same lens on another pixel grid over the same image."""
-        return replace(self, **vars(self.resized(width, height)))
-
     def pixels(self, xy: Array) -> Array:
         """Return (N, 2) pixel positions in the photograph of (N, 2) normalised coordinates."""
         distorted = xy if self.distortion is None else self.distortion(xy)
@@ -160,7 +156,8 @@ def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
     if intrinsics.distortion is None:
         scale = min(1.0, max_side / max(intrinsics.width, intrinsics.height))
         size = max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale))
-        return Camera(**vars(intrinsics.resized(*size)), world_to_camera=np.eye(4))
+        small = intrinsics.resized(*size)
+        return Camera(*size, small.fx, small.fy, small.cx, small.cy, np.eye(4))
     left, top, right, bottom = _inner_rectangle(intrinsics)
     wide, high = intrinsics.fx * (right - left), intrinsics.fy * (bottom - top)
     if not (wide >= 1 and high >= 1):

@@ -303,7 +303,7 @@ def _read_for(photo: Photo, tell: Tell) -> tuple[Image.Image, PhotoIntrinsics]:
             f"{intrinsics.width}x{intrinsics.height}; use the photographs that the cameras were computed from"
         )
     try:
-        return image, intrinsics.regridded(*image.size)
+        return image, intrinsics.resized(*image.size)
     except ValueError as error:  # a camera of one or two pixels, at the edge of what a lens may be
         raise InputError(f"{photo.path}: {error}; export the cameras again") from None
 

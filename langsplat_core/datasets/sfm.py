@@ -19,7 +19,7 @@ from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import photos
 from langsplat_core.datasets import workspace as workspaces
 from langsplat_core.datasets.capture import Capture, develop, on_ground, random_points
-from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
+from langsplat_core.datasets.colmap import SparseModel, good_points, located_photos, model_suffix, read_model
 from langsplat_core.errors import FormatError, InputError, printable_line, report_loss, shortened
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
@@ -50,7 +50,7 @@ def load_photos(
     workspace = workspaces.open_workspace(work, ["photographs", 5, SMALL, SIDE, contents, masked])
     files = numbered(paths)
     told = (workspace / TRIED).exists()
-    if not has_model(workspace / "sparse"):
+    if not model_suffix(workspace / "sparse"):
         try:
             workspaces.run_apart(_locate, workspace, files, workspace=workspace, progress=progress)
         except workspaces.FAILURES as error:
@@ -58,7 +58,7 @@ def load_photos(
             raise InputError(
                 f"structure from motion failed ({reason}); remove {workspace} and try again"
             ) from None
-    model = _stored_model(workspace) if has_model(workspace / "sparse") else None
+    model = _stored_model(workspace) if model_suffix(workspace / "sparse") else None
     matches = workspaces.read_matches(
         workspace, files, {image.name for image in model.images} if model else ()
     )
@@ -121,7 +121,7 @@ def _locate(workspace: Path, files: dict[str, Path], progress: Progress) -> None
                 (small / name).replace(workspace / name)
         (workspace / TRIED).touch()
         shutil.rmtree(small, ignore_errors=True)
-    if not has_model(workspace / "sparse"):
+    if not model_suffix(workspace / "sparse"):
         map_cameras(workspace, match_photos(workspace, files, progress), progress)
 
 
@@ -231,7 +231,7 @@ def _triangulated(
     """Return points, their colours, and why there are none, for people; "" where nothing failed."""
     workspace = workspaces.open_workspace(work, ["known poses", 3, SIDE, capture.digest(views)])
     try:
-        if not has_model(workspace / "sparse"):
+        if not model_suffix(workspace / "sparse"):
             names = [f"{index:05d}.png" for index in range(len(views))]
             cameras = _write_images(workspace / "images", names, capture, views, progress)
             workspaces.run_apart(

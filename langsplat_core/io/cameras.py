@@ -19,7 +19,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Raw, Struct
 
-from langsplat_core.arrays import Array, affine
+from langsplat_core.arrays import affine
 from langsplat_core.errors import malformed, quoted, report_losses, unread
 from langsplat_core.io.files import write_whole
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, decode_json, read_file
@@ -31,7 +31,7 @@ SIZE_LIMIT = 64 * 1024 * 1024  # bytes; a camera takes about 500
 # A side of the image; beyond it a renderer would be asked for gigabytes
 Pixels = Annotated[float, Meta(ge=1, le=1 << 16, multiple_of=1)]
 Coordinate = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]
-Cosine = Annotated[float, Meta(ge=-2, le=2)]  # generously: `is_rotation` judges
+Cosine = Annotated[float, Meta(ge=-2, le=2)]  # generously: the camera judges
 Row = tuple[Cosine, Cosine, Cosine]
 
 
@@ -80,8 +80,6 @@ def write_cameras(path: Path | str, cameras: tuple[Camera, ...]) -> None:
 def _camera(entry: _Entry, what: str) -> Camera:
     """Return the camera of an entry; `what` names the file and the camera in messages."""
     rotation = np.array(entry.rotation)
-    if not is_rotation(rotation):
-        raise malformed(what, "'rotation' is not a rotation matrix")
     pose = affine(rotation.T, -rotation.T @ np.array(entry.position))
     # Newer INRIA files keep the photograph's suffix; a name such as "frame.01" must keep its own dot.
     name = entry.img_name
@@ -93,11 +91,3 @@ def _camera(entry: _Entry, what: str) -> Camera:
         return Camera(*size, entry.fx, entry.fy, cx, cy, pose, name[: len(name) - len(ending)])
     except ValueError as error:  # what the camera itself refuses: fx of 0, for one
         raise malformed(what, f"{error}") from None
-
-
-def is_rotation(matrix: Array) -> bool:
-    """Return whether a finite (3, 3) matrix is a rotation, to 1e-3; files written in float32 keep 1e-6."""
-    if np.abs(matrix).max() > 2:  # products of larger ones could overflow
-        return False
-    unlike = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    return bool(unlike <= 1e-3 and np.linalg.det(matrix) > 0)

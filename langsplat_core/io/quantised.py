@@ -130,6 +130,8 @@ def write_splat(path: Path | str, scene: Scene) -> None:
     component; positions and scales stay exact. A row that cannot be drawn is written with opacity 0.
     """
     gaussians, valid = scene.gaussians, scene.gaussians.valid()
+    if len(gaussians) == 0:
+        raise InputError(f"{path}: a .splat without Gaussians would be an empty file; write .ply")
     drawn = gaussians.take(valid)
     largest = np.maximum(np.abs(drawn.means).max(1), np.exp(drawn.log_scales.max(1)))
     if (largest >= _HUGE).any():

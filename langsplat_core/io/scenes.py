@@ -317,14 +317,18 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
     """Return where the companion of a scene that ends in `suffix` lies: `a/b.ply` -> `a/b<suffix>`.
 
     A SOG folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .sog or
-    .splat -> `a/b.spz<suffix>` and so on.
+    .splat -> `a/b.spz<suffix>` and so on. Of a symbolic link it is the one beside the file that the link
+    leads to, where only that is there.
     """
     scene = Path(scene)
     if any(scene.name == row.folder_file for row in formats()):
         scene = scene.parent
     row = None if os.path.isdir(scene) else format_of(scene)  # which a name too long is not
     if row is not None:
-        return scene.with_name((scene.name if row.own_companions else scene.stem) + suffix)
+        beside = scene.with_name((scene.name if row.own_companions else scene.stem) + suffix)
+        linked = os.path.islink(scene) and not os.path.lexists(beside)
+        there = companion_path(os.path.realpath(scene), suffix) if linked else beside
+        return there if os.path.exists(there) else beside
     whole = scene.resolve()  # "." has no name of its own
     return whole.with_name(whole.name + suffix)
 
@@ -350,8 +354,9 @@ def _companions(path: Path) -> tuple[Path, Path, Path]:
 
 def _cameras_path(scene: Path) -> Path:
     beside = companion_path(scene, camera_files.SUFFIX)
-    if not os.path.exists(beside) and scene.name == "point_cloud.ply":
-        return scene.parent.parent.parent / "cameras.json"
+    real = Path(os.path.realpath(scene))
+    if not os.path.exists(beside) and real.name == "point_cloud.ply":
+        return real.parent.parent.parent / "cameras.json"
     return beside
 
 

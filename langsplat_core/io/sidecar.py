@@ -266,16 +266,6 @@ def _taught_parts(words: Sequence[TaughtWord]) -> tuple[dict[str, Array], dict[s
     return {"taught": _narrow(vectors), "taught.rivals": _narrow(rivals)}, texts
 
 
-def _tree_tensors(tree: Tree) -> dict[str, Array]:
-    few = tree.count < np.iinfo(np.uint16).max
-    return {
-        "tree.leaves": _unsigned(tree.leaves, np.uint16 if few else np.uint32),
-        "tree.parents": _unsigned(tree.parents, np.uint32),
-        "tree.levels": tree.levels,
-        "tree.votes": tree.votes,
-    }
-
-
 def _signed(numbers: Array) -> Array:
     """Numbers as int32, the largest of their type as NO_NODE."""
     none = np.iinfo(numbers.dtype).max
@@ -325,8 +315,14 @@ def write_language(path: Path | str, field: LanguageField, means: Array, origin:
     taught, stated = _taught_parts(field.taught)
     tensors = {name: _narrow(tensor) for name, tensor in floats.items()} | taught
     tensors |= {"positions": positions, "corners": corners}
-    if field.tree is not None:
-        tensors |= _tree_tensors(field.tree)
+    if (tree := field.tree) is not None:
+        few = tree.count < np.iinfo(np.uint16).max
+        tensors |= {
+            "tree.leaves": _unsigned(tree.leaves, np.uint16 if few else np.uint32),
+            "tree.parents": _unsigned(tree.parents, np.uint32),
+            "tree.levels": tree.levels,
+            "tree.votes": tree.votes,
+        }
     about = {
         "encoder": field.encoder_id,
         "levels": ",".join(LEVELS),

@@ -195,7 +195,11 @@ def kept_photographs(
     if not scene.cameras:
         raise InputError(f"{path}: has no cameras, which photographs belong to; keep .cameras.json beside it")
     work = work or work_folder(path)
-    dataset = dataset or _stated_dataset(path, work)
+    place = dataset or stated_figures(work / REPORT).get("dataset")
+    if not isinstance(place, str | Path) or not str(place) or not (dataset or exists(place)):
+        where = f"not in {place}" if isinstance(place, str) and place else f"not named in {work / REPORT}"
+        raise InputError(f"{path}: its photographs are {where}; name their folder with --photographs")
+    dataset = Path(place)
     most = max(max(camera.width, camera.height) for camera in scene.cameras)
     capture = load_photographs(dataset, DatasetConfig(max_side=most, allow_few_cameras=True), work, progress)
     found = {camera.name: image for camera, image in zip(capture.cameras, capture.images, strict=True)}
@@ -208,15 +212,6 @@ def kept_photographs(
             image = np.asarray(Image.fromarray(image).resize((camera.width, camera.height)))
         photographs[camera.name] = image
     return photographs
-
-
-def _stated_dataset(path: Path, work: Path) -> Path:
-    """Return the dataset that the report of a training names, if it is still there."""
-    place = stated_figures(work / REPORT).get("dataset")
-    if isinstance(place, str) and place and exists(Path(place)):
-        return Path(place)
-    where = f"not in {place}" if isinstance(place, str) and place else f"not named in {work / REPORT}"
-    raise InputError(f"{path}: its photographs are {where}; name their folder with --photographs")
 
 
 # A contact sheet.

@@ -73,7 +73,7 @@ def show(
 
 def draw(scene: Scene, size: tuple[int, int] = (960, 540), answer: QueryResult | None = None) -> Image.Image:
     """Return a picture of a scene; an `answer` as heat, from the nearest camera that has it in its image."""
-    fitted = [camera.with_intrinsics(camera.intrinsics.fitted(*size)) for camera in scene.cameras]
+    fitted = [camera.fitted(*size) for camera in scene.cameras]
     camera = fitted[0] if fitted else scene.framing_camera(size)
     if answer is None:
         drawn = render(scene, camera)

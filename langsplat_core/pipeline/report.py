@@ -9,7 +9,7 @@ import html
 import io
 import json
 from base64 import b64encode
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -174,9 +174,13 @@ def write_reports(
     head = files("langsplat_core").joinpath("web", "report.html").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(SLIDE.encode()).digest()).decode()
     head = head.replace("{{SCRIPT}}", SLIDE).replace("{{DIGEST}}", digest)
+    cards = (
+        f"<div class='card warning'><b>{_text(fault + colon, 600)}</b> {_text(remedy, 1000)}</div>"
+        for fault, colon, remedy in (warning.partition(": ") for warning in report.warnings)
+    )
     parts = [
         head.replace("{{TITLE}}", _text(Path(report.dataset).name or "Training")),
-        _tiles(report), *_warnings(report.warnings), "<div class=halves>",
+        _tiles(report), *cards, "<div class=halves>",
         _section("Cameras from above", _from_above(scene, held_out)), _figures(report, capture.matches),
         "</div><h2>Photographs, and what the scene shows there</h2>",
         "<p class=soft>Left of the line the photograph, right the scene: drag it. Held-out photographs, not "
@@ -193,13 +197,6 @@ def _text(text: object, limit: int = 120) -> str:
 
 def _section(title: str, content: str) -> str:
     return f"<div><h2>{title}</h2><div class=card>{content}</div></div>"
-
-
-def _warnings(warnings: Iterable[str]) -> Iterator[str]:
-    """Yield a card for each warning, in which the remedy stands behind the colon."""
-    for warning in warnings:
-        fault, colon, remedy = warning.partition(": ")
-        yield f"<div class='card warning'><b>{_text(fault + colon, 600)}</b> {_text(remedy, 1000)}</div>"
 
 
 def _tiles(report: TrainReport) -> str:

@@ -51,8 +51,8 @@ class QueryResult(Judged):
     peak: float  # score of the chosen level
     fits: Fits  # of the best region, or neighbourhood, of each level, see `Scale.fit`
     judgement: Verdict
-    place: Array | None  # (3,) world units
-    box: Array | None  # (2, 3) corners, world units
+    place: Array | None  # (3,) in the scene, which lies about its origin: see `Scene.in_world`
+    box: Array | None  # (2, 3) corners, likewise
     points: Array  # (N, 3) means of the Gaussians
     relevancy: Deferred = Deferred()  # (3, N) float32 in [0, 1] per level and Gaussian
     even: Deferred = Deferred()  # (N,) float32 relevancy at the level, the same all over a region
@@ -62,7 +62,13 @@ class QueryResult(Judged):
     engine: Any = None  # the QueryEngine that was asked, whose scene a notebook shows
 
     def __repr__(self) -> str:
-        return f"<{self.phrase!r}: {self.said}, as {LEVELS[self.level]}, near {self.place}>"
+        known = self.engine is not None and self.place is not None
+        near = self.engine.scene.in_world(self.place) if known else self.place
+        return f"<{self.phrase!r}: {self.said}, as {LEVELS[self.level]}, near {near}>"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process takes: all fields, their arrays made, but no engine."""
+        return {name: getattr(self, name) for name in vars(self)} | {"engine": None}
 
     def _repr_html_(self) -> str | None:
         """Return a light page of the scene with the phrase asked, for a notebook; None without an engine."""

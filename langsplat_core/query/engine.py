@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from threading import RLock
+from typing import Any
 
 import numpy as np
 import scipy
@@ -87,7 +88,7 @@ class QueryEngine:
     def __init__(
         self,
         scene: Scene,
-        load_encoder: LoadEncoder | None = None,
+        load_encoder: LoadEncoder | TextEncoder | None = None,
         *,
         encoder_id: str = "",
         exact: bool = False,
@@ -96,15 +97,18 @@ class QueryEngine:
     ) -> None:
         """Prepare queries against a scene; nothing is computed yet.
 
-        load_encoder: without one only the scene's own phrasebook can be asked. encoder_id: in place of the
-        encoder that the scene names. exact: compare every latent itself instead of its cell, to measure the
-        cells by. rule: "regions" becomes "peak" where neither scene nor encoder has everyday phrases. words:
-        taught ones of the user, before the scene's; EncoderError where they are of another encoder.
+        load_encoder: or an encoder; without, only the scene's own phrasebook can be asked. encoder_id: in
+        place of the one that the scene names. exact: compare every latent itself instead of its cell, to
+        measure the cells by. rule: "regions" becomes "peak" where neither scene nor encoder has everyday
+        phrases. words: taught ones of the user, before the scene's; EncoderError if of another encoder.
         """
         self.scene = scene
         self.exact = exact
         self._rule: AnswerRule = rule
-        self._load_encoder = load_encoder
+        given: Any = load_encoder
+        self._load_encoder: LoadEncoder | None = (
+            (lambda _: given) if hasattr(given, "encode_texts") else given
+        )
         self._encoder_id = encoder_id
         self._encoder: TextEncoder | None = None
         self._encoder_checked = False

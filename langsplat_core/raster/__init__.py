@@ -40,6 +40,8 @@ def load_rasterizer(name: str, **resources: Any) -> Rasterizer:
         raise InputError(f"unknown rasterizer {name!r}; choose one of {', '.join(BACKENDS)}")
     backend = BACKENDS[name]
     try:
+        if name == "opengl" and "ctx" not in resources:
+            raise BackendError("draws into a context that is given, ctx=create_egl_context(), by `view_of`")
         with optional_imports():
             rasterizer: Rasterizer = getattr(import_module(backend.module), backend.class_name)(**resources)
     except (ImportError, OSError, BackendError) as error:

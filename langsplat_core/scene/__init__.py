@@ -20,6 +20,7 @@ from langsplat_core.scene.scene import (
     Intrinsics,
     Scene,
     about_origin,
+    is_rotation,
     look_at,
     moved_pose,
     near_plane,
@@ -30,5 +31,5 @@ __all__ = [
     "CANONICAL_PHRASES", "FARTHEST", "LEVELS", "NO_NODE", "NO_ORIGIN", "SH_COUNTS", "AutoencoderCodec",
     "Calibration", "Camera", "CodebookCodec", "Codec", "Fits", "Gaussians", "Intrinsics", "LanguageField",
     "LinearCodec", "PlattScaling", "Scene", "TaughtWord", "Tree", "about_origin", "codec_from_tensors",
-    "look_at", "moved_pose", "near_plane", "origin_of",
+    "is_rotation", "look_at", "moved_pose", "near_plane", "origin_of",
 ]  # fmt: skip

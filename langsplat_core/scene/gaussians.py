@@ -9,6 +9,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array, logit, pieces, quaternions, rotation_matrices, sigmoid
 from langsplat_core.config import INRIA
+from langsplat_core.errors import report_loss
 from langsplat_core.progress import Progress, silent
 
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16}  # degree -> coefficients per colour channel
@@ -30,6 +31,7 @@ class Gaussians:
     sh: Array  # (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16; colour = 0.5 + SH(direction)
 
     def __post_init__(self) -> None:
+        given = np.asarray(self.means)
         for field in fields(self):
             with np.errstate(over="ignore", invalid="ignore"):  # of doubles in files: such rows are not drawn
                 value = np.ascontiguousarray(getattr(self, field.name), dtype=np.float32)
@@ -41,6 +43,11 @@ class Gaussians:
         check_array("sh", self.sh, ("N", "K", 3), dims)
         if self.sh.shape[1] not in SH_COUNTS.values():
             raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients, got {self.sh.shape[1]}")
+        if given.dtype == np.float64 and len(self):
+            some = slice(None, None, len(self) // 4096 + 1)
+            step = np.spacing(np.median(np.abs(self.means[some]).max(1)))
+            if step > np.exp(np.median(self.log_scales[some].max(1))):
+                report_loss("positions as far from zero are rounded to %g units: give Scene an origin", step)
 
     def __len__(self) -> int:
         return len(self.means)

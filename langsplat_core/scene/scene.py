@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,17 +34,19 @@ class Intrinsics:
         if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and min(self.fx, self.fy) > 0):
             raise ValueError("focal lengths must be positive and the principal point finite")
 
-    def resized(self, width: float, height: float) -> "Intrinsics":
+    def resized(self, width: float, height: float) -> Self:
         """Return the same camera on another pixel grid over the same image."""
         sx, sy = width / self.width, height / self.height
-        return Intrinsics(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
+        inner = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
+        return replace(self, width=width, height=height, **inner)
 
-    def fitted(self, width: float, height: float) -> "Intrinsics":
+    def fitted(self, width: float, height: float) -> Self:
         """Return the same camera in a window around its whole image, whose square pixels stay square."""
         scale = min(width / self.width, height / self.height)
         cx = (self.cx - self.width / 2) * scale + width / 2
         cy = (self.cy - self.height / 2) * scale + height / 2
-        return Intrinsics(width, height, self.fx * scale, self.fy * scale, cx, cy)
+        inner = {"fx": self.fx * scale, "fy": self.fy * scale, "cx": cx, "cy": cy}
+        return replace(self, width=width, height=height, **inner)
 
     @property
     def fov_degrees(self) -> float:
@@ -56,29 +58,34 @@ FARTHEST = 1e9  # world units along an axis, of cameras in files: there, float32
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(Intrinsics):
     """A pinhole camera without distortion, or an orthographic one, which looks along its z axis everywhere.
 
-    Pixel (0, 0) is the top left one and its centre lies at (0.5, 0.5).
+    Pixel (0, 0) is the top left one and its centre lies at (0.5, 0.5). Focal lengths of an orthographic one
+    are pixels per world unit.
     """
 
     width: int  # pixels, >= 1
-    height: int  # pixels, >= 1
-    fx: float  # pixels, > 0; orthographic: pixels per world unit
-    fy: float
-    cx: float  # pixels, principal point measured from the left edge
-    cy: float  # pixels, principal point measured from the top edge
+    height: int
     world_to_camera: Array  # (4, 4) float64, rigid
     name: str = ""  # file stem of the photograph it belongs to, if any
     orthographic: bool = False
+    __eq__, __hash__ = object.__eq__, object.__hash__  # not by intrinsics alone
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         matrix = np.ascontiguousarray(self.world_to_camera, dtype=np.float64)
         check_array("world_to_camera", matrix, (4, 4))
         if not np.isfinite(matrix).all():
             raise ValueError("world_to_camera: every entry must be finite")
-        _ = self.intrinsics  # which are checked as they are made
-        object.__setattr__(self, "world_to_camera", matrix)
+        if not is_rotation(matrix[:3, :3]) or np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-3:
+            raise ValueError("world_to_camera: no rotation and shift, but scaled, mirrored or transposed")
+        if (self.width % 1, self.height % 1) != (0, 0):
+            raise ValueError(f"a picture of {self.width}x{self.height} pixels: they must be whole")
+        # Sizes of calibrations may be 640.0, or of a type in which products overflow.
+        whole = {"width": int(self.width), "height": int(self.height), "world_to_camera": matrix}
+        for name, value in whole.items():
+            object.__setattr__(self, name, value)
 
     @property
     def position(self) -> Array:
@@ -98,15 +105,6 @@ class Camera:
     def intrinsics(self) -> Intrinsics:
         """Focal lengths and principal point on the camera's own pixel grid."""
         return Intrinsics(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
-
-    def with_intrinsics(self, intrinsics: Intrinsics) -> "Camera":
-        """Another camera in the same pose; its size must be whole pixels."""
-        inner = {name: getattr(intrinsics, name) for name in ("fx", "fy", "cx", "cy")}
-        return replace(self, width=int(intrinsics.width), height=int(intrinsics.height), **inner)
-
-    def resized(self, width: int, height: int) -> "Camera":
-        """Return the same view on another pixel grid."""
-        return self.with_intrinsics(self.intrinsics.resized(width, height))
 
     def within(self, side: int) -> "Camera":
         """Return the same view, no side of whose image is longer than `side` pixels."""
@@ -138,6 +136,14 @@ class Camera:
         return np.asarray(inside & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height))
 
 
+def is_rotation(matrix: Array) -> bool:
+    """Return whether a finite (3, 3) matrix is a rotation, to 1e-3; files written in float32 keep 1e-6."""
+    if np.abs(matrix).max() > 2:  # products of larger ones could overflow
+        return False
+    unlike = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(unlike <= 1e-3 and np.linalg.det(matrix) > 0)
+
+
 def moved_pose(world_to_camera: Array, offset: Array) -> Array:
     """Return the (4, 4) pose of a camera that was moved by `offset` (3,)."""
     pose = world_to_camera.copy()
@@ -154,7 +160,9 @@ def look_at(
     """
     eye = np.asarray(eye, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - eye
-    forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
+    if not (away := float(np.linalg.norm(forward))) > 0:
+        raise ValueError(f"a camera at {eye} that looks at itself; give another eye or target")
+    forward = forward / away
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
     if np.linalg.norm(right) < 1e-9:
         right = across(forward)

@@ -101,7 +101,7 @@ try langsplat train --preset g
 """
 
 
-def test_bash_completes_commands_options_and_choices(capsys):
+def test_bash_completes_and_doctor_names_what_there_is(capsys):
     with pytest.raises(SystemExit) as stop:
         parse(["--tyro-print-completion", "bash"])
     assert not stop.value.code
@@ -109,9 +109,6 @@ def test_bash_completes_commands_options_and_choices(capsys):
     terminal = {**os.environ, "LC_ALL": "C.UTF-8", "PYTHONUTF8": "1"}  # of others tyro's scripts know nothing
     said = subprocess.check_output(["bash", "-c", COMPLETE], input=script, encoding="utf-8", env=terminal)
     assert said.splitlines() == ["query", "--max-relevancy-error", "good"]
-
-
-def test_doctor_names_opengl_and_encoder(capsys):
     Doctor().run()
     said = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
     assert said["langsplat"] == __version__
@@ -395,16 +392,24 @@ def test_a_signal_before_the_command_is_a_line(program: str, number: int, second
     assert len(lines) == 1 or ended == 0, lines
 
 
+CALLBACK = """import time; from ctypes import CFUNCTYPE, c_int
+        names = {"__name__": "numba.core.codegen"}
+        exec("import signal\\ndef call():\\n    signal.raise_signal(NUMBER)\\n    return 1", names)
+        CFUNCTYPE(c_int)(names["call"])()
+        while True: time.sleep(0.05)"""
+
+
 @ENDED
-def test_a_signal_during_an_import_ends_the_command(number: int, said: str, tmp_path: Path) -> None:
-    """As pycolmap, which makes another error of any, and torch, which swallows some."""
+@pytest.mark.parametrize("does", ["import heavy", CALLBACK])
+def test_a_signal_in_foreign_code_ends_the_command(number: int, said: str, does: str, tmp_path: Path) -> None:
+    """As pycolmap, which makes another error of any, torch, which swallows some, and LLVM, which drops it."""
     module = f"import os\ntry:\n    os.kill(os.getpid(), {int(number)})\nexcept BaseException:\n    pass\n"
     (tmp_path / "heavy.py").write_text(module)
     code = (
         "import signal, sys\nfrom langsplat_core.cli.run import main\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from dataclasses import dataclass\n@dataclass\nclass Imports:\n"
-        "    def run(self):\n        import heavy\n"
+        f"    def run(self):\n        {does.replace('NUMBER', str(int(number)))}\n"
         f"sys.path.append({str(tmp_path)!r})\nsys.exit(main('langsplat', Imports))\n"
     )
     words = [sys.executable, "-c", code]

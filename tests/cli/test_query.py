@@ -98,14 +98,11 @@ def test_broken_encoder_is_tried_once_and_where_needed(folder, monkeypatch, caps
     assert len(tried) == 1
 
 
-def test_commas_separate_phrases_and_exclusions_stay_one(folder, capsys):
+def test_commas_separate_phrases_and_a_camera_gives_many_pixels(folder, capsys):
     found = answers(capsys, "query", "a.ply", "mug, plant; mug or book, not book")
     assert [answer["phrase"] for answer in found] == ["mug", "plant", "mug or book, not book"]
     assert [answer["reading"] for answer in found] == [None, None, "(mug  or  book)  without  book"]
     assert lines(capsys, "query", "a.ply", "mug or plant")[1] == "  read as: mug  or  plant"
-
-
-def test_pixels_of_many_phrases_are_found_where_a_camera_is_named(folder, capsys):
     some = [" or ".join(names) for names in itertools.permutations(("mug", "book", "plant", "pair", "void"))]
     assert {answer["pixel"] for answer in answers(capsys, "query", "a.ply", *some)} == {None}
     together = answers(capsys, "query", "a.ply", *some, "--camera", "0")
@@ -188,13 +185,11 @@ def test_select_writes_a_thing_and_remove_its_complement(folder, capsys):
     assert not QueryEngine(rest, lambda name: FakeEncoder()).run("mug").found
 
 
-def test_select_takes_several_phrases(folder):
+def test_select_takes_several_phrases_and_one_instance(folder, capsys):
     for phrases, want in ((("mug", "book"), [1, 1, 0]), (("pair, not mug",), [0, 0, 1])):
         assert run("select", "a.ply", *phrases, "--out", "b.ply") == 0
         assert [count > 0.8 * PER_BLOB for count in blob_of(load_scene("b.ply"))] == [bool(k) for k in want]
-
-
-def test_select_takes_one_instance(folder, capsys):
+    assert capsys.readouterr()
     assert run("select", "a.ply", "pair", "--out", "all.ply", "--json") == 0
     answer = json.loads(capsys.readouterr().out)
     assert [thing["number"] for thing in answer["instances"]] == answer["taken"] == [1, 2]
@@ -238,7 +233,7 @@ def described(folder: Path) -> Path:
     return folder
 
 
-def test_outline_lists_wholes_with_their_parts(described, capsys):
+def test_outline_and_inventory_are_printed_as_text_and_json(described, capsys):
     words = ("describe", "named.ply", "--vocabulary", "list.txt", "--outline")
     said = lines(capsys, *words)
     assert {line.split(":")[0] for line in said[:3]} == {"mug", "book", "plant"}
@@ -249,10 +244,7 @@ def test_outline_lists_wholes_with_their_parts(described, capsys):
         assert sum(node["votes"]) == 0
         assert node["share"] == pytest.approx(1 / 3, abs=0.05)
         assert (np.diff(node["size"]) <= 0).all()
-
-
-def test_inventory_is_printed_as_table_and_json(described, capsys):
-    words = ("describe", "named.ply", "--vocabulary", "list.txt")
+    words = words[:-1]
     said = "\n".join(lines(capsys, *words))
     assert all(word in said for word in ("mug", "book", "plant", "sofa"))
     assert "wall" not in said
@@ -365,7 +357,21 @@ def test_words_taught_at_once_are_all_kept(described, into):
         (f"teach named.ply --name vase --at {MUG} --level subpart", "point at something else"),
         ("teach named.ply --name vase --remove", "'vase' was not taught here; taught words: none"),
         (f"teach blind.ply --name vase --at {MUG}", "no cameras"),
-        ("clean a.ply --out b.ply", "out is missing; is there an unknown option"),
+        ("inspect --jsn", "scene is missing; is there an unknown option"),
+        ("convert a.ply out.txt", "scenes are written as"),
+        ("convert b.ply", "name what to read"),
+        ("convert missing.ply b.ply", "no such file"),
+        ("convert a.ply out --to nothing", "choose one of scene"),
+        ("convert a.ply a.ply", "would replace the original scene"),
+        ("transform a.ply a.ply", "would replace"),
+        ("clean a.ply a.ply", "would replace"),
+        ("crop a.ply a.ply --box -9 -9 -9 9 9 9", "would replace"),
+        ("transform a.ply b.ply --scale 0", "must be above 0"),
+        ("transform a.ply b.ply --rotate x inf", "about no direction"),
+        ("transform a.ply b.ply --matrix 1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1", "mirrors"),
+        ("transform a.ply b.ply --move 1e11 0 0", "move by less"),
+        ("crop a.ply b.ply", "Missing"),
+        ("crop a.ply b.ply --box 100 0 0 101 1 1", "langsplat inspect a.ply"),
         (f"teach named.ply --name vase --at {MUG} --into words.json", "written as .safetensors"),
         (f"teach named.ply --name vase --at {MUG} --into junk.safetensors", "not a whole safetensors file"),
         (f"teach named.ply --name vase --at {MUG} --into named.langsplat.safetensors", "not of taught words"),

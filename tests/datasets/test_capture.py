@@ -32,6 +32,7 @@ from tests.support.photographs import (
     write_photos,
     write_picture,
 )
+from tests.support.scenes import random_camera
 
 
 def captured(error: float = 0.0) -> Capture:
@@ -39,8 +40,8 @@ def captured(error: float = 0.0) -> Capture:
     rng, noise = np.random.default_rng(1), np.random.default_rng(2)
     cameras = []
     for number in range(3):
-        pose = np.eye(4)
-        pose[:3] += 0.1 * rng.normal(size=(3, 4)) + error * noise.uniform(-1, 1, (3, 4))
+        pose = random_camera(number).world_to_camera.copy()
+        pose[:3] += error * noise.uniform(-1, 1, (3, 4))
         cameras.append(Camera(4, 3, 5.0, 5.0, 2.0, 1.5, pose, f"view_{number}"))
     points = rng.normal(size=(10, 3)) + error * noise.uniform(-1, 1, (10, 3))
     images = tuple(rng.integers(0, 256, (3, 4, 3), dtype=np.uint8) for _ in cameras)

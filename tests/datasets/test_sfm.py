@@ -477,7 +477,7 @@ def test_two_captures_in_one_folder_are_told_apart(
 
 def test_no_feature_is_sought_where_a_mask_is_black(tmp_path: Path) -> None:
     photos, work = tmp_path / "photos", tmp_path / "work"
-    write_photos(photos, LENS.regridded(240, 180), poses(3))
+    write_photos(photos, LENS.resized(240, 180), poses(3))
     left = np.zeros((90, 120), bool)
     left[:, :60] = True
     mask_file(photos / "masks/view_1.png.png", left)

@@ -3,6 +3,7 @@ the basis of answers; and relevancy, by whatever the codec allows, against its d
 
 import math
 import multiprocessing
+import pickle
 import threading
 import time
 import tracemalloc
@@ -125,6 +126,14 @@ def test_encoder_is_loaded_once_when_needed(encoder_id, asked_for):
     assert engine.unknown_words("red mug") == ("red",)
     assert loaded == [asked_for]
     assert told[1:] == ["loading the text encoder", "searching 'Plant'", "searching 'mug'"]
+
+
+def test_answers_reach_other_processes_and_say_where_in_the_world():
+    scene = replace(blob_scene(), origin=np.array([5e5, 5.4e6, 0]))
+    answer = QueryEngine(scene, FakeEncoder()).run("mug")  # what loads an encoder, or one
+    again = pickle.loads(pickle.dumps(answer))
+    np.testing.assert_array_equal(again.members, answer.members)
+    assert repr(answer).endswith(f"near {scene.in_world(answer.place)}>")
 
 
 def test_peak_pixel_is_the_middle_one_of_equal_means():

@@ -231,8 +231,9 @@ def test_backends_that_cannot_draw_or_lift_are_refused():
         render(Scene(G), CAMERA, backend="vulkan")
     with pytest.raises(ValueError, match=r"values: expected shape \(N, C\) with {'N': 80}"):
         render(Scene(G), CAMERA, random_values(160, 2))
-    with pytest.raises(BackendError, match="--backend cpu"):
-        render(Scene(G), CAMERA, backend="cuda")
+    for backend in ("cuda", "opengl"):  # which needs a device handed to it
+        with pytest.raises(BackendError, match="--backend cpu"):
+            render(Scene(G), CAMERA, backend=backend)
     assert load_lifting_rasterizer("auto").name == "cpu"
     for name, message in (("opengl", "cannot lift"), ("vulkan", "choose one of")):
         with pytest.raises(InputError, match=message):

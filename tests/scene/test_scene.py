@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from langsplat_core import render
+from langsplat_core import look_at, render
 from langsplat_core.arrays import logit, psnr, sigmoid, unit
 from langsplat_core.config import INRIA
 from langsplat_core.errors import InputError
@@ -46,7 +46,6 @@ def test_a_camera_frames_any_scene(offset: float) -> None:
     gaussians = random_gaussians(20)
     scene = Scene(replace(gaussians, means=gaussians.means + np.float32(offset)))
     camera = scene.framing_camera((64, 48))
-    assert np.isfinite(camera.world_to_camera).all()
     np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-6)
 
 
@@ -93,6 +92,21 @@ def test_spiral_cameras_surround_the_scene():
         np.testing.assert_allclose(pixels[0], (32, 24), atol=1e-6)
 
 
+def test_cameras_are_rigid_and_of_whole_pixels():
+    camera = random_camera(4, 60, 40)
+    pose = camera.world_to_camera
+    for wrong in (pose * [[2], [2], [2], [1]], pose * [[-1], [1], [1], [1]], pose.T, np.ones((4, 4))):
+        with pytest.raises(ValueError, match="scaled, mirrored or transposed"):
+            replace(camera, world_to_camera=wrong)
+    with pytest.raises(ValueError, match="must be whole"):
+        replace(camera, width=60.5)
+    with pytest.raises(ValueError, match="looks at itself"):
+        look_at(np.ones(3), np.ones(3), np.array([0, 0, 1.0]), (60, 40))
+    sized = replace(camera, width=np.uint8(60), height=40.0)
+    assert (type(sized.width), sized.width, type(sized.height), sized.height) == (int, 60, int, 40)
+    assert camera not in (replace(camera), sized)
+
+
 # What cameras project, and where that came from.
 
 
@@ -102,18 +116,13 @@ def off_centre(orthographic: bool) -> Camera:
 
 
 @pytest.mark.parametrize("orthographic", [False, True])
-def test_unprojecting_inverts_projecting(orthographic: bool) -> None:
+def test_unprojecting_inverts_projecting_along_rays(orthographic: bool) -> None:
+    """By hand, in float64: x right, y down, z forward, the first pixel's centre at 0.5."""
     camera, points = off_centre(orthographic), np.random.default_rng(0).normal(size=(4, 5, 3))
     pixels, depths = camera.project(points.reshape(-1, 3))
     back = camera.unproject(pixels.reshape(4, 5, 2), depths.reshape(4, 5))
     np.testing.assert_allclose(back, points, atol=1e-12)
     np.testing.assert_allclose(camera.unproject(pixels[3], depths[3]), points[0, 3], atol=1e-12)
-
-
-@pytest.mark.parametrize("orthographic", [False, True])
-def test_a_pixel_unprojects_along_its_ray(orthographic: bool) -> None:
-    """By hand, in float64: x right, y down, z forward, the first pixel's centre at 0.5."""
-    camera = off_centre(orthographic)
     right, down, forward = camera.rotation
     points = camera.unproject(camera.pixel_centres(), np.float32(2.5))
     assert points.shape == (40, 60, 3)

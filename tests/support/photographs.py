@@ -96,7 +96,7 @@ def sensor_picture(intrinsics: PhotoIntrinsics, pose: bytes) -> Image.Image:
 
     `pose` holds the bytes of a float64 world-to-camera matrix.
     """
-    fine = intrinsics.regridded(3 * intrinsics.width, 3 * intrinsics.height)
+    fine = intrinsics.resized(3 * intrinsics.width, 3 * intrinsics.height)
     return Image.fromarray(photograph(fine, np.frombuffer(pose).reshape(4, 4))).reduce(3)
 
 

@@ -249,7 +249,7 @@ class RenderRequest:
         """Return the request by another camera of the image's size, which is fitted into each pane."""
         pane = self.split.pane_size(self.size)
         if pane != (camera.width, camera.height):
-            camera = camera.with_intrinsics(camera.intrinsics.fitted(*pane))
+            camera = camera.fitted(*pane)
         return replace(self, camera=camera)
 
     def reduced(self, scale: float, merged: Merged | None = None) -> "RenderRequest":
