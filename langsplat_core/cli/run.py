@@ -76,6 +76,8 @@ def one_line(box: str) -> str:
     words = " ".join(" ".join(said).split()) or title.strip(" ╭╮─").lower()
     hint = r"\1 is missing; is there an unknown option, or a file '-NAME' in place of './-NAME'?"
     words = re.sub(r"Missing value for argument 'command\.(\w+)'.*", hint, words)
+    optional = r"Error parsing (\S+): no type .*?\|(.*?) could be instantiated from (\[.*?\])\. Got.*"
+    words = re.sub(optional, r"\1: expected \2, got \3", words)
     return f"{words or 'unusable arguments'} (see --help)"
 
 

@@ -341,6 +341,7 @@ def test_words_taught_at_once_are_all_kept(described, into):
         ("select a.ply mug --out a.ply", "would replace the original"),
         ("select a.ply mug --out there/b.ply", "there: no such folder for b.ply"),
         ("scale a.ply --metres 1", "belong together"),
+        ("scale a.ply --metres x", "langsplat: --metres: expected FLOAT, got ['x'] (see --help)"),
         ("scale a.ply --metres 1 --between 0 0 0 0 0 0", "must be above 0"),
         ("scale a.ply --metres 1 --between 0 0 0 1 0 0 --metres-per-unit 1", "give either"),
         ("select plain.ply mug", "no language field (NAME.langsplat.safetensors) lies beside it"),
