@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -145,7 +146,12 @@ def begin_at_the_start_page(s: Any) -> None:
     s.menu("File", "Start page")
     assert not s.ctx.item_exists("//start/2/###card")  # after the bundled scene and the one that is there
     assert s.drawn == 0
+    warm = Event()
+    begun = replace(s.viewer.services, warm_up=lambda *given: given[2]("compiling", 0.5) or warm.wait(60))
+    s.viewer.services = begun
     s.click("//start/1/###card", frames=5)
+    s.wait(lambda: s.ctx.item_exists("//start/compiling ..."))
+    warm.set()
     s.until(lambda: s.state.path == blobs)
     assert not s.state.show_start
     assert s.ctx.item_exists("//**/##phrase")

@@ -70,7 +70,7 @@ def test_canvas_draws_only_changes_and_is_then_still(gl, shown):
     assert (on_screen(canvas)[0] == (255, 0, 0)).all()
 
 
-def test_canvas_draws_each_edit_once(gl, shown):
+def test_canvas_draws_each_edit_once_and_keeps_few_textures(gl, shown):
     renderer = FakeRenderer()
     canvas, everything = Canvas(gl, renderer), np.ones(360, bool)
     for hidden, count in ((np.arange(360) < 100, 260), (everything, 0), (~everything, 360)):
@@ -85,9 +85,6 @@ def test_canvas_draws_each_edit_once(gl, shown):
     put_marks(shown, deleted=everything)
     canvas.update(shown.state, 9.0)
     assert "hidden or deleted: show what is hidden (U), or undo (Ctrl+Z)" in shown.state.nothing
-
-
-def test_canvas_keeps_few_textures(gl, shown):
     canvas, seen = Canvas(gl, FakeRenderer()), []
     for width in range(20, 40):
         settings.resize(shown, width, 20)

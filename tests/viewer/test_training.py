@@ -140,7 +140,7 @@ def test_folder_without_photographs_is_refused(viewer, tmp_path, monkeypatch, da
     assert viewer.training is None
 
 
-def test_training_command_is_parsed_by_the_program():
+def test_training_command_is_parsed_and_what_it_says_is_heard():
     words = command(TrainingForm("photos", "trained.ply", "s.ply", "demo", "quick"))
     assert words[1:3] == ["-m", "langsplat_core"]
     parsed = parse(words[3:])
@@ -148,9 +148,6 @@ def test_training_command_is_parsed_by_the_program():
     assert (parsed.config.radiance.steps, parsed.config.clip.model) == (500, "demo")
     assert parsed.config.radiance.checkpoint_every == PREVIEW_EVERY
     assert parsed.gaussians == Path("trained.ply")
-
-
-def test_other_output_is_kept_as_words_and_metrics_once_per_report():
     progress = ProcessProgress()
     for line in ("plain words\n", '{"stage": 3}', '"text"', "", "[1]", '{"stage": "a", "fraction": 0.5}'):
         progress.hear(line)

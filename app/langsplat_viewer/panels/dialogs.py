@@ -83,8 +83,8 @@ class StartPage:
                 if _card(path, None if image is None else picture.texture(image), card):
                     opening.open_file(viewer, path)
         imgui.dummy(ImVec2(0, hello_imgui.em_size(0.4)))
-        reading, text = viewer.state.opening, "Drop a scene, a project or a folder of photographs here"
-        text = f"Opening {reading.name} ..." if reading else text
+        work, text = viewer.worker.current, "Drop a scene, a project or a folder of photographs here"
+        text = f"{work[0]} ..." if viewer.state.opening and work else text
         with ui.disabled(True):  # files are taken all over the window
             imgui.button(text, ImVec2(width, hello_imgui.em_size(DROP_EM)))
         imgui.end()

@@ -227,7 +227,8 @@ def draw_over(
     free = _float_search(viewer, area, menus.draw_toolbar(viewer, area))
     state, said = viewer.state, viewer.state.nothing  # in place of an image
     if state.scene is None and not state.show_start:
-        said = f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or press Ctrl+O"
+        work = viewer.worker.current  # which may compile for half a minute
+        said = f"{work[0]} ..." if state.opening and work else "Drop a scene here, or press Ctrl+O"
     if said:
         overlays.say(said, free)
     elif not state.show_start:
