@@ -427,7 +427,6 @@ def say_what_is_not_here(s: Any) -> None:
     assert right.active
     s.key("F")  # the plant, from which no mug is seen
     assert "nothing of the scene" in viewer.beside.state.nothing
-    assert left.active
     assert not right.active
     s.open_panel("Search")
     card, said = map(imgui.internal.find_window_by_name, ("Search", "side, right"))

@@ -491,12 +491,23 @@ def test_a_video_has_the_images_at_their_rate(program, folder):
     assert [path.name for path in folder.iterdir() if path.suffix == ".mp4"] == ["a.mp4"]
 
 
-def test_a_video_that_cannot_be_written_is_one_line(folder):
+def test_what_cannot_be_written_is_one_line_and_leaves_the_earlier_film(folder):
     (folder / "a.mp4").write_bytes(b"old")
     with pytest.raises(InputError, match=r"a\.mp4: no video .*; use --out folder/"):
         write_film(folder / "a.mp4", 2, 4.0, lambda number: np.zeros((25, 33, 3), np.uint8))
     assert (folder / "a.mp4").read_bytes() == b"old"
     assert not [path for path in folder.iterdir() if path.name.startswith(".a")]
+    out = folder / "film"
+    write_film(out, 2, 2.0, lambda number: np.zeros((3, 4, 3), np.uint8))
+
+    def fails(number: int) -> np.ndarray:
+        raise InputError("nothing to draw")
+
+    with pytest.raises(InputError):
+        write_film(out, 1, 2.0, fails)
+    assert len(list(out.glob("frame-*.png"))) == 2
+    write_film(out, 1, 2.0, lambda number: np.zeros((3, 4, 3), np.uint8))
+    assert len(list(out.glob("frame-*.png"))) == 1
 
 
 def test_film_of_nothing_is_refused(folder):
@@ -531,16 +542,3 @@ def test_impossible_options_are_one_line(program, folder, arguments, reason):
     assert (code, out, len(err)) == (2, [], 1)
     assert reason in err[0]
     assert sorted(folder.rglob("*")) == before
-
-
-def test_failed_film_leaves_the_earlier_one_in_its_folder(tmp_path):
-    write_film(tmp_path, 2, 2.0, lambda number: np.zeros((3, 4, 3), np.uint8))
-
-    def fails(number: int) -> np.ndarray:
-        raise InputError("nothing to draw")
-
-    with pytest.raises(InputError):
-        write_film(tmp_path, 1, 2.0, fails)
-    assert len(list(tmp_path.glob("frame-*.png"))) == 2
-    write_film(tmp_path, 1, 2.0, lambda number: np.zeros((3, 4, 3), np.uint8))
-    assert len(list(tmp_path.glob("frame-*.png"))) == 1

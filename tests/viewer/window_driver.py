@@ -391,6 +391,10 @@ def without_field(s: Session) -> None:
     assert s.ctx.item_exists("//**/##Gaussians")
     s.key("4", frames=1)  # relevancy: refused with a line, not a crash
     assert s.state.session.picture.display == "rgb"
+    s.ctx.mouse_move_to_pos(s.on_screen(BOOK))
+    s.ctx.mouse_click(1)
+    s.ctx.yield_(3)
+    assert not s.ctx.item_exists("//**/##name this")  # nor anything else of which each would be refused
 
     s.drop("truncated.ply")
     assert s.state.messages[-1].is_error

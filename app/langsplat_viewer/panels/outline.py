@@ -131,7 +131,7 @@ class ThingsMenu:
             mouse = imgui.get_io().mouse_pos
             place = area.fraction(mouse.x, mouse.y)
             self._at = None if viewer.surface is None else viewer.surface.point_at(*place)
-            if self._at is not None and viewer.engine is not None:
+            if self._at is not None and viewer.searchable() is not None:
                 imgui.open_popup(MENU)
         if imgui.begin_popup(MENU):
             _things_menu(viewer, self._at)
