@@ -594,6 +594,9 @@ def large_letters(s: Any) -> None:
     assert not left.active
     assert legend.size.y > 1.5 * low
     assert card.pos.x + card.size.x <= legend.pos.x
+    settings.set_display(s.viewer, "latent")
+    s.until(lambda: s.state.outline is not None and len(s.state.outline.roots) > 0)
+    assert legend.size.y > 1.5 * low  # things and depth
 
 
 def use_the_outline(s: Any) -> None:

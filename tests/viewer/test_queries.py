@@ -203,7 +203,7 @@ def test_calibrated_scene_gives_probabilities(viewer, monkeypatch, logit, verdic
 # Thresholds of one's own.
 
 
-def test_threshold_is_set_and_reset(asked):
+def test_threshold_is_set_and_reset_and_the_histogram_counts_all(asked):
     automatic = result(asked)
     assert automatic.own_cut is None
     assert 0 < automatic.members.sum() < 360
@@ -218,6 +218,11 @@ def test_threshold_is_set_and_reset(asked):
     assert asked.state.panes() != key
     queries.set_cut(asked, "mug", None)
     assert result(asked) is automatic
+    low, high, counts = histogram(result(asked, 0))
+    even = result(asked, 0).even
+    assert (low, high) == (even.min(), max(even.max(), low + 1e-3))
+    assert len(counts) == BINS
+    assert np.expm1(counts.astype(np.float64)).sum() == pytest.approx(360, rel=1e-5)
 
 
 def test_threshold_is_one_step_and_outlives_the_level(asked):
@@ -234,14 +239,6 @@ def test_threshold_is_one_step_and_outlives_the_level(asked):
     np.testing.assert_array_equal(result(asked).members, automatic.members)
     editing.redo(asked)
     assert result(asked).own_cut == 0.62
-
-
-def test_relevancy_histogram_counts_every_gaussian(asked):
-    low, high, counts = histogram(result(asked, 0))
-    even = result(asked, 0).even
-    assert (low, high) == (even.min(), max(even.max(), low + 1e-3))
-    assert len(counts) == BINS
-    assert np.expm1(counts.astype(np.float64)).sum() == pytest.approx(360, rel=1e-5)
 
 
 # When the viewer loads the text encoder, and what it says if that fails.
