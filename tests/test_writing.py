@@ -30,7 +30,7 @@ from langsplat_core.pipeline.stages import kept
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
-from langsplat_viewer.output import Film, save_png, write_film
+from langsplat_viewer.output import save_png, write_film
 from langsplat_viewer.projects import (
     Bookmark,
     Project,
@@ -144,8 +144,7 @@ EARLIER = b"what was there before"
 def film(name: str) -> Write:
     def write(folder: Path) -> None:
         noise = np.random.default_rng(0)
-        settings = Film(folder / name, 3, (32, 24), 4.0)
-        write_film(settings, lambda _: noise.integers(0, 255, (24, 32, 3), dtype=np.uint8))
+        write_film(folder / name, 3, 4.0, lambda _: noise.integers(0, 255, (24, 32, 3), dtype=np.uint8))
 
     return write
 
