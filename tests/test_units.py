@@ -226,7 +226,7 @@ def window(case: Case) -> Found:
     scene, extent = case.scene, extent_of(case.scene)
     view = default_view(scene, extent, (160, 120))
     camera, close = view.camera(160, 120), replace(view, distance=0.1 * view.distance).camera(160, 120)
-    grid = ground_grid(extent, extent.up, scene.metres_per_unit, scene.origin)
+    lines, _ = ground_grid(extent, extent.up, scene.metres_per_unit, scene.origin)
     flight = Flight(
         tuple(
             Keyframe(2.0 * at, pose_of(from_camera(one, extent))) for at, one in enumerate(scene.cameras[:3])
@@ -248,8 +248,8 @@ def window(case: Case) -> Found:
         "radius": Length([extent.radius, extent.farthest]),
         "everything": Length(frame_all(view, extent, (160, 120)).distance),
         "clicked": Places(clicked(scene, camera)),
-        "lines": Near(len(grid.segments), 2.01),
-        "ground": Length((extent.centre - grid.segments.mean((0, 1))) @ extent.up),
+        "lines": Near(len(lines), 2.01),
+        "ground": Length((extent.centre - lines.mean((0, 1))) @ extent.up),
         "flown": Places(fly(view, 0.1 * extent.radius, 0, 0.2 * extent.radius).eye),
     }
 

@@ -191,5 +191,6 @@ def _tensor(array: Array) -> Any:
 def _save(content: Any, path: Path) -> None:
     import torch
 
-    with atomic_path(path) as temporary:
-        torch.save(content, temporary)
+    # Given a path, torch 2.8 says nothing of a full disk.
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        torch.save(content, file)
