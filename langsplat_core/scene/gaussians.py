@@ -47,7 +47,7 @@ class Gaussians:
             some = slice(None, None, len(self) // 4096 + 1)
             step = np.spacing(np.median(np.abs(self.means[some]).max(1)))
             if step > np.exp(np.median(self.log_scales[some].max(1))):
-                report_loss("positions as far from zero are rounded to %g units: give Scene an origin", step)
+                report_loss("positions so far from zero are rounded to %g units: give Scene an origin", step)
 
     def __len__(self) -> int:
         return len(self.means)

@@ -86,7 +86,8 @@ def summary(outcomes: list[Outcome], head: str) -> str:
     ]
     lines += ["", "| section | seconds | outcome |", "|---|---|---|"]
     for outcome in outcomes:
-        name = f"[{outcome.name}]({outcome.name}.md)" if outcome.state == "ran" else outcome.name
+        has_page = outcome.state == "ran" and outcome.name != "environment"  # which is the head of each page
+        name = f"[{outcome.name}]({outcome.name}.md)" if has_page else outcome.name
         lines.append(f"| {name} | {outcome.seconds:.0f} | {outcome.state} |")
     for outcome in outcomes:
         if outcome.failed:

@@ -231,7 +231,7 @@ def same_reading(tab: Tab, engine: QueryEngine, phrases: str) -> None:
         assert count <= found["members"] <= 1.12 * count, phrase
 
 
-def test_several_phrases_are_answered_side_by_side_and_boxes_go_with_them(browser: Any, thin: Path) -> None:
+def test_several_phrases_are_answered_side_by_side(browser: Any, thin: Path) -> None:
     with open_tab(browser, thin) as tab:
         lines = {"teddy bear, banana; candle": 3, "candle and teapot": 1, "red and blue ball": 1}
         for line, count in lines.items():

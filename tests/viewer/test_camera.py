@@ -111,7 +111,7 @@ def test_turning_stops_before_the_pole_and_looking_keeps_the_eye(view):
     assert pixel(controls.look(view, 0, 0.1), view.target)[1] < SIZE[1] / 2 - 1
 
 
-def test_from_camera_is_the_photograph_to_the_pixel_with_a_target_ahead():
+def test_from_camera_is_the_photograph_to_the_pixel():
     camera = random_camera(3)  # principal point off centre, fx differs from fy
     extent = controls.extent_of(Scene(random_gaussians(50)))
     same = controls.from_camera(camera, extent).camera(camera.width, camera.height)

@@ -491,7 +491,7 @@ def test_a_video_has_the_images_at_their_rate(program, folder):
     assert [path.name for path in folder.iterdir() if path.suffix == ".mp4"] == ["a.mp4"]
 
 
-def test_what_cannot_be_written_is_one_line_and_leaves_the_earlier_film(folder):
+def test_unwritable_films_leave_the_earlier_one(folder):
     (folder / "a.mp4").write_bytes(b"old")
     with pytest.raises(InputError, match=r"a\.mp4: no video .*; use --out folder/"):
         write_film(folder / "a.mp4", 2, 4.0, lambda number: np.zeros((25, 33, 3), np.uint8))

@@ -102,7 +102,7 @@ class Door:
         return list(self._scenes)
 
     def find(self, phrase: str, scene: str = "") -> dict[str, Any]:
-        """Where something is: a phrase such as 'blue gift', 'lid of the teapot' or 'duck on the table'.
+        """Find where something is: a phrase such as 'blue gift', 'lid of the teapot' or 'duck on the table'.
 
         The verdict is 'found', 'weak match' or 'not here'; place is the middle of the best one, box its
         corners.
@@ -124,7 +124,7 @@ class Door:
         }
 
     def count(self, phrase: str, scene: str = "") -> dict[str, Any]:
-        """How many there are of something, with the least and most there may be; 0 where it is not found."""
+        """Count what a phrase names, with the least and most there may be; 0 where it is not found."""
         engine = self.engine(scene)
         answer = run_phrase(engine, phrase, viewpoint=_first(engine.scene)).answer
         number = count_things(engine, answer) if answer.found else None
@@ -132,7 +132,7 @@ class Door:
         return dict(zip(("count", "least", "most"), counts, strict=True)) | {"verdict": answer.verdict}
 
     def distance(self, first: str, second: str, scene: str = "") -> dict[str, Any]:
-        """How far apart the nearest points of two things are, each named by a phrase."""
+        """Measure how far apart the nearest points of two things are, each named by a phrase."""
         engine = self.engine(scene)
         frame, unit = upright(engine.scene.up()), _unit(engine.scene)
         bodies = []

@@ -56,8 +56,8 @@ class Rows(NamedTuple):
 class Projection(NamedTuple):
     """Gaussians projected onto the image plane, as `project` returns them."""
 
-    geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; only where drawn
-    depths: Array  # (N,) float64 camera z; only where drawn
+    geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; means something only where drawn
+    depths: Array  # (N,) float64 camera z; means something only where drawn
     drawn: Array  # (M,) int32 rising rows of those that are drawn
 
 
