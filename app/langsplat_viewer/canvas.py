@@ -91,7 +91,7 @@ class Canvas:
             self._pose, self._moved = pose, now if before[0] is not None else self._moved
         moving = now - self._moved < REST_SECONDS
         request = state.request().without_line()
-        self._resolution.expect(len(state.scene.gaussians))
+        self._resolution.count = max(len(state.scene.gaussians), 1)
         if moving:
             self._background.drop()
             self._follow(state, request)
@@ -277,13 +277,9 @@ class AdaptiveResolution:
     def __init__(self, budget: float = MOVING_BUDGET) -> None:
         """`budget` in milliseconds of an image."""
         self._budget = budget
-        self._count = 1  # Gaussians
+        self.count = 1  # Gaussians of the next images
         self._each = 4e-4  # milliseconds of a full image for each Gaussian; a guess before one was drawn
         self._shares: dict[Detail, float] = {}  # of the full image's time, measured
-
-    def expect(self, count: int) -> None:
-        """Take `count` Gaussians as those of the next images."""
-        self._count = max(count, 1)
 
     @property
     def is_slow(self) -> bool:
@@ -292,7 +288,7 @@ class AdaptiveResolution:
 
     def is_quick(self, detail: Detail) -> bool:
         """Return whether an image is expected within the budget."""
-        return self._each * self._count * self._share(detail) <= self._budget
+        return self._each * self.count * self._share(detail) <= self._budget
 
     def finest(self, levels: tuple[Detail, ...]) -> Detail:
         """Return the first of `levels` that is expected within the budget, else the last one."""
@@ -301,11 +297,11 @@ class AdaptiveResolution:
     def drew(self, detail: Detail, milliseconds: float) -> None:
         """Learn from the time of an image."""
         if detail == FULL:
-            self._each = milliseconds / self._count
+            self._each = milliseconds / self.count
             # Coarse ones are held to be a little faster with every full image, so that better is tried again.
             self._shares = {other: 0.8 * share for other, share in self._shares.items()}
         elif self._each > 0:
-            self._shares[detail] = (self._share(detail) + milliseconds / (self._each * self._count)) / 2
+            self._shares[detail] = (self._share(detail) + milliseconds / (self._each * self.count)) / 2
 
     def _share(self, detail: Detail) -> float:
         """Return the time as a share of a full image's; guessed, a quarter where four are drawn as one."""

@@ -125,14 +125,7 @@ OVERLAY_TITLES: dict[Overlay, str] = {
     "cube": "axes",
     "grid": "ground grid",
 }
-SIDE_KEYS: tuple[tuple[Side, str], ...] = (
-    ("front", "Keypad1"),
-    ("back", "Ctrl+Keypad1"),
-    ("right", "Keypad3"),
-    ("left", "Ctrl+Keypad3"),
-    ("top", "Keypad7"),
-    ("bottom", "Ctrl+Keypad7"),
-)
+SIDES: tuple[tuple[int, Side, Side], ...] = ((1, "front", "back"), (3, "right", "left"), (7, "top", "bottom"))
 PANEL_TITLES = (
     *("Search", "Display", "Camera", "Outline", "Selection", "Transform", "Record", "Bookmarks"),
     *("Notes", "Scene", "Train", "Timeline", "Messages"),
@@ -264,7 +257,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command(
             "align the up axis with the view", lambda v: viewpoint.move(v, adopt_up), (), "Align up axis"
         ),
-        *(_side(side, key) for side, key in SIDE_KEYS),
+        *chain(*((_side(one, f"Keypad{n}"), _side(other, f"Ctrl+Keypad{n}")) for n, one, other in SIDES)),
         Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
         Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True),
         Command("add a keyframe here", viewpoint.add_keyframe, ("K",), "Add keyframe"),

@@ -91,9 +91,7 @@ class Watch:
 
     def dismiss(self) -> None:
         """Count the files as read in their present state."""
-        with self._lock:
-            self._read = self._last
-            self.changed = False
+        self.begin(self._last)
 
     def close(self) -> None:
         self._closed.set()

@@ -59,17 +59,11 @@ class ViewerCommand(ViewerOptions):
                 f"{path}: a project is opened in a window; name its scene, or leave out --headless"
             )
         if self.headless:
-            self._without_window(path)
-        else:
-            self._window(path)
-
-    def _without_window(self, path: Path) -> None:
-        check_options(self)
-        with TerminalProgress() if sys.stderr.isatty() else nullcontext(silent) as progress:
-            lines = draw(self, path, services(self.encoder), progress)
-        print("\n".join(lines))
-
-    def _window(self, path: Path) -> None:
+            check_options(self)
+            with TerminalProgress() if sys.stderr.isatty() else nullcontext(silent) as progress:
+                lines = draw(self, path, services(self.encoder), progress)
+            print("\n".join(lines))
+            return
         if self.beside is not None:
             scene_path(self.beside)
         from langsplat_viewer.window import open_window

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -166,18 +166,18 @@ class Hover:
     phrases: tuple[str, ...] = ()  # whose relevancies it has
 
 
+in_train = partial(widget, "Train")
+
+
 @dataclass(frozen=True)
 class TrainingForm:
     """Fields of the panel that trains scenes."""
 
-    dataset: Annotated[str, widget("Train", "Photographs", "a folder, a COLMAP project, transforms.json")] = (
-        ""
-    )
-    gaussians: Annotated[
-        str, widget("Train", "Gaussians", "a trained scene; empty: they are trained, too")
-    ] = ""  # of the scene that gets a language field
-    out: Annotated[str, widget("Train", "Scene", "scene.ply")] = ""
-    encoder: Annotated[str, widget("Train", "Encoder", '"demo", or a folder or hub id of CLIP')] = "demo"
+    dataset: Annotated[str, in_train("Photographs", "a folder, a COLMAP project, transforms.json")] = ""
+    # of the scene that gets a language field
+    gaussians: Annotated[str, in_train("Gaussians", "a trained scene; empty: they are trained, too")] = ""
+    out: Annotated[str, in_train("Scene", "scene.ply")] = ""
+    encoder: Annotated[str, in_train("Encoder", '"demo", or a folder or hub id of CLIP')] = "demo"
     preset: TrainPreset = "good"
 
 

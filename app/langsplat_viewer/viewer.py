@@ -277,6 +277,11 @@ class Viewer:
             return field
         return replace(field, taught=tuple(self.engine.taught.values()))
 
+    @property
+    def has_percentages(self) -> bool:
+        """True where probabilities were measured: others are not shown."""
+        return self.engine is not None and self.engine.basis.calibration is not None
+
     def describing(self, engine: QueryEngine, progress: Progress) -> Describer:
         """Return the describer of an engine, made once; on the worker only."""
         kept = self.describer

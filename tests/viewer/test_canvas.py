@@ -428,12 +428,12 @@ def test_measured_times_choose_the_level_of_detail(images, detail):
 
 def test_times_of_other_scenes_follow_from_their_size():
     resolution = AdaptiveResolution()
-    resolution.expect(1000)
+    resolution.count = 1000
     assert not resolution.is_slow
-    resolution.expect(1_000_000)  # guessed
+    resolution.count = 1_000_000  # guessed
     assert resolution.is_slow
     resolution.drew(FULL, 500)
-    resolution.expect(100_000)
+    resolution.count = 100_000
     assert resolution.finest(PLAIN) == HALF
-    resolution.expect(50_000)
+    resolution.count = 50_000
     assert resolution.finest(PLAIN) == FULL

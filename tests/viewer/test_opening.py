@@ -10,7 +10,7 @@ import pytest
 
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import editing, opening, queries, settings, viewpoint
+from langsplat_viewer.actions import opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.disk import completions
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
@@ -371,10 +371,20 @@ def test_second_scene_without_field_shows_colours_or_says_why(two):
     assert two.state.scene is not None
 
 
-def test_second_scene_closes_with_the_split(two):
-    settings.compare(two, "off")
-    opening.follow_beside(two)
-    assert two.beside is None
-    editing.undo(two)
-    opening.follow_beside(two)
-    assert two.state.session.split.mode == "off"
+@pytest.mark.parametrize("away", [(-90, 0, 0), (90, 0, 0)])
+def test_opening_view_shows_a_compared_scene_far_away(two, monkeypatch, away):
+    """Each scene on its side of the line; a near one leaves the opening view as it is."""
+    go(viewpoint.reset_view, two)
+    np.testing.assert_array_equal(two.state.view.eye, viewpoint.opening_view(two).eye)
+    blobs, state = SCENES["blobs.ply"], two.state
+    there = (blobs.gaussians.means + away).astype(np.float32)
+    monkeypatch.setitem(SCENES, "far.ply", replace(blobs, gaussians=replace(blobs.gaussians, means=there)))
+    opening.open_beside(two, Path("far.ply"))
+    meet(two)
+    for show in (viewpoint.reset_view, viewpoint.frame_scene):
+        go(show, two)
+        camera = state.view.camera(*state.size)
+        for means, is_right in ((blobs.gaussians.means, False), (there, True)):
+            pixels, depths = camera.project(means.astype(np.float64))
+            assert camera.in_image(pixels, depths).all()
+            assert ((pixels[:, 0] > camera.width / 2) == is_right).all()

@@ -17,7 +17,7 @@ from langsplat_viewer.actions.editing import take
 from langsplat_viewer.panels.search import BINS, hint, histogram
 from langsplat_viewer.program import answer_line
 from langsplat_viewer.session import Query, Things
-from langsplat_viewer.viewer import Services
+from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, calibrated_for, language
 from tests.support.scenes import with_tree
 from tests.support.windowless import (
@@ -303,7 +303,7 @@ def nodes(outlined) -> list[int]:
     return [row_of(outlined, word).node for word in ("mug", "book", "plant")]
 
 
-def test_outline_row_is_named_and_selects_its_thing(outlined):
+def test_outline_row_is_named_and_selects_its_thing(outlined, monkeypatch):
     before = outlined.state.view
     for word, centre in zip(("mug", "book", "plant"), CENTRES, strict=True):
         row = row_of(outlined, word)
@@ -314,6 +314,11 @@ def test_outline_row_is_named_and_selects_its_thing(outlined):
         assert outlined.state.glide.end.distance < before.distance
         np.testing.assert_allclose(outlined.state.glide.end.target, centre, atol=0.2)
     assert sum(row.count for row in outlined.state.outline.roots) == 360
+    assert outline.sure_of(outlined, row) == (False, "?")  # however probable: nothing is calibrated
+    monkeypatch.setattr(Viewer, "has_percentages", True)
+    for probability, said in ((0.94, (True, " 94 %")), (0.5, (False, "? 50 %"))):
+        likely = replace(row.word, probability=probability)
+        assert outline.sure_of(outlined, replace(row, word=likely)) == said
 
 
 def test_a_clicked_thing_is_selected_and_a_hidden_row_keeps_the_selection(outlined, nodes):
@@ -339,7 +344,7 @@ def test_a_clicked_thing_is_selected_and_a_hidden_row_keeps_the_selection(outlin
 def test_given_name_is_taught_and_filtered(outlined):
     mug = row_of(outlined, "mug")
     act(outline.give_name, outlined, mug.node, "  grandma's cup ")
-    assert outline.name_of(outlined, mug) == "grandma's cup"
+    assert (outline.name_of(outlined, mug), outline.sure_of(outlined, mug)) == ("grandma's cup", (True, ""))
     assert outlined.state.session.queries[-1].phrase == "grandma's cup"
     assert result(outlined, -1).found
     rows = list(outline.filtered(outlined, outlined.state.outline.roots, "CUP grand"))

@@ -395,8 +395,8 @@ def start_training(viewer: Viewer) -> None:
     if not typed or photographs == 0:
         viewer.say_error(f"no photographs in '{typed}'; name a folder that has some")
         return
-    form = replace(form, dataset=str(dataset), out=str(out), encoder=form.encoder.strip() or "demo")
-    form = replace(form, gaussians=form.gaussians.strip())
+    gaussians, encoder = form.gaussians.strip(), form.encoder.strip() or "demo"
+    form = replace(form, dataset=str(dataset), gaussians=gaussians, out=str(out), encoder=encoder)
     try:
         viewer.training = Training(form, viewer.worker.wake)
     except OSError as error:

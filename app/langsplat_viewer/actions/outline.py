@@ -20,6 +20,7 @@ from langsplat_viewer.actions.viewpoint import focus_on
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
+SURE = 0.7  # probability of a name below which it is a question
 BACKGROUND = {"wall", "floor", "ground", "ceiling", "skirting", "rug", "carpet"}  # the last in the outline
 
 
@@ -71,6 +72,15 @@ def name_of(viewer: Viewer, row: Outline) -> str:
     """Return the name that was given to a row, else what it is likely to be."""
     given = viewer.state.session.things.names.get(row.node)
     return given or ("unknown" if row.word is None else row.word.phrase)
+
+
+def sure_of(viewer: Viewer, row: Outline) -> tuple[bool, str]:
+    """Return whether a row's name is to be relied on, and what is said of that behind it."""
+    if row.word is None or row.node in viewer.state.session.things.names:
+        return row.node in viewer.state.session.things.names, ""
+    is_sure = viewer.has_percentages and row.word.probability >= SURE
+    said = f" {100 * row.word.probability:.0f} %" if viewer.has_percentages else ""
+    return is_sure, said if is_sure else "?" + said
 
 
 def filtered(viewer: Viewer, rows: Iterable[Outline], text: str) -> Iterator[Outline]:

@@ -121,10 +121,8 @@ def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
         viewer.say_error("a path to save needs a keyframe: add one at the current view")
         return None
     path = _new_file(viewer.state, folder, PATHS)
-    more = "; langsplat-viewer --headless --path makes a film of it"
-    return viewer.save(
-        path, lambda: write_flight(path, flight_of(keyframes).moved(viewer.state.origin)), more
-    )
+    more, flight = "; langsplat-viewer --headless --path makes a film of it", flight_of(keyframes)
+    return viewer.save(path, lambda: write_flight(path, flight.moved(viewer.state.origin)), more)
 
 
 # Films, drawn by the CPU on a thread of their own.
@@ -142,12 +140,8 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
         if not typed:
             new = _new_file(viewer.state, folder, output.VIDEO if output.has_video() else "", "-film")
         out = output.check_film(new, record.size)
-        shot = output.Shot(
-            request,
-            output.cameras_of(flight_of(path), state.extent, record.fps, record.size),
-            record.fps,
-            "cpu",
-        )
+        seen_by = output.cameras_of(flight_of(path), state.extent, record.fps, record.size)
+        shot = output.Shot(request, seen_by, record.fps, "cpu")
     except (InputError, OSError) as error:
         viewer.say_error(f"no film: {error}")
         return

@@ -15,7 +15,7 @@ from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera import controls, flight
-from langsplat_viewer.camera.controls import Extent, OrbitCamera, Side
+from langsplat_viewer.camera.controls import Extent, OrbitCamera, Sample, Side
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.camera.overlays import FRUSTUM_DEPTH, frusta
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight
@@ -88,7 +88,7 @@ def opening_view(viewer: Viewer) -> OrbitCamera | None:
 
 
 def reset_view(viewer: Viewer) -> None:
-    """Return to the opening view, in the projection of now."""
+    """Return to the opening view, in the projection of now; to one of both scenes if it has one alone."""
     view, state = opening_view(viewer), viewer.state
     if view is None or state.scene is None or state.extent is None:
         return
@@ -96,14 +96,31 @@ def reset_view(viewer: Viewer) -> None:
         view = replace(view, orthographic=True)
         if state.opening_camera is None and not state.scene.cameras:
             view = controls.frame_all(view, state.extent, state.size)
+    other = _compared(viewer)
+    if other is not None:
+        camera = view.camera(*state.size)
+        if not camera.in_image(*camera.project(other.points)).any():
+            is_left = (other.points.mean(0) - state.extent.centre) @ view.rotation[0] < 0
+            view = controls.orbit(view, np.pi * is_left, 0)  # it is drawn right of the line
+            view = controls.frame_all(view, controls.joined(state.extent, other), state.size)
     glide_to(viewer, view)
 
 
+def _compared(viewer: Viewer) -> Sample | None:
+    """Return the sample of a scene that is compared, in the coordinates of the first."""
+    beside, origin = viewer.beside, viewer.state.origin
+    if beside is None or beside.state.extent is None:
+        return None
+    sample = beside.state.extent.sample
+    return replace(sample, points=sample.points + (beside.state.origin - origin))
+
+
 def frame_scene(viewer: Viewer) -> None:
-    """Show the whole scene, from the side that it is seen from now."""
-    state = viewer.state
+    """Show the whole scene, and one that is compared, from the side that it is seen from now."""
+    state, other = viewer.state, _compared(viewer)
     if state.view is not None and state.extent is not None:
-        glide_to(viewer, controls.frame_all(state.view, state.extent, state.size))
+        extent = state.extent if other is None else controls.joined(state.extent, other)
+        glide_to(viewer, controls.frame_all(state.view, extent, state.size))
 
 
 def look_from(viewer: Viewer, side: Side) -> None:

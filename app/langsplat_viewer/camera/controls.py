@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from langsplat_core.arrays import Array, quaternions, rotation_matrices, sigmoid
+from langsplat_core.arrays import Array, affine, quaternions, rotation_matrices, sigmoid
 from langsplat_core.scene import Camera, Gaussians, Intrinsics, Scene, look_at
 
 
@@ -158,9 +158,7 @@ class OrbitCamera:
 
     def camera(self, width: int, height: int) -> Camera:
         """Return the camera for an image of `width` x `height` pixels."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = self.rotation
-        matrix[:3, 3] = -self.rotation @ self.eye
+        matrix = affine(self.rotation, -self.rotation @ self.eye)
         inner = self.intrinsics.fitted(width, height)
         if self.orthographic:
             inner = narrowed(inner, 1 / self.distance)
@@ -315,7 +313,6 @@ class Extent:
     centre: Array  # (3,) robust middle, world units
     radius: float  # robust, world units, > 0
     up: Array  # (3,) unit
-    rotation: Array  # (3, 3) world to camera, of a view from a little above
     sample: Sample  # what a view of everything is fitted to
     farthest: float  # how far the camera may go back from what it turns around, world units
 
@@ -323,10 +320,15 @@ class Extent:
 def extent_of(scene: Scene) -> Extent:
     """Return the extent of a scene's Gaussians."""
     centre, radius = scene.bounds()
-    rotation = scene.framing_camera((1000, 1000), (centre, radius)).rotation
     sample = sample_of(scene.gaussians)
     farthest = FARTHEST * max(reach(sample, centre), radius)
-    return Extent(centre, radius, scene.up(), rotation, sample, farthest)
+    return Extent(centre, radius, scene.up(), sample, farthest)
+
+
+def joined(extent: Extent, other: Sample) -> Extent:
+    """Return an extent of which a view of everything shows another sample, too, whatever each weighs."""
+    weights = np.concatenate([each.weights / each.weights.sum() for each in (extent.sample, other)])
+    return replace(extent, sample=Sample(np.concatenate([extent.sample.points, other.points]), weights))
 
 
 def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
@@ -368,5 +370,6 @@ def default_view(scene: Scene, extent: Extent, size: tuple[int, int]) -> OrbitCa
     """Return the first training camera, else a view of the whole scene in a window of `size` pixels."""
     if scene.cameras:
         return from_camera(scene.cameras[0], extent)
-    anywhere = OrbitCamera(extent.rotation, extent.centre, extent.radius, extent.up, symmetric_intrinsics())
+    rotation = scene.framing_camera((1000, 1000), (extent.centre, extent.radius)).rotation  # from above
+    anywhere = OrbitCamera(rotation, extent.centre, extent.radius, extent.up, symmetric_intrinsics())
     return frame_all(anywhere, extent, size)

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 import scipy
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, affine
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import (
     Extent,
@@ -48,9 +48,7 @@ class Pose:
 
     def camera(self, width: int, height: int) -> Camera:
         """Return the pinhole camera of an image, its principal point centred; `camera_of` minds `span`."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = self.rotation
-        matrix[:3, 3] = -self.rotation @ self.position
+        matrix = affine(self.rotation, -self.rotation @ self.position)
         inner = symmetric_intrinsics(self.fov_degrees).fitted(width, height)
         return Camera(width, height, inner.fx, inner.fy, inner.cx, inner.cy, matrix)
 

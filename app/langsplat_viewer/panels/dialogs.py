@@ -132,9 +132,13 @@ class Toasts:
         if not self._shown and writes is None:
             return
         foot = ImVec2(area.left + area.width / 2, area.top + area.height - hello_imgui.em_size(2))
+        widest = min(hello_imgui.em_size(TOAST_EM), 0.8 * area.width)
+        for low, high in ui.floating_windows("legend", "left legend"):  # which are not to be covered
+            if low.x - widest / 2 < foot.x < high.x + widest / 2:
+                foot.y = min(foot.y, low.y - hello_imgui.em_size(0.5))
         flags = ui.FLOATS & ~imgui.WindowFlags_.no_bring_to_front_on_focus | imgui.WindowFlags_.no_nav
         with ui.floating("toasts", foot, ImVec2(0.5, 1), flags):
-            with imgui_ctx.push_text_wrap_pos(min(hello_imgui.em_size(TOAST_EM), 0.8 * area.width)):
+            with imgui_ctx.push_text_wrap_pos(widest):
                 for number, (message, _) in enumerate(self._shown):
                     with imgui_ctx.push_id(str(number)):
                         self._toast(viewer, message)

@@ -14,7 +14,6 @@ from langsplat_viewer.panels.overlays import beside_search, clicked, legend, par
 from langsplat_viewer.viewer import Viewer
 
 LEGEND_ROWS, LEGEND_EM = 8, 9.0
-SURE = 0.7  # probability of a name below which it is a question
 MENU = "menu of a thing"
 
 
@@ -42,14 +41,11 @@ def _row(viewer: Viewer, row: Outline) -> None:
         flags |= imgui.TreeNodeFlags_.span_avail_width | imgui.TreeNodeFlags_.no_tree_push_on_open
         flags |= imgui.TreeNodeFlags_.leaf if not row.parts else 0
         colour = outline.colour_of(viewer, row.node)
-        name, sure = outline.name_of(viewer, row), ""
-        named = row.node in viewer.state.session.things.names
-        if row.word and not named:
-            named = row.word.probability >= SURE
-            sure = f"{'' if named else '?'} {100 * row.word.probability:.0f} %"
+        name = outline.name_of(viewer, row)
+        named, said = outline.sure_of(viewer, row)
         taken = (1 if colour is None else 2) * (side + spacing)
         room = imgui.get_content_region_avail().x - taken - imgui.get_tree_node_to_label_spacing()
-        label = ui.elided(name + sure, room)
+        label = ui.elided(name + said, room)
         imgui.align_text_to_frame_padding()
         with theme.styled(text="ink" if named else "soft"):
             opened = imgui.tree_node_ex(f"{label}###row", flags)
@@ -162,9 +158,7 @@ def draw_legend(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
     state = viewer.state
     if state.session.picture.display not in ("latent", "tree") or state.session.split.columns > 1:
         return
-    view = outline.wanted(viewer)
-    if view is None or view.problem:
-        return
+    outline.wanted(viewer)  # is looked for, where it is not known yet
     seen: dict[str, tuple[float, float, float]] = {}
     for row in outline.in_view(viewer):
         colour = outline.colour_of(viewer, row.node)

@@ -60,12 +60,10 @@ def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Textur
 
 def below_search(part: ui.Area) -> ui.Area:
     """Return what of an area lies lower than the search, open or folded; all of it beside that."""
-    cards = map(imgui.internal.find_window_by_name, ("Search", "Folded search"))
-    card = next((card for card in cards if card and card.active), None)
-    if card is None or card.pos.x + card.size.x < part.left:
-        return part
-    top = card.pos.y + card.size.y
-    return replace(part, top=top, height=max(part.top + part.height - top, 1.0))
+    for _, card in ui.floating_windows("Search", "Folded search"):
+        if card.x >= part.left:
+            return replace(part, top=card.y, height=max(part.top + part.height - card.y, 1.0))
+    return part
 
 
 def parts_of(area: ui.Area, split: Split) -> list[ui.Area]:
@@ -351,10 +349,8 @@ def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
 
     A legend that has no room there, because of the search, is drawn with that of the next image.
     """
-    other, bars = (
-        viewer.beside,
-        list[Callable[[float], None]](),
-    )  # of this image, and of those before that had no room
+    other = viewer.beside
+    bars = list[Callable[[float], None]]()  # of this image, and of those before that had no room
     images = [(viewer, pane.row.drawing, "") for pane in viewer.state.panes()]
     if other is not None:
         sides = (viewer, ", left"), (other, ", right")
@@ -471,11 +467,10 @@ def draw_pointing(viewer: Viewer) -> None:
     if hover is None or hover.found is None or not imgui.begin_tooltip():
         return
     with imgui_ctx.push_text_wrap_pos(hello_imgui.em_size(24)):
-        sure = viewer.engine is not None and viewer.engine.basis.calibration is not None
         for name, words in zip(LEVELS, hover.found.words, strict=True):
             ui.coloured(name)
             imgui.same_line(hello_imgui.em_size(4.5))
-            imgui.text_unformatted(said(words, sure))
+            imgui.text_unformatted(said(words, viewer.has_percentages))
         for line in pointed_figures(hover, viewer.state.origin):
             ui.coloured(line)
     imgui.end_tooltip()

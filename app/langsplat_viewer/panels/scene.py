@@ -151,10 +151,8 @@ def _compared(viewer: Viewer) -> None:
     off, levels = (partial(settings.compare, mode=mode) for mode in ("off", "levels"))
     rows: list[tuple[str, bool, Callable[[Viewer], None]]] = [("nothing", False, off)]  # which need a field
     for button in BUTTONS:
-        beside = partial(
-            settings.compare, mode="wipe", second=button.display, latent_level=button.latent_level
-        )
-        rows.append((button.name, DISPLAYS[button.display].needs_field, beside))
+        wipe = partial(settings.compare, mode="wipe", second=button.display, latent_level=button.latent_level)
+        rows.append((button.name, DISPLAYS[button.display].needs_field, wipe))
     rows += [("three levels", True, levels), ("another scene ...", False, opening.ask_for_beside)]
     for label, needs_field, act in rows:
         with ui.disabled(needs_field and not state.has_field):

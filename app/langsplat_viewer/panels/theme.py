@@ -84,7 +84,7 @@ SIZES = {
 FLOATING = 14.0  # radius of what floats over the scene
 PILL = 99.0  # that of a button with round ends
 FONT_SIZE = 15.0
-FONT, BOLD = "fonts/Roboto/Roboto-Regular.ttf", "fonts/Roboto/Roboto-Bold.ttf"  # of imgui-bundle
+FONT = "fonts/Roboto/Roboto-Regular.ttf"  # of imgui-bundle
 
 
 def rgba(colour: str) -> tuple[float, float, float, float]:

@@ -76,9 +76,14 @@ def scene_area() -> Area:
 
 
 def lying_over(*names: str) -> Iterator[tuple[ImVec2, ImVec2]]:
-    """Yield the corners of the windows with these names, and of undocked panels, that are over the scene."""
+    """Return the corners of the windows with these names, and of undocked panels, that are over the scene."""
     docks = hello_imgui.get_runner_params().docking_params.dockable_windows
-    for window in map(imgui.internal.find_window_by_name, (*names, *(dock.label for dock in docks))):
+    return floating_windows(*names, *(dock.label for dock in docks))
+
+
+def floating_windows(*names: str) -> Iterator[tuple[ImVec2, ImVec2]]:
+    """Yield the corners of the windows with these names that are over the scene now."""
+    for window in map(imgui.internal.find_window_by_name, names):
         node = None if window is None else window.dock_node
         if window is not None and window.active and (node is None or node.is_floating_node()):
             yield window.pos, window.pos + window.size

@@ -53,6 +53,8 @@ from langsplat_viewer.rendering.request import (
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
 Channel = Array | Literal["depth"] | None  # of a pane: (N, 1 to 3) per Gaussian, camera z, or none
 L = TypeVar("L", Channels, moderngl.Texture)  # a layer
+# Fields of a `PictureConfig` that are uniforms of the shader.
+AS_IN_PICTURE = ("transparent", "own_colours", "heat_opacity", "dim", "threshold", "alpha_gate", "background")
 PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked
 
 
@@ -353,16 +355,10 @@ class GlRenderer(Renderer[moderngl.Texture]):
             "selection": 3,
             "has_selection": selected is not None,
             "colour_map": list(COLOUR_MAPS).index(picture.colour_map),
-            "transparent": picture.transparent,
             "display": int(drawing_of(picture.display, channel is not None)),
             "query_colours": QUERY_COLOURS.astype("f4").tobytes(),
             "ranges": full_ranges(_ranges(request, pane)).astype("f4").tobytes(),
-            "own_colours": picture.own_colours,
-            "heat_opacity": picture.heat_opacity,
-            "dim": picture.dim,
-            "threshold": picture.threshold,
-            "alpha_gate": picture.alpha_gate,
-            "background": picture.background,
+            **{name: getattr(picture, name) for name in AS_IN_PICTURE},
         }
         set_uniforms(self._program, uniforms)
         sources = layers.images[0], layers.of(channel), self._maps, layers.of(selected)
