@@ -143,6 +143,7 @@ ICONS = {  # by what a command does
     "return to the opening view": "HOUSE", "frame everything": "EXPAND",
     "focus on the latest result found": "CROSSHAIRS",
 }  # fmt: skip
+open_train = partial(settings.open_panel, title="Train")
 OTHER_THEME = {"dark": "light", "light": "dark"}
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
@@ -153,13 +154,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("reload the scene", opening.reload, ("F5",), apart=True),
         Command("next scene of the list", lambda v: opening.step_scene(v, 1), ("Ctrl+PageDown",)),
         Command("previous scene of the list", lambda v: opening.step_scene(v, -1), ("Ctrl+PageUp",)),
-        Command(
-            "train a scene",
-            lambda v: settings.open_panel(v, "Train"),
-            (),
-            "Train from photographs ...",
-            apart=True,
-        ),
+        Command("train a scene", open_train, (), "Train from photographs ...", apart=True),
         Command(
             "save the project",
             saving.save,

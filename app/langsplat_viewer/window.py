@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -296,7 +297,10 @@ class Window:
         self._ask(viewer)
         if options.beside is not None:
             opening.open_beside(viewer, options.beside)
-        settings.set_display(viewer, wanted.display, latent_level(options.level))
+        show = partial(settings.set_display, viewer, wanted.display, latent_level(options.level))
+        show()
+        if options.display != "auto":  # a first answer would be shown as heat
+            viewer.run("showing", lambda progress: None, lambda nothing: show())
 
     def drop(self, paths: list[str]) -> None:
         opening.open_dropped(self.viewer, [Path(path) for path in paths])
@@ -340,7 +344,7 @@ class Window:
         now = (news, seen, self.unfinished, viewer.watch.changed)
         self._frames = AWAKE_FRAMES if now != self._last else max(self._frames - 1, 0)
         self._last = now
-        awaits = any(canvas is not None and canvas.waits for canvas in self._canvases)  # and is woken
+        awaits = any(canvas.waits for canvas in self._canvases)  # and is woken
         busy = (
             (self.unfinished and not awaits)
             or state.glide is not None
@@ -356,15 +360,15 @@ class Window:
         idling.time_active_after_last_event = 0.0 if awaits else AWAKE_SECONDS
 
     @property
-    def _canvases(self) -> tuple[Canvas | None, ...]:
-        return self._canvas, self._second
+    def _canvases(self) -> list[Canvas]:
+        return [canvas for canvas in (self._canvas, self._second) if canvas is not None]
 
     @property
     def is_running(self) -> bool:
         """True while threads are at work that would keep the process."""
         workers = [self.viewer.worker, self.viewer.recorder]
         workers += [] if self.viewer.beside is None else [self.viewer.beside.worker]
-        draws = any(canvas is not None and canvas.is_running for canvas in self._canvases)
+        draws = any(canvas.is_running for canvas in self._canvases)
         return draws or any(worker.is_running for worker in workers)
 
     def is_minimised(self) -> bool:
@@ -427,8 +431,7 @@ class Window:
         self._keep_thumbnail((self.viewer.state.path, self.viewer.state.project))
         self.viewer.watch.close()
         for canvas in self._canvases:
-            if canvas is not None:
-                canvas.close()
+            canvas.close()
         if self.viewer.beside is not None:
             self.viewer.beside.worker.close()
         self.viewer.recorder.close(RECORDER_PATIENCE)

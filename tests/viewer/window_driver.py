@@ -400,7 +400,7 @@ def without_field(s: Session) -> None:
 def from_the_command_line(s: Session) -> None:
     assert [query.phrase for query in s.state.session.queries] == ["mug", "sofa", "plant"]
     assert [s.state.result(query) is not None for query in s.state.session.queries] == [True, False, True]
-    assert s.state.session.picture.display == "segmentation"
+    assert s.state.session.picture.display == "latent"
     assert s.state.session.level == "whole"
     expected = s.state.scene.cameras[2]
     np.testing.assert_allclose(s.state.view.eye, expected.position, atol=1e-9)
@@ -487,7 +487,7 @@ def look_at_nothing(s: Session) -> None:
 
 ASKED = {
     "query": ("mug", "sofa", "plant"),
-    "display": "segmentation",
+    "display": "latent",  # and not the heat of the answers
     "level": "whole",
     "camera": "2",
     "orthographic": 4.0,

@@ -42,10 +42,10 @@ def _row(viewer: Viewer, row: Outline) -> None:
         flags |= imgui.TreeNodeFlags_.leaf if not row.parts else 0
         colour = outline.colour_of(viewer, row.node)
         name = outline.name_of(viewer, row)
-        named, said = outline.sure_of(viewer, row)
+        named, sure = outline.sure_of(viewer, row)
         taken = (1 if colour is None else 2) * (side + spacing)
         room = imgui.get_content_region_avail().x - taken - imgui.get_tree_node_to_label_spacing()
-        label = ui.elided(name + said, room)
+        label = ui.elided(name + sure, room)
         imgui.align_text_to_frame_padding()
         with theme.styled(text="ink" if named else "soft"):
             opened = imgui.tree_node_ex(f"{label}###row", flags)
@@ -163,7 +163,8 @@ def draw_legend(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
     for row in outline.in_view(viewer):
         colour = outline.colour_of(viewer, row.node)
         if colour is not None:
-            seen.setdefault(outline.name_of(viewer, row).split(OR)[0], colour)
+            is_sure, name = outline.sure_of(viewer, row)[0], outline.name_of(viewer, row).split(OR)[0]
+            seen.setdefault(name if is_sure else f"{name}?", colour)
         if len(seen) == LEGEND_ROWS:
             break
     if not seen:
