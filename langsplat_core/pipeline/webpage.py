@@ -62,7 +62,7 @@ MODULES = ("words", "rule", "encoder", "camera", "space", "language", "data", "d
 BEGIN = "// [page]\n"  # between imports and code of a module
 LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "COLOURS", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL",
          "MEASURES", "OWNERS")  # fmt: skip
-TABLES = ("SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")  # beside the lists of words, in query/grammar.py
+TABLES = ("PREPOSITIONS", "SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")  # also in query/grammar.py
 STILL = 1280  # pixels of the longer side of the picture in the page
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
 TOUCHING: tuple[grammar.Side, ...] = ("near", "on", "in")  # relations that follow from points
@@ -279,7 +279,6 @@ def language_tables(
         "rule": asdict(RULE) | {"found": found, "half": HALF, "low": LOW},
         "grammar": {
             **{name.lower(): sorted(getattr(grammar, name)) for name in LISTS},
-            "prepositions": {" ".join(words): kind for words, kind in grammar.PREPOSITIONS.items()},
             **{name.lower(): getattr(grammar, name) for name in TABLES},
         },
         "space": {

@@ -278,16 +278,20 @@ _SIDES: dict[str, Side] = {
 }  # fmt: skip
 _COUNTED = ["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 NUMBERS = {str(number): number for number in range(1, 1000)} | dict(zip(_COUNTED, range(1, 13), strict=True))
-PREPOSITIONS: dict[tuple[str, ...], Side | Literal["nearest", "farthest", "of"]] = {
-    ("of",): "of",
-    **{(word, to): kind for word, kind in _DISTANCES.items() for to in ("to", "from")},
-    **{tuple(text.split()): kind for text, kind in _SIDES.items()},
+PREPOSITIONS: dict[str, Side | Literal["nearest", "farthest", "of"]] = {
+    "of": "of",
+    **{f"{word} {to}": kind for word, kind in _DISTANCES.items() for to in ("to", "from")},
+    **_SIDES,
 }
 _EMPTY = STOP_WORDS | ADJECTIVES
-_LONGEST = max(map(len, PREPOSITIONS))
+_LONGEST = max(len(words.split()) for words in PREPOSITIONS)
 # Before what is looked for, where that is asked in a sentence: "where is the mug".
 _QUESTION = r"(?i)^(?:(?:where|which)(?:'s| is| are)|(?:is|are) there|find(?: me)?|show me|look for) (?=.)"
-_EXCLUSIONS = [["but", "not"], ["and", "not"], ["other", "than"], ["not"], ["without"], ["except"]]
+# Between the sides of a construction, in a text of words and commas with a blank between any two.
+_EXCLUDED = r"(?i)(?: ,)?(?: (?:but|and))? (?:not|without|except|other than)(?= |$)"
+_OR = r"(?i)(?: ,)?(?:^| )or(?= |$)|(?:^| ),(?= )"
+_AND = r"(?i)(?:^| )(?:and|&|as well as)(?= |$)"
+_LEADING = rf"(?i)^(?:(?:{'|'.join(sorted(ARTICLES))}) )+"
 
 
 def parse(text: str, names: Collection[str] = ()) -> Phrase:
@@ -298,15 +302,15 @@ def parse(text: str, names: Collection[str] = ()) -> Phrase:
     """
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"a query of {len(text)} characters; use at most {MAX_CHARACTERS}")
-    tokens = re.sub(_QUESTION, "", " ".join(_with_names(list(tokens_of(text)), names))).split(" ")
-    words = [token for token in tokens if token not in ("", ",")]
-    if words and _exclusion_at(tokens, 0):
+    asked = re.sub(_QUESTION, "", " ".join(_with_names(list(tokens_of(text)), names))).strip(", ")
+    words = [word for word in asked.split(" ") if word not in ("", ",")]
+    if words and re.match(_EXCLUDED, f" {asked}"):
         raise InputError(
             f"'{' '.join(words)[:60]}' only says what not to look for; "
             "begin with what to look for: 'toy, not teddy bear'"
         )
     check_names(words)
-    tree = _query(tokens)
+    tree = _query(asked)
     count = len(atoms(tree))
     if count > MAX_ATOMS:
         raise InputError(f"a query of {count} phrases; ask at most {MAX_ATOMS} at a time")
@@ -326,22 +330,18 @@ def _with_names(tokens: list[str], names: Collection[str]) -> list[str]:
     return tokens
 
 
-def _query(tokens: list[str]) -> Phrase:
-    sides: list[list[str]] = [[]]
-    at = 0
-    while at < len(tokens):
-        length = _exclusion_at(tokens, at)
-        if length and _names(sides[-1]) and _names(tokens[at + length :]):
-            sides.append([])
-            at += length
-        else:
-            sides[-1].append(tokens[at])
-            at += 1
-    wanted, *others = [_alternatives(side) for side in sides]
-    if not others:
-        return wanted
-    unwanted = [_of_it(other, wanted) for other in others]
-    return Without(wanted, unwanted[0] if len(unwanted) == 1 else Union(tuple(unwanted)))
+def _query(text: str) -> Phrase:
+    wanted, *others = map(_alternatives, _exclusions(text))
+    return Without(wanted, _group(Union, [_of_it(other, wanted) for other in others])) if others else wanted
+
+
+def _exclusions(text: str) -> list[str]:
+    """Split a text into what is wanted and what is not, wherever both sides name something."""
+    for mark in re.finditer(_EXCLUDED, text):
+        before, after = text[: mark.start()], text[mark.end() :]
+        if _names(before) and _names(after):
+            return [before, *_exclusions(after.strip(", "))]
+    return [text]
 
 
 def _of_it(unwanted: Phrase, wanted: Phrase) -> Phrase:
@@ -351,67 +351,53 @@ def _of_it(unwanted: Phrase, wanted: Phrase) -> Phrase:
     return Inside(unwanted, wanted) if own else unwanted
 
 
-def _exclusion_at(tokens: list[str], at: int) -> int:
-    """Return number of tokens of the exclusion that begins at token `at`; 0 for none."""
-    comma = int(tokens[at] == ",")
-    ahead = [token.lower() for token in tokens[at + comma : at + comma + 2]]
-    return next((comma + len(words) for words in _EXCLUSIONS if ahead[: len(words)] == words), 0)
+def _alternatives(text: str) -> Phrase:
+    each = (_sides(side.replace(" ,", ""), _AND) for side in _sides(text, _OR))
+    return _group(Union, [_group(Both, list(map(_clause, items))) for items in each])
 
 
-def _alternatives(tokens: list[str]) -> Phrase:
-    ahead = [*(token.lower() for token in tokens[1:]), ""]
-    tokens = [token for token, then in zip(tokens, ahead, strict=True) if (token, then) != (",", "or")]
-    sides = _split(tokens, ("or", ","))
-    items = tuple(_all([token for token in side if token != ","]) for side in sides)
-    return items[0] if len(items) == 1 else Union(items)
+def _group(kind: type[Both | Union], items: Sequence[Phrase]) -> Phrase:
+    return items[0] if len(items) == 1 else kind(tuple(items))
 
 
-def _all(tokens: list[str]) -> Phrase:
-    as_one = " ".join(tokens)
-    tokens = re.sub(r"\bas well as\b", "&", as_one, flags=re.IGNORECASE).split(" ")
-    items = tuple(_clause(part) for part in _split(tokens, ("and", "&")))
-    return items[0] if len(items) == 1 else Both(items)
+def _sides(text: str, mark: str) -> list[str]:
+    """Split a text at marks, unless a side would name nothing."""
+    sides = [side.strip(", ") for side in re.split(mark, text)]
+    return sides if all(map(_names, sides)) else [text]
 
 
-def _split(tokens: list[str], marks: tuple[str, ...]) -> list[list[str]]:
-    """Split tokens at `marks`, unless a side would name nothing."""
-    parts: list[list[str]] = [[]]
-    for token in tokens:
-        if token.lower() in marks:
-            parts.append([])
-        else:
-            parts[-1].append(token)
-    return parts if all(map(_names, parts)) else [tokens]
-
-
-def _names(tokens: list[str]) -> bool:
+def _names(text: str) -> bool:
     """Return whether words name a thing: more than stop words and descriptions."""
-    words = [token for token in tokens if token != ","]
+    words = [word for word in text.split(" ") if word not in ("", ",")]
     return not only(_EMPTY, words) or (bool(words) and words[-1].lower() in ALSO_NOUNS)
 
 
-def _clause(tokens: list[str]) -> Phrase:
-    tokens = _without_articles(tokens)
-    low = [token.lower() for token in tokens]
-    if low[0] in SUPERLATIVES and not NUMBERS.keys().isdisjoint(low[1:2]):  # "biggest two mugs"
-        tokens, low = ([words[1], words[0], *words[2:]] for words in (tokens, low))
-    kind = SUPERLATIVES.get(low[0])
-    if kind and _names(tokens[1:]):
-        what = _related(tokens[1:])
-        if kind in ("nearest", "farthest") and isinstance(what, Relation) and what.kind == "near":
-            return Superlative(kind, what.what, what.anchor)
-        at = next((i for i, word in enumerate(low) if word in ("to", "from") and i > 1), 0)
-        if kind in ("nearest", "farthest") and at and _names(tokens[1:at]) and _names(tokens[at + 1 :]):
-            return Superlative(kind, _related(tokens[1:at]), _related(tokens[at + 1 :]))
-        return Superlative(kind, what)
-    count = NUMBERS.get(low[0], 0)
-    if count and _names(tokens[1:]):
-        what = _clause(tokens[1:])
+def _clause(text: str) -> Phrase:
+    text = re.sub(_LEADING, "", text)
+    first, _, rest = text.partition(" ")
+    if first.lower() in SUPERLATIVES and rest.split(" ")[0].lower() in NUMBERS:  # "biggest two mugs"
+        number, _, rest = rest.partition(" ")
+        return _clause(f"{number} {first} {rest}".strip())
+    kind = SUPERLATIVES.get(first.lower())
+    if kind and _names(rest):
+        return _extreme(kind, rest)
+    count = NUMBERS.get(first.lower())
+    if count and _names(rest):
+        what = _clause(rest)
         return Counted(count, what if count == 1 else _one_of(what))
-    for side, extreme in (("left", "leftmost"), ("right", "rightmost")):
-        if low[-3:] == ["on", "the", side] and _names(tokens[:-3]):
-            return Superlative(SUPERLATIVES[extreme], _related(tokens[:-3]))
-    return _related(tokens)
+    aside = re.fullmatch("(?i)(.+) on the (left|right)", text)
+    if aside and _names(aside[1]):
+        return Superlative(SUPERLATIVES[f"{aside[2].lower()}most"], _related(aside[1]))
+    return _related(text)
+
+
+def _extreme(kind: Extreme, text: str) -> Superlative:
+    what, ends = _related(text), re.match(r"(?i)(.+?) (?:to|from) (.+)", text)
+    if kind in _DISTANCES and isinstance(what, Relation) and what.kind == "near":
+        return Superlative(kind, what.what, what.anchor)
+    if kind in _DISTANCES and ends and all(map(_names, ends.groups())):
+        return Superlative(kind, *map(_related, ends.groups()))
+    return Superlative(kind, what)
 
 
 def _one_of(tree: Phrase) -> Phrase:
@@ -427,13 +413,14 @@ def _one_of(tree: Phrase) -> Phrase:
     return tree
 
 
-def _related(tokens: list[str]) -> Phrase:
-    for at in range(1, len(tokens)):
-        for length in range(min(_LONGEST, len(tokens) - at - 1), 0, -1):
-            kind = PREPOSITIONS.get(tuple(token.lower() for token in tokens[at : at + length]))
-            before, after = tokens[:at], tokens[at + length :]
-            named = _names(before) or (kind == "of" and is_part(before[-1]))
-            holds = not MEASURES.isdisjoint(forms(before[-1])) and only(_EMPTY, before[:-1])  # "cup of tea"
+def _related(text: str) -> Phrase:
+    words = text.split(" ")
+    for at in range(1, len(words)):
+        for end in range(min(at + _LONGEST, len(words) - 1), at, -1):
+            kind = PREPOSITIONS.get(" ".join(words[at:end]).lower())
+            (*describing, head), before, after = words[:at], " ".join(words[:at]), " ".join(words[end:])
+            named = _names(before) or (kind == "of" and is_part(head))
+            holds = not MEASURES.isdisjoint(forms(head)) and only(_EMPTY, describing)  # "cup of tea"
             if kind and named and _names(after) and not (kind == "of" and holds):
                 what, anchor = _thing(before), _clause(after)
                 if kind == "of":
@@ -441,23 +428,17 @@ def _related(tokens: list[str]) -> Phrase:
                 if kind == "nearest" or kind == "farthest":
                     return Superlative(kind, what, anchor)
                 return Relation(kind, what, anchor)
-    return _thing(tokens)
+    return _thing(text)
 
 
-def _thing(tokens: list[str]) -> Phrase:
-    for at, token in enumerate(tokens[:-1]):
-        owner, rest = [*tokens[:at], re.sub(r"'s?$", "", token)], tokens[at + 1 :]
-        owned = re.search(r"(?:\w's|s')$", token) and owner[-1].lower() not in OWNERS
-        if owned and _names(owner) and not only(STOP_WORDS, rest):
+def _thing(text: str) -> Phrase:
+    for mark in re.finditer(r"(?:(?<=\w)'s|(?<=s)') ", text):
+        owner, rest = text[: mark.start()], text[mark.end() :]
+        owns = owner.split(" ")[-1].lower() not in OWNERS and _names(owner)
+        if owns and not only(STOP_WORDS, rest.split(" ")):
             return Inside(_thing(rest), _thing(owner))
-    words = _without_articles(tokens)
-    if len(words) > 1 and is_part(words[-1]) and not only(_EMPTY, words[:-1]):
-        at = len(words) - 1
-        return Inside(Atom(words[at]), Atom(" ".join(words[:at])))
-    return Atom(" ".join(words))
-
-
-def _without_articles(tokens: list[str]) -> list[str]:
-    """Return the tokens without articles at the beginning, unless there is nothing else."""
-    first = next((at for at, token in enumerate(tokens) if token.lower() not in ARTICLES), 0)
-    return tokens[first:]
+    text = re.sub(_LEADING, "", text)
+    thing, _, part = text.rpartition(" ")
+    if thing and is_part(part) and not only(_EMPTY, thing.split(" ")):
+        return Inside(Atom(part), Atom(thing))
+    return Atom(text)
