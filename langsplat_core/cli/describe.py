@@ -64,13 +64,8 @@ class Describe:
             if self.labels is not None:
                 print(f"{self.labels} and {export_labels(describer, self.labels)}")
                 return
-            sure = engine.basis.calibration is not None
-            found = (
-                outline_of(describer)
-                if self.outline
-                else [_plain(entry, sure) for entry in scene_inventory(describer, progress)]
-            )
-        found = in_world(found, scene.origin)
+            found: Any = scene_outline(describer) if self.outline else scene_inventory(describer, progress)
+        found = in_world(_plain(found, engine), scene.origin)
         asked, left_out = len(describer.words[0].phrases), describer.left_out
         if self.json:
             counts = {"asked": asked, "left_out": len(left_out)}
@@ -89,10 +84,10 @@ class Describe:
             )
 
 
-def _plain(value: Any, sure: bool) -> Any:
-    """Words, spots and entries, ready for JSON; softmax shares are probabilities too where that is `sure`."""
-    if isinstance(value, tuple):
-        return [_plain(item, sure) for item in value]
+def _plain(value: Any, engine: QueryEngine) -> Any:
+    """Words, spots and entries, ready for JSON; softmax shares are probabilities too if it is calibrated."""
+    if isinstance(value, tuple | list):
+        return [_plain(item, engine) for item in value]
     if not is_dataclass(value):
         return value
     made: dict[str, Any] = {}
@@ -103,9 +98,9 @@ def _plain(value: Any, sure: bool) -> Any:
         elif name == "rows":
             made["gaussians"] = len(held)
         elif name == "probability":
-            made |= {"softmax": held, "probability": held if sure else None}
+            made |= {"softmax": held, "probability": held if engine.basis.calibration else None}
         else:
-            made[name] = _plain(held, sure)
+            made[name] = _plain(held, engine)
     return made
 
 
@@ -129,8 +124,7 @@ def _print_inventory(entries: list[dict[str, Any]], origin: Array) -> None:
 
 def outline_of(describer: Describer) -> list[dict[str, Any]]:
     """Return the scene as a tree, ready for JSON."""
-    sure = describer.engine.basis.calibration is not None
-    return [_plain(one, sure) for one in scene_outline(describer)]
+    return list(_plain(scene_outline(describer), describer.engine))
 
 
 def outline_lines(nodes: list[dict[str, Any]], unit: Unit) -> list[str]:

@@ -108,13 +108,8 @@ def read_sog_scene(path: Path | str) -> Scene:
         return _decode(lambda name, limit: hostile.read_file(path.parent / name, limit), path, size, images)
     with hostile.opened_archive(path, "SOG archive") as archive:
         # The images are compressed already, so a member far larger than its archive is a trap.
-        most = 16 * archive.size + META_LIMIT
-        return _decode(
-            lambda name, limit: archive.read(name, min(limit, most)),
-            path / META_NAME,
-            archive.size,
-            archive.names,
-        )
+        most, about = 16 * archive.size + META_LIMIT, (path / META_NAME, archive.size, archive.names)
+        return _decode(lambda name, limit: archive.read(name, min(limit, most)), *about)
 
 
 def _decode(fetch: Fetch, meta_path: Path, size: int, files: Iterable[str]) -> Scene:

@@ -158,10 +158,8 @@ def make_page(
         },
     }
     tensors["colour_maps"] = np.stack(list(COLOUR_MAPS.values()))
-    why_not, language = (
-        unsearchable(engine) if engine else no_field(scene).partition(": ")[2],
-        dict[str, Any](),
-    )
+    why_not = unsearchable(engine) if engine else no_field(scene).partition(": ")[2]
+    language: dict[str, Any] = {}
     if engine is not None and not why_not:
         language, own = language_tables(engine, rows, progress)
         tensors |= own
