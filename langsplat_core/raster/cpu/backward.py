@@ -350,10 +350,7 @@ def to_parameters(
             out.values[i] = added[number, MOMENTS : MOMENTS + out.values.shape[1]]
             which[number], ranks[number], number = i, rank, number + 1
         if number == 8 or (number > 0 and i == last - 1):
-            which[number:], ranks[number:], added[number:] = (
-                which[0],
-                ranks[0],
-                added[0],
-            )  # the last are fewer
+            # The last are fewer.
+            which[number:], ranks[number:], added[number:] = which[0], ranks[0], added[0]
             _pull_back(which, (tiles.geometry, ranks, added, each), rows, camera, out)
             number = 0
