@@ -20,18 +20,17 @@ SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be 
 
 
 @dataclass(frozen=True, eq=False)
-class Outlines:
-    """Polygons on the label's grid; several of one category in a frame are joined."""
+class Outline:
+    """A polygon on the label's grid."""
 
     size: Size
-    polygons: tuple[Array, ...]  # (K, 2) float x, y each, K >= 3
+    corners: Array  # (K, 2) float x, y, K >= 3
 
     def draw(self, size: Size) -> Array:
         """Return the mask on a grid of `size`, (H, W) bool."""
         canvas = Image.new("L", self.size)
-        brush = ImageDraw.Draw(canvas)
-        for polygon in self.polygons:
-            brush.polygon([(int(x), int(y)) for x, y in polygon], fill=1, outline=1)
+        corners = [(int(x), int(y)) for x, y in self.corners]
+        ImageDraw.Draw(canvas).polygon(corners, fill=1, outline=1)
         return resized(np.asarray(canvas) > 0, size)
 
 
@@ -47,29 +46,19 @@ class MaskFile:
         return resized(grey > (127 if grey.max(initial=0) > 1 else 0), size)
 
 
-@dataclass(frozen=True)
-class JoinedMasks:
-    """Masks of any number of things; of none the empty one."""
-
-    masks: tuple[Outlines | MaskFile, ...]
-
-    def draw(self, size: Size) -> Array:
-        """Return the mask on a grid of `size`, (H, W) bool."""
-        return np.any([mask.draw(size) for mask in self.masks] or [np.zeros(size[::-1], bool)], axis=0)
-
-
-Truth = Outlines | MaskFile | JoinedMasks  # true mask of a phrase in a frame
-
-
 @dataclass(frozen=True, eq=False)
 class LabelledPhrase:
-    """A phrase that is asked in a frame, with the true mask and boxes."""
+    """A phrase that is asked in a frame, with the true masks and boxes."""
 
     phrase: str
-    truth: Truth
+    masks: tuple[Outline | MaskFile, ...]  # of the things that it names; of none where it names nothing
     # (B, 4) left, top, right, bottom on the label's grid, inclusive; None: no place is scored
     boxes: Array | None
     targets: int | None = None  # things that it names in the frame; None: one at least
+
+    def truth(self, size: Size) -> Array:
+        """Return the masks joined on a grid of `size`, (H, W) bool."""
+        return np.any([mask.draw(size) for mask in self.masks] or [np.zeros(size[::-1], bool)], axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,21 +200,18 @@ def _read_frame(path: Path) -> tuple[Frame, list[str]]:
     """Return the frame, and the categories of it that have no polygon with an inside."""
     content = _stated(path, _LabelFile, "LERF-OVS")
     size = content.info.width, content.info.height
-    polygons: dict[str, list[Array]] = {}
-    boxes: dict[str, list[Array]] = {}
+    drawn: dict[str, list[tuple[Outline, Array]]] = {}  # each with its box
     for number, item in enumerate(content.objects):
-        phrase, corners = item.category.strip(), _corners(item.segmentation, size, f"{path}: object {number}")
-        polygons.setdefault(phrase, [])
+        own = drawn.setdefault(item.category.strip(), [])
+        corners = _corners(item.segmentation, size, f"{path}: object {number}")
         if len(corners) >= 3:
-            polygons[phrase].append(corners)
-            boxes.setdefault(phrase, []).append(_box(item.bbox, corners))
+            own.append((Outline(size, corners), _box(item.bbox, corners)))
     labels = tuple(
-        LabelledPhrase(phrase, Outlines(size, tuple(outlines)), np.stack(boxes[phrase]))
-        for phrase, outlines in polygons.items()
-        if outlines
+        LabelledPhrase(phrase, tuple(outline for outline, _ in own), np.stack([box for _, box in own]))
+        for phrase, own in drawn.items()
+        if own
     )
-    without = [phrase for phrase, outlines in polygons.items() if not outlines]
-    return Frame(path.stem, size, labels), without
+    return Frame(path.stem, size, labels), [phrase for phrase, own in drawn.items() if not own]
 
 
 def _corners(stored: list[tuple[float, float]], size: Size, where: str) -> Array:
@@ -273,7 +259,9 @@ def _read_ovs3d_scene(folder: Path) -> LabelledScene:
     for view in sorted(path for path in (folder / "segmentations").iterdir() if path.is_dir()):
         files = {normalize("NFC", path.stem): path for path in sorted(view.glob("*.png"))}
         stray += [f"{view.name}: {name} (not in classes.txt)" for name in files if name not in classes]
-        labels = tuple(LabelledPhrase(name, MaskFile(files[name]), None) for name in classes if name in files)
+        labels = tuple(
+            LabelledPhrase(name, (MaskFile(files[name]),), None) for name in classes if name in files
+        )
         if labels:
             photograph = photograph_of(folder / "images", view.name)
             grid = picture_size(photograph or files[labels[0].phrase])
@@ -340,7 +328,7 @@ def _referred_frame(path: Path, scene: Path) -> Frame:
         size = picture_size(photograph)
     else:
         raise FormatError(f"{path}: has no info of width and height; add it, or images/{path.stem}.jpg")
-    masks: dict[str, list[Outlines | MaskFile]] = {}
+    masks: dict[str, list[Outline | MaskFile]] = {}
     for item in (*content.object, *content.objects):
         for sentence in item.sentence or [item.category]:
             own = masks.setdefault(" ".join(sentence.split()), [])
@@ -348,12 +336,8 @@ def _referred_frame(path: Path, scene: Path) -> Frame:
                 own.append(_mask_in(scene, item.segmentation, path))
             elif item.segmentation:
                 corners = _corners(item.segmentation, size, f"{path}: {sentence!r}")
-                own.append(Outlines(size, (np.resize(corners, (max(len(corners), 3), 2)),)))
-    labels = (
-        LabelledPhrase(phrase, JoinedMasks(tuple(own)), None, len(own))
-        for phrase, own in masks.items()
-        if phrase
-    )
+                own.append(Outline(size, np.resize(corners, (max(len(corners), 3), 2))))
+    labels = (LabelledPhrase(phrase, tuple(own), None, len(own)) for phrase, own in masks.items() if phrase)
     return Frame(path.stem, size, tuple(labels))
 
 

@@ -96,7 +96,7 @@ def score_scene(
             if not isinstance(answer, str):
                 size = answer.mask.shape[1], answer.mask.shape[0]
                 check_same_image(frame.name, size, frame.size)
-            truth = label.truth.draw(size)
+            truth = label.truth(size)
             if label.targets != 0 and not truth.any():
                 left_out.append(f"{frame.name}: {label.phrase} (empty mask)")
                 continue

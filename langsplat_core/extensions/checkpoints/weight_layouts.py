@@ -60,29 +60,27 @@ HEAD_WIDTH, MOST_HEADS = 64, 16
 SAM_HEADS = 8  # of the mask decoder, which no shape tells
 NOT_OURS = "open_clip's {part} states {name} {value!r}, which is not computed here"
 
-WHOLE = {
-    "logit_scale": "logit_scale",
-    "token_embedding.weight": "text_model.embeddings.token_embedding.weight",
-    "positional_embedding": "text_model.embeddings.position_embedding.weight",
-    "visual.class_embedding": "vision_model.embeddings.class_embedding",
-    "visual.conv1.weight": "vision_model.embeddings.patch_embedding.weight",
-    "visual.positional_embedding": "vision_model.embeddings.position_embedding.weight",
-}
-NORMS = {
-    "ln_final": "text_model.final_layer_norm",
-    "visual.ln_pre": "vision_model.pre_layrnorm",  # as transformers spells it
-    "visual.ln_post": "vision_model.post_layernorm",
-}
-TRANSPOSED = {"text_projection": "text_projection.weight", "visual.proj": "visual_projection.weight"}
+CLIP_NAMES: Names = (
+    (r"^visual\.class_embedding$", "vision_model.embeddings.class_embedding"),
+    (r"^visual\.conv1\.weight$", "vision_model.embeddings.patch_embedding.weight"),
+    (r"^visual\.positional_embedding$", "vision_model.embeddings.position_embedding.weight"),
+    (r"^visual\.ln_pre\.", "vision_model.pre_layrnorm."),  # as transformers spells it
+    (r"^visual\.transformer\.resblocks\.", "vision_model.encoder.layers."),
+    (r"^visual\.ln_post\.", "vision_model.post_layernorm."),
+    (r"^visual\.proj$", "visual_projection.weight"),
+    (r"^token_embedding\.", "text_model.embeddings.token_embedding."),
+    (r"^positional_embedding$", "text_model.embeddings.position_embedding.weight"),
+    (r"^transformer\.resblocks\.", "text_model.encoder.layers."),
+    (r"^ln_final\.", "text_model.final_layer_norm."),
+    (r"^text_projection$", "text_projection.weight"),
+    (r"\.ln_(\d)\.", r".layer_norm\1."),
+    (r"\.attn\.", ".self_attn."),
+    (r"\.mlp\.c_fc\.", ".mlp.fc1."),
+    (r"\.mlp\.c_proj\.", ".mlp.fc2."),
+)
+TRANSPOSED = ("text_projection", "visual.proj")
 OPENAI = {"input_resolution", "context_length", "vocab_size"}  # numbers beside OpenAI's weights
 UNUSED = OPENAI | {"attn_mask"}
-BLOCK = re.compile(r"(visual\.)?transformer\.resblocks\.(\d+)\.(ln_1|ln_2|attn|mlp)[._](.+)")
-IN_BLOCK = {
-    **{f"ln_{number} {part}": f"layer_norm{number}.{part}" for number in "12" for part in ("weight", "bias")},
-    **{f"attn out_proj.{part}": f"self_attn.out_proj.{part}" for part in ("weight", "bias")},
-    **{f"mlp c_fc.{part}": f"mlp.fc1.{part}" for part in ("weight", "bias")},
-    **{f"mlp c_proj.{part}": f"mlp.fc2.{part}" for part in ("weight", "bias")},
-}
 # Settings of open_clip_config.json that are read or follow from the shapes; and what transformers calls those
 # that must be as the shapes say.
 STATED = {
@@ -282,39 +280,32 @@ def _check(model: Settings, config: Settings) -> None:
                 raise ValueError(f"{OPEN_CLIP_CONFIG} states {name} {value}, tensors have {number}")
 
 
-def _clip_tensors(tensors: Tensors) -> dict[str, Any]:
-    renamed: dict[str, Any] = {}
-    for name, tensor in tensors.items():
-        stem, _, leaf = name.rpartition(".")
-        if name in WHOLE:
-            renamed[WHOLE[name]] = tensor
-        elif stem in NORMS:
-            renamed[f"{NORMS[stem]}.{leaf}"] = tensor
-        elif name in TRANSPOSED:
-            renamed[TRANSPOSED[name]] = tensor.T
-        elif (found := BLOCK.fullmatch(name)) and found[4].startswith("in_proj_"):
-            # queries, keys and values are one tensor of open_clip's
-            layer, part = f"{_layer(found)}self_attn.", found[4].removeprefix("in_proj_")
-            for role, third in zip("qkv", tensor.chunk(3), strict=True):
-                renamed[f"{layer}{role}_proj.{part}"] = third
-        elif found and (inner := f"{found[3]} {found[4]}") in IN_BLOCK:
-            renamed[f"{_layer(found)}{IN_BLOCK[inner]}"] = tensor
-        elif name not in UNUSED:
-            raise ValueError(f"{name} is no tensor of a CLIP with a vision transformer")
-    return renamed
-
-
-def _layer(found: re.Match[str]) -> str:
-    return f"{'vision' if found[1] else 'text'}_model.encoder.layers.{found[2]}."
-
-
-def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
+def _renamed(tensors: Tensors, names: Names) -> dict[str, Any]:
+    """Return tensors under the names of transformers."""
     renamed = {}
     for old, tensor in tensors.items():
         name = old
         for pattern, by in names:
             name = re.sub(pattern, by, name)
         renamed[name] = tensor
+    return renamed
+
+
+def _clip_tensors(tensors: Tensors) -> dict[str, Any]:
+    own = {name: tensor for name, tensor in tensors.items() if name not in UNUSED}
+    own |= {name: own[name].T for name in TRANSPOSED if name in own}
+    renamed = _renamed(own, CLIP_NAMES)
+    if more := renamed.keys() & own.keys() - {"logit_scale"}:
+        raise ValueError(f"{min(more)} is no tensor of a CLIP with a vision transformer")
+    for name in [name for name in renamed if ".in_proj_" in name]:
+        # queries, keys and values are one tensor of open_clip's
+        thirds = zip("qkv", renamed.pop(name).chunk(3), strict=True)
+        renamed |= {name.replace(".in_proj_", f".{role}_proj."): third for role, third in thirds}
+    return renamed
+
+
+def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
+    renamed = _renamed(tensors, names)
     renamed["shared_image_embedding.positional_embedding"] = renamed[SAM_GRID]
     return renamed
 

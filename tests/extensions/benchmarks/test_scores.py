@@ -68,7 +68,7 @@ def label_files(folder):
 def drawn(path):
     for frame in only_scene(read_lerf_ovs(path.parents[2])).frames:
         for label in frame.labels:
-            label.truth.draw(frame.size)
+            label.truth(frame.size)
     return 1.0
 
 
@@ -87,17 +87,17 @@ def test_polygons_of_one_category_are_joined(lerf):
     assert scene.left_out == ("frame_00002: nothing (no outline)",)
     mug, camera = scene.frames[1].labels
     assert (scene.frames[1].size, mug.phrase, camera.phrase) == (SIZE, "mug", "old camera")
-    mask = mug.truth.draw(SIZE)
+    mask = mug.truth(SIZE)
     np.testing.assert_array_equal(mask, block(1, 2, 5, 6) | block(20, 10, 29, 19))
     assert mug.boxes.tolist() == [[1, 2, 5, 6], [20, 10, 29, 19]]
-    np.testing.assert_array_equal(mug.truth.draw((80, 60)), np.kron(mask, np.ones((2, 2), bool)))
+    np.testing.assert_array_equal(mug.truth((80, 60)), np.kron(mask, np.ones((2, 2), bool)))
     assert without_suffix("frame.00041") == without_suffix("frame.00041.JPG") == "frame.00041"
 
 
 def test_a_polygon_of_fractions_and_one_that_leaves_the_picture(tmp_path):
     shape = [[-5.0, 3.9], [4.6, 3.2], [4.2, 99.0], [-5.0, 99.0]]
     lerf_frame(tmp_path / "label" / "a", "b", [("mug", shape)])
-    mask = only_scene(read_lerf_ovs(tmp_path)).frames[0].labels[0].truth.draw(SIZE)
+    mask = only_scene(read_lerf_ovs(tmp_path)).frames[0].labels[0].truth(SIZE)
     np.testing.assert_array_equal(mask, block(0, 3, 4, 29))
 
 
@@ -108,7 +108,7 @@ def test_3d_ovs(tmp_path):
     found = only_scene(read_3d_ovs(tmp_path))
     frames = [(f.name, f.size, [x.phrase for x in f.labels]) for f in found.frames]
     assert frames == [("00", SIZE, ["red cup", "wall"]), ("1.5", SIZE, ["wall"])]
-    np.testing.assert_array_equal(found.frames[0].labels[0].truth.draw(SIZE), block(1, 1, 8, 8))
+    np.testing.assert_array_equal(found.frames[0].labels[0].truth(SIZE), block(1, 1, 8, 8))
     assert only_scene(read_3d_ovs(scene)).name == found.name == "bench"
 
 
@@ -123,10 +123,10 @@ def test_masks_of_another_size_of_zeros_and_ones_unlisted_and_broken(tmp_path):
     assert scene.left_out == ("00: cpu (not in classes.txt)",)
     cup, jar, pot = scene.frames[0].labels
     assert scene.frames[0].size == SIZE  # the photograph's
-    np.testing.assert_array_equal(cup.truth.draw(SIZE), block(4, 5, 11, 20))
-    np.testing.assert_array_equal(jar.truth.draw(SIZE), block(5, 5, 6, 6))
+    np.testing.assert_array_equal(cup.truth(SIZE), block(4, 5, 11, 20))
+    np.testing.assert_array_equal(jar.truth(SIZE), block(5, 5, 6, 6))
     with pytest.raises(FormatError, match=r"pot\.png"):
-        pot.truth.draw(SIZE)
+        pot.truth(SIZE)
 
 
 # Rooms drawn in both layouts, read and scored as the benchmarks are.
@@ -164,7 +164,7 @@ def test_labels_state_the_truth_of_their_view(rooms, layout, read, kinds, names)
         masks = {text: mask for text, mask in masks.items() if mask.sum() >= MIN_PIXELS}
         assert {label.phrase for label in frame.labels} == set(masks)
         for label in frame.labels:
-            np.testing.assert_array_equal(label.truth.draw(DRAWN), masks[label.phrase])
+            np.testing.assert_array_equal(label.truth(DRAWN), masks[label.phrase])
             several += layout == "lerf-ovs" and len(label.boxes) > 1
     assert several > 5 or layout == "3d-ovs"
 
