@@ -36,8 +36,6 @@ NAMESPACE = "{http://www.freedesktop.org/standards/shared-mime-info}"
 def script(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """packaging/NAME.py as a module."""
     spec = importlib.util.spec_from_file_location(name, PACKAGING / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, name, module)  # dataclasses look their module up
     spec.loader.exec_module(module)

@@ -87,8 +87,7 @@ class Maps(InRooms):
     def _measure(self, room: Room) -> Iterator[MapRow]:
         planes = find_room(scene_of(room))
         occupancy = find_occupancy(scene_of(room), map_axes(planes, 1.0), self.resolution)
-        points, to_map = true_points(room), occupancy.to_map
-        true = points @ to_map[:3, :3].T + to_map[:3, 3]
+        true = occupancy.to_map.points(true_points(room))
         voxels = np.floor((true - occupancy.origin) / self.resolution).astype(np.int64)
         seen = _taken(occupancy.seen, voxels)
         near = 1.5 * self.resolution
@@ -281,9 +280,6 @@ def _judged(scene: Scene, judging: list[tuple[Any, ...]]) -> float:
     found = mean_psnr(scene, Views((), cameras, photographs, "photographs").measured(scene))
     assert found is not None
     return found
-
-
-# Search over many scenes.
 
 
 # What changed between two captures of a room.

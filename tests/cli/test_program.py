@@ -347,7 +347,6 @@ def signalled(code: str, number: int, seconds: float = 0.0) -> tuple[int, list[s
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         time.sleep(seconds)
         process.send_signal(number)

@@ -273,7 +273,6 @@ def test_transparency_is_a_mask_or_an_empty_background(tmp_path, inside, alpha, 
     capture = load_photographs(tmp_path, config, tmp_path / "work")
     assert capture.cut_out == (not inside if alpha == "auto" else alpha == "background")
     counted = capture.mask(0)
-    assert counted is not None
     assert bool(counted[15, 20]) != inside
     assert bool(counted[8, 20]) == capture.cut_out  # the thing's edge
     assert (capture.images[0][15 if inside else 0, 20] == 0).all()
@@ -337,7 +336,6 @@ def test_a_mask_has_the_shape_of_the_photograph_as_it_is_shown(tmp_path: Path) -
     mask = mask_file(tmp_path / "masks/a.png", shown)
     photo = Photo(tmp_path / "a.jpg", "a.jpg", LENS, np.eye(4), upright=True, mask=mask)
     (found,) = developed([photo]).masks
-    assert found is not None
     np.testing.assert_array_equal(found, shown.repeat(2, 0).repeat(2, 1))
     mask_file(mask, shown.T)
     with pytest.raises(InputError, match=r"a\.png: is 45x60 pixels, its photograph 120x90"):

@@ -95,9 +95,7 @@ def engine(scene) -> QueryEngine:
 
 @pytest.fixture(scope="module")
 def evidence(engine, features) -> Evidence:
-    found = find_evidence(engine, engine.run("mug"), ["mug"], features)
-    assert found is not None
-    return found
+    return find_evidence(engine, engine.run("mug"), ["mug"], features)
 
 
 def test_masks_of_just_the_answer_vote_for_it(evidence, shown):
@@ -308,7 +306,6 @@ PART = slice(PER_BLOB, PER_BLOB + 40)
 def labelled_scene() -> Scene:
     """Wholes 3, 4, 5 with the blobs' names; node 0, some of the second blob, is a part of the first whole."""
     scene = named_scene()
-    assert scene.language is not None
     leaves = np.repeat(np.arange(3, 6, dtype=np.int32), PER_BLOB)
     leaves[PART], leaves[-LOOSE:] = 0, NO_NODE
     parents = np.array([3, 4, 5, NO_NODE, NO_NODE, NO_NODE], np.int32)

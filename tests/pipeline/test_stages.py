@@ -56,7 +56,6 @@ def test_lock_names_its_owner_and_expires_with_it(tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, str(work)], stdout=subprocess.PIPE, text=True
     ) as other:
-        assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         with pytest.raises(InputError, match=f"process {other.pid} on .*--work"), sole_use(work):
             pass
@@ -185,7 +184,6 @@ def train_until(
     command = [sys.executable, "-m", "langsplat_core", *words]
     stages, said, sent = dict[str, None](), [], False
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
         for line in process.stderr:
             try:
                 report = Report.from_json(line)

@@ -126,7 +126,6 @@ def test_page_draws_the_bundled_scene_as_opengl_does(tab, demo, gl, measured, vi
 
 def test_page_draws_heat_and_latents_as_opengl_does(tab, demo, engine, gl, measured):
     camera, origin = demo.cameras[3], demo.bounds()[0]
-    assert demo.language is not None
     answer = engine.run("teddy bear")
     ours = tab.image(camera, origin, "relevancy", "teddy bear")
     values, ranges = heats(Subject(len(demo.gaussians), answers=[answer])), heat_ranges([answer])
@@ -260,7 +259,6 @@ def no_encoder(name: str) -> Any:
 
 def without_encoder(demo: Scene, **field: Any) -> tuple[Scene, QueryEngine]:
     """The bundled scene with an encoder that is not here, and no calibration."""
-    assert demo.language is not None
     own = replace(demo.language, calibration=None, encoder_id="elsewhere", **field)
     scene = replace(demo, language=own)
     return scene, QueryEngine(scene, no_encoder)
@@ -304,7 +302,6 @@ class Fluent:
 
 def test_page_without_small_encoder_knows_encoded_phrases(browser: Any, demo: Scene, tmp_path: Path) -> None:
     scene = demo.take(np.arange(0, len(demo.gaussians), 8))
-    assert scene.language is not None
     encoder = Fluent(scene.language.canonical)
     engine = QueryEngine(scene, lambda name: encoder)
     report = write_page(tmp_path / "a.html", make_page(scene, engine, "A"))

@@ -455,7 +455,6 @@ def taught(kind: int, name: str = "grandma's vase") -> TaughtWord:
 
 
 def asking(scene: Scene, *words: TaughtWord) -> QueryEngine:
-    assert scene.language is not None
     return QueryEngine(Scene(scene.gaussians, replace(scene.language, taught=words)))
 
 

@@ -16,7 +16,6 @@ import torch
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import GSPLAT, INRIA, RadianceConfig
-from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.opengl.rasterizer import create_egl_context
@@ -32,6 +31,7 @@ from langsplat_core.training.radiance.state import PARAMETERS, start
 from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support.backends import drawn_settings
 from tests.support.scenes import (
+    capture,
     find_mask_weights,
     make_views,
     random_camera,
@@ -262,16 +262,6 @@ def test_gradients_of_cuda_equal_the_cpus(degree: int, orthographic: bool, antia
     np.testing.assert_array_equal(cuda.pop("visible")[cpu.pop("visible")], True)
     for name, want in cpu.items():
         np.testing.assert_allclose(cuda[name], want, atol=1e-4 * np.abs(want).max(), err_msg=name)
-
-
-def capture() -> Capture:
-    """Six pictures of a random scene, its centres as points."""
-    truth = random_gaussians(60, 7)
-    cameras = tuple(random_camera(seed, 40, 32) for seed in range(6))
-    values = np.random.default_rng(2).random((60, 3))
-    pictures = [ReferenceRasterizer().view(truth, camera).splat(values)[0] for camera in cameras]
-    images = tuple(np.round(255 * picture.clip(0, 1)).astype(np.uint8) for picture in pictures)
-    return Capture(cameras, images, truth.means.astype(np.float64), np.full((60, 3), 128, np.uint8))
 
 
 @on_cuda

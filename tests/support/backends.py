@@ -294,25 +294,23 @@ def reference_gradients(
         image, alpha = ReferenceView(footprints, camera, settings).splat(values)
         return float((image * image_grad).sum() + (alpha * alpha_grad).sum())
 
-    def moved(array: Array, place: tuple[int, ...], step: float) -> Array:
-        array = array.copy()
-        array[place] += step
-        return array
+    def drawn(**moved: Array) -> Footprints:
+        return project(replace(exact, **moved), camera, settings)  # type: ignore[arg-type]
 
-    footprints, found = project(exact, camera, settings), {}  # type: ignore[arg-type]
-    for name in PARAMETERS:
-        whole = getattr(exact, name)
-        grad = found[name] = np.empty((len(rows), *whole.shape[1:]))
-        for place in np.ndindex(grad.shape):
-            at = (int(rows[place[0]]), *place[1:])
-            ends = [replace(exact, **{name: moved(whole, at, step)}) for step in (STEP, -STEP)]
-            high, low = (loss(project(end, camera, settings)) for end in ends)  # type: ignore[arg-type]
-            grad[place] = (high - low) / (2 * STEP)
-    grad = found["means_px"] = np.empty((len(rows), 2))
-    for place in np.ndindex(grad.shape):
-        at = (int(rows[place[0]]), place[1])
-        ends_px = [moved(footprints.means_px, at, step) for step in (STEP, -STEP)]
-        high, low = (loss(replace(footprints, means_px=end)) for end in ends_px)
-        grad[place] = (high - low) / (2 * STEP)
+    def slopes(whole: Array, drawn_with: Callable[[Array], Footprints]) -> Array:
+        slopes = np.empty((len(rows), *whole.shape[1:]))
+        for place in np.ndindex(slopes.shape):
+            step = np.zeros_like(whole)
+            step[(int(rows[place[0]]), *place[1:])] = STEP
+            high, low = (loss(drawn_with(whole + way * step)) for way in (1, -1))
+            slopes[place] = (high - low) / (2 * STEP)
+        return slopes
+
+    footprints = drawn()
+    found = {
+        name: slopes(getattr(exact, name), lambda moved, name=name: drawn(**{name: moved}))
+        for name in PARAMETERS
+    }
+    found["means_px"] = slopes(footprints.means_px, lambda moved: replace(footprints, means_px=moved))
     found["values"] = ReferenceView(footprints, camera, settings).gather(image_grad)[rows]  # linear
     return found

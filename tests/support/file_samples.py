@@ -12,11 +12,12 @@ import math
 import struct
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from PIL import Image
 from torch import nn
 
 from langsplat_core.arrays import Array, sigmoid, unit
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import STRICTNESS, FormatError, InputError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
@@ -40,6 +41,7 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.transform import sh_basis
 
+T = TypeVar("T")
 C0 = 0.28209479177387814
 
 
@@ -533,6 +535,26 @@ def _parts(field: LanguageField) -> dict[str, Array]:
 
 def _arrays(owner: object, names: Sequence[str], prefix: str = "") -> dict[str, Array]:
     return {prefix + name: getattr(owner, name) for name in names}
+
+
+def same_or_a_line(
+    read: Callable[[], T], check: Callable[[T], object], caplog: pytest.LogCaptureFixture
+) -> int:
+    """Read what was changed: it is the same, or an error, or said, which `--strict` makes an error.
+
+    check: that it is the same. Returns how many lines were said.
+    """
+    try:
+        got = read()
+    except InputError:
+        return 0
+    if not (lines := len(caplog.messages)):
+        check(got)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(STRICTNESS, "on", True)
+        with pytest.raises(InputError, match="--strict") if lines else nullcontext():
+            read()
+    return lines
 
 
 def assert_refused(read: Callable[[Path], object], path: Path) -> None:

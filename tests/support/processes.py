@@ -21,6 +21,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,20 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
         subprocess.run(["umount", "--lazy", str(folder)], check=True, capture_output=True)
 
 
+def in_a_fork(work: Callable[[], object]) -> int:
+    """The exit code of `work` in a fork of this process; negative: the signal that killed it."""
+    if (child := os.fork()) == 0:
+        code = 1
+        try:
+            code = int(work() or 0)
+        except BaseException:  # noqa: BLE001  as at the end of any program
+            sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
+        finally:
+            sys.stderr.flush()
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
 def resize(disk: Path, size: int) -> None:
     """Make a `small_disk` larger."""
     subprocess.run(["mount", "-o", f"remount,size={size}", str(disk)], check=True, capture_output=True)
@@ -138,8 +153,6 @@ class Cast:
 
     def play(self, arguments: list[str], folder: Path, timeout: int) -> str:
         """As the function of this name."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
         self._process.stdin.write(json.dumps([arguments, str(folder), timeout]) + "\n")
         self._process.stdin.flush()
         code, said = json.loads(self._process.stdout.readline())
@@ -297,23 +310,17 @@ def _child(path: Path) -> tuple[int, str, bool]:
     folder = path.with_suffix("")
     folder.mkdir()
     log = path.with_suffix(".log")
-    process = os.fork()
-    if process == 0:
-        try:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-            os.dup2(os.open(log, os.O_CREAT | os.O_WRONLY), 2)
-            held = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-            resource.setrlimit(resource.RLIMIT_AS, (held + ROOM,) * 2)
-            resource.setrlimit(resource.RLIMIT_CPU, (SECONDS,) * 2)
-            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            code = main("langsplat", lambda: Convert(path, (folder / "out.ply",)))
-        except BaseException:  # noqa: BLE001  as at the end of any program
-            sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
-            code = 1
-        sys.stderr.flush()
-        os._exit(code)
-    code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
-    return code, log.read_text(), any(folder.iterdir())
+
+    def convert() -> int:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.dup2(os.open(log, os.O_CREAT | os.O_WRONLY), 2)
+        held = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        resource.setrlimit(resource.RLIMIT_AS, (held + ROOM,) * 2)
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS,) * 2)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        return main("langsplat", lambda: Convert(path, (folder / "out.ply",)))
+
+    return in_a_fork(convert), log.read_text(), any(folder.iterdir())
 
 
 def _all(folder: Path) -> None:
@@ -381,23 +388,18 @@ def killed_everywhere(work: Callable[[], int | None], folder: Path) -> Iterator[
     Steps are what opens, makes, renames or removes a file. Yields the exit codes, the last of which is of a
     fork that ended otherwise.
     """
+
+    def killed(left: Iterator[int]) -> int | None:
+        def watch(event: str, given: tuple[object, ...]) -> None:
+            if event in STEPS and str(given[0]).startswith(str(folder)) and next(left, None) is None:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        signal.alarm(60)  # of threads a fork has none, and may wait for one
+        sys.addaudithook(watch)
+        return work()
+
     for last in range(500):
-        if (child := os.fork()) == 0:
-            left = iter(range(last))
-
-            def watch(event: str, given: tuple[object, ...], left: Iterator[int] = left) -> None:
-                if event in STEPS and str(given[0]).startswith(str(folder)) and next(left, None) is None:
-                    os.kill(os.getpid(), signal.SIGKILL)
-
-            code = 1
-            try:
-                signal.alarm(60)  # of threads a fork has none, and may wait for one
-                sys.addaudithook(watch)
-                code = int(work() or 0)
-            finally:
-                os._exit(code)
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        yield code
+        yield (code := in_a_fork(partial(killed, iter(range(last)))))
         if code != -signal.SIGKILL:
             return
 

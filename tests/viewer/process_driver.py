@@ -104,7 +104,6 @@ class Rider:
 
     def _stop(self, now: float) -> None:
         stats, count = self.window.viewer.state.stats, len(self._pictures)
-        assert self._moving_since is not None
         self.seen.pictures_per_second.append(count / (now - self._moving_since))
         self.seen.cpu_per_picture.append((self._cpu() - self._started) / count)
         self.seen.picture.append(statistics.median(self._pictures))
@@ -117,7 +116,6 @@ class Rider:
     def _rest(self, now: float) -> None:
         if self.window.viewer.state.stats.scale < 1 or self.window.unfinished:
             return
-        assert self._resting_since is not None
         self.seen.longest_resting.append(self._longest)
         self.seen.sharp_after.append(now - self._resting_since)
         self.seen.cpu_to_sharp.append(self._cpu() - self._started)
@@ -156,7 +154,6 @@ def ride(
     params.fps_idling.vsync_to_monitor = False
     immapp.run(params)
     state = window.viewer.state
-    assert state.scene is not None
     rider.seen.gaussians, rider.seen.backend = len(state.scene.gaussians), state.backend
     return rider.seen
 

@@ -273,7 +273,6 @@ def save_session(opened: Viewer, folder: Path) -> Path:
     settings.write_note(opened, opened.state.session.notes[0], 'a "note" <b>of</b> 1987')
     opened.state.preferences = replace(opened.state.preferences, panels=("Search", "Notes"))
     path = saving.save_project(opened, folder)
-    assert path is not None
     assert path.name == "blobs-001.langsplat"
     return path
 

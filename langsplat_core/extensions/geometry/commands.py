@@ -276,7 +276,7 @@ class Map:
         solid = surface_weights(scene.gaussians) > 0
         for phrase in self.goal:
             result = run_phrase(engine, phrase, viewpoint=scene.cameras[0]).answer
-            points = occupancy.metres(scene.gaussians.means[result.members & solid])
+            points = occupancy.to_map.points(scene.gaussians.means[result.members & solid])
             goal = None
             if result.found and len(points):
                 goal = find_goal(plan, where, points[:, :2], self.robot_radius + self.resolution)
@@ -329,8 +329,9 @@ def write_voxels(
     names = np.array([words.get(int(node), "") for node in nodes], str)
     with atomic_path(path) as temporary:
         np.savez_compressed(
-            temporary, cells=cells.astype(np.int32), origin=occupancy.origin, resolution=occupancy.resolution,
-            to_map=occupancy.to_map @ moving(-scene.origin).matrix, nodes=nodes.astype(np.int32), words=names,
+            temporary, cells=cells.astype(np.int32), nodes=nodes.astype(np.int32), words=names,
+            origin=occupancy.origin, resolution=occupancy.resolution,
+            to_map=moving(-scene.origin).then(occupancy.to_map).matrix,
             hits=occupancy.hits[tuple(cells.T)], passes=occupancy.passes[tuple(cells.T)],
         )  # fmt: skip
 
@@ -343,7 +344,7 @@ def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array
     rows = np.flatnonzero((surface_weights(scene.gaussians) > 0) & (whole != NO_NODE))
     if len(rows) == 0:
         return np.full(len(cells), NO_NODE)
-    means = occupancy.metres(scene.gaussians.means[rows])
+    means = occupancy.to_map.points(scene.gaussians.means[rows])
     centres = occupancy.origin + (cells + 0.5) * occupancy.resolution
     gaps, nearest = cKDTree(means).query(centres, distance_upper_bound=4 * occupancy.resolution, workers=-1)
     return np.append(whole[rows], NO_NODE)[np.where(np.isfinite(gaps), nearest, len(rows))]

@@ -60,10 +60,14 @@ class Mesh:
 
     def hollows(self) -> int:
         """Return the number of pieces that are turned inside out: hollows in others, of a watertight mesh."""
-        piece = _pieces(self.triangles[:, [0, 1, 1, 2]].reshape(-1, 2), len(self.vertices))
         a, b, c = (self.vertices[self.triangles[:, corner]] for corner in range(3))
-        volumes = np.bincount(piece[self.triangles[:, 0]], (np.cross(a, b) * c).sum(1))
+        volumes = np.bincount(self.pieces(), (np.cross(a, b) * c).sum(1))
         return int(np.count_nonzero(volumes < 0))
+
+    def pieces(self) -> Array:
+        """Return (T,) the number of the connected piece that each triangle is of."""
+        piece = _pieces(self.triangles[:, [0, 1, 1, 2]].reshape(-1, 2), len(self.vertices))
+        return np.asarray(piece[self.triangles[:, 0]])
 
     def areas(self) -> Array:
         """Return (T,) areas of the triangles, square world units."""
@@ -173,8 +177,7 @@ def _taken(mesh: "object") -> Mesh:
 
 def _cleaned(mesh: Mesh) -> Mesh:
     """Without the pieces of fewer triangles than a `SPECK`. InputError where nothing is left."""
-    vertices = _pieces(mesh.triangles[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices))
-    piece = vertices[mesh.triangles[:, 0]]
+    piece = mesh.pieces()
     kept = mesh.triangles[np.bincount(piece)[piece] >= SPECK] if len(piece) else mesh.triangles
     if len(kept) == 0:
         raise InputError("too few views show the same surface; take fewer --views, or a coarser --resolution")

@@ -18,7 +18,7 @@ from langsplat_core.extensions.geometry.planes import Room
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import NO_ORIGIN, Scene
-from langsplat_core.scene.transform import turned_origin
+from langsplat_core.scene.transform import Similarity, turned_origin
 
 MOST_CELLS = 60_000_000  # of a grid
 SIDE = 240  # pixels of the longer side of the depth images
@@ -34,7 +34,7 @@ STAGE = "measuring what is free"
 class Occupancy:
     """X x Y x Z voxels in the axes of a map: metres, z up, the ground at z = 0."""
 
-    to_map: Array  # (4, 4) similarity, from the scene to the map's metres
+    to_map: Similarity  # from the scene to the map's metres
     origin: Array  # (3,) lower corner of the first voxel, metres
     resolution: float  # metres
     hits: Array  # (X, Y, Z) uint16 rays that end in each voxel
@@ -49,10 +49,6 @@ class Occupancy:
     def seen(self) -> Array:
         """The (X, Y, Z) bool, the voxels that some ray reaches."""
         return np.asarray((self.hits > 0) | (self.passes > 0))
-
-    def metres(self, points: Array) -> Array:
-        """Return (P, 3) points of the scene in metres along the axes of the map."""
-        return _moved(points, self.to_map)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +75,8 @@ class Goal:
     distance: float  # metres from the robot's middle to the thing's nearest point
 
 
-def map_axes(room: Room, metres: float, origin: Array = NO_ORIGIN) -> Array:
-    """Return the (4, 4) similarity from a scene with an `origin` (3,) to the axes of a map.
+def map_axes(room: Room, metres: float, origin: Array = NO_ORIGIN) -> Similarity:
+    """Return the similarity from a scene with an `origin` (3,) to the axes of a map.
 
     z is up, the ground at 0, and x as near to the world's x axis, or its y axis where that is nearly up, as a
     level axis can be. metres: of a unit.
@@ -88,14 +84,15 @@ def map_axes(room: Room, metres: float, origin: Array = NO_ORIGIN) -> Array:
     first = np.eye(3)[0 if abs(room.up[0]) < 0.9 else 1]
     first = first - (first @ room.up) * room.up
     first /= np.linalg.norm(first)
-    made = np.eye(4)
-    made[:3, :3] = metres * np.stack([first, np.cross(room.up, first), room.up])
-    made[:3, 3] = metres * turned_origin(made[:3, :3] / metres, origin)
-    made[2, 3] = -metres * room.ground
-    return made
+    rotation = np.stack([first, np.cross(room.up, first), room.up])
+    moved = metres * turned_origin(rotation, origin)
+    moved[2] = -metres * room.ground
+    return Similarity(rotation, moved, metres)
 
 
-def find_occupancy(scene: Scene, to_map: Array, resolution: float, progress: Progress = silent) -> Occupancy:
+def find_occupancy(
+    scene: Scene, to_map: Similarity, resolution: float, progress: Progress = silent
+) -> Occupancy:
     """Voxels, `resolution` metres, along the cameras' rays; InputError: none, blind, too many cells."""
     if not scene.cameras:
         raise InputError("the scene has no cameras, so nothing says what is free; map a trained scene")
@@ -105,7 +102,7 @@ def find_occupancy(scene: Scene, to_map: Array, resolution: float, progress: Pro
         small = camera.within(SIDE)
         depth = view_of(scene, small).median_depth()
         points = small.unproject(small.pixel_centres()[depth > 0], depth[depth > 0])
-        rays.append((_moved(small.position[None], to_map)[0], _moved(points, to_map)))
+        rays.append((to_map.points(small.position), to_map.points(points)))
     ends = np.concatenate([points for _, points in rays])
     if len(ends) == 0:
         raise InputError("the scene's cameras see nothing in it; a map needs surfaces")
@@ -125,10 +122,6 @@ def find_occupancy(scene: Scene, to_map: Array, resolution: float, progress: Pro
         trace((eye - low) / resolution, (points - low) / resolution, hits, passes)
     progress(STAGE, 1.0)
     return Occupancy(to_map, low, resolution, hits, passes)
-
-
-def _moved(points: Array, transform: Array) -> Array:
-    return np.asarray(points @ transform[:3, :3].T + transform[:3, 3])
 
 
 @kernel

@@ -2,7 +2,6 @@
 is measured of rasterizers and of queries."""
 
 import json
-import logging
 from dataclasses import replace
 
 import numpy as np
@@ -464,8 +463,7 @@ def test_a_view_that_is_missing_and_words_that_are_unknown(blobs_on_disk, caplog
     tmp_path, _ = blobs_on_disk
     ovs_view(tmp_path / "data", "photo.2.x", {"mug": block(0, 0, 9, 9, (160, 120))}, (160, 120))
     ovs_view(tmp_path / "data", "photo.1.x", {"zebra": block(0, 0, 9, 9, (160, 120))}, (160, 120))
-    with caplog.at_level(logging.WARNING, "langsplat"):
-        report = of_scene(tmp_path, OVS_PROFILES["ours"])
+    report = of_scene(tmp_path, OVS_PROFILES["ours"])
     assert "1 labelled frames have no camera: photo.2.x" in caplog.text
     text = table(report)
     assert "not answered (no camera of that name), 1 queries: photo.2.x: mug" in text

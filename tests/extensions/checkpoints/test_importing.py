@@ -95,7 +95,6 @@ def test_the_autoencoder_is_the_networks(tmp_path, widths):
     latents = unit(rng.normal(size=(N, d))).astype(np.float32)
     save_model(tmp_path / "a_1" / "c.pth", G, tensor(latents))
     codec = read_foreign([tmp_path / "a_1" / "c.pth", tmp_path / "best_ckpt.pth"]).codec
-    assert codec is not None
     with torch.no_grad():
         decoded = network.decode(torch.from_numpy(latents)).numpy()
         encoded = network.encode(torch.from_numpy(VECTORS[0])).numpy()
@@ -399,7 +398,6 @@ def decoded(field: LanguageField, level: int) -> Array:
 def test_few_vectors_become_a_codebook_of_them(tmp_path, clip):
     scene, loss = import_scene(read_foreign(occam_levels(tmp_path)), clip, ("red mug", "Red mug "))
     field = scene.language
-    assert field is not None
     assert_same(scene.gaussians, GAUSSIANS)
     assert (field.codec.kind, field.codec.size) == ("codebook", 7)
     assert field.calibration is None  # the encoder's is of drawn rooms
@@ -411,11 +409,9 @@ def test_few_vectors_become_a_codebook_of_them(tmp_path, clip):
     np.testing.assert_array_equal(field.canonical, encoder.encode_texts(list(CANONICAL_PHRASES)))
     assert list(field.phrasebook) == ["red mug"]
     assert (field.encoder_id, field.temperature) == (clip, encoder.temperature)
-    assert loss is not None
     assert loss.error_mean < 1e-3
     save_scene(tmp_path / "a.ply", scene)
     read = load_scene(tmp_path / "a.ply").language
-    assert read is not None
     np.testing.assert_array_equal(read.latents, field.latents)
 
 
@@ -428,8 +424,6 @@ def test_many_vectors_keep_the_stated_error(tmp_path, clip):
     path = save_model(tmp_path / "a_3.pth", g, tensor(vectors))
     config = CodecConfig(max_relevancy_error=0.02)
     scene, loss = import_scene(read_foreign([path]), clip, (), config)
-    assert scene.language is not None
-    assert loss is not None
     assert (scene.language.confidence.sum(1) == [0, 0, n]).all()
     vocabulary = everyday_vocabulary(load_text_encoder(clip))
     got, want = (vocabulary.relevancy(v) for v in (decoded(scene.language, 2), vectors))
@@ -437,7 +431,6 @@ def test_many_vectors_keep_the_stated_error(tmp_path, clip):
     assert np.abs(got - want).mean() <= 1.1 * loss.error_mean  # most of these were fitted to
     assert loss.error_mean <= 1.2 * config.max_relevancy_error
     linear, _ = import_scene(read_foreign([path]), clip, (), CodecConfig("linear", latent_dim=D))
-    assert linear.language is not None
     np.testing.assert_allclose(decoded(linear.language, 2), vectors, atol=1e-5)
 
 
@@ -472,8 +465,6 @@ def test_langsplat_there_and_back(tmp_path, clip):
     again, lines = IMPORTER.read(replace(request, paths=tuple(written)), silent)
     assert "length 1" not in lines[-1]
     first, second = scene.language, again.language
-    assert first is not None
-    assert second is not None
     assert_same(again.gaussians, GAUSSIANS)
     np.testing.assert_allclose(second.latents, first.latents, atol=1e-6)
     np.testing.assert_array_equal(second.confidence, first.confidence)
@@ -499,7 +490,6 @@ def test_clusters_are_a_codebook(tmp_path, clip, number):
     )
     scene, _ = import_scene(read_foreign([path, tmp_path / "cluster_lang.npz"]), clip)
     field = scene.language
-    assert field is not None
     seen = (index != 1) & (index < number)
     assert field.codec.size == len(np.unique(index[seen]))
     np.testing.assert_array_equal(field.confidence, [np.zeros(COUNT), np.zeros(COUNT), seen])
@@ -541,7 +531,6 @@ def test_checkpoints_become_a_scene(tmp_path, checkpoints, capsys):
     assert "codec codebook of 5, encoder demo" in printed
     assert "relevancy error of the codec: mean 0.000" in printed
     scene = load_scene(tmp_path / "a.ply")
-    assert scene.language is not None
     assert set(scene.language.phrasebook) == {"apple", "red mug"}
     assert (scene.language.confidence == 1).all()
     words = ("convert", tmp_path / "a.ply", tmp_path / "out", "--to", "langsplat")

@@ -437,15 +437,15 @@ def test_rays_along_an_axis_and_of_no_length_end():
 
 def test_axes_of_a_map_are_metres_with_the_ground_at_nought():
     up = np.array([0.6, 0.0, 0.8])
-    matrix = map_axes(Room(up, 2.0, True), 3.0)
+    matrix = map_axes(Room(up, 2.0, True), 3.0).matrix
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, 9 * np.eye(3), atol=1e-12)
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(27)
     np.testing.assert_allclose(matrix[:3, :3] @ (2.0 * up) + matrix[:3, 3], [0, 0, 0], atol=1e-12)
     tilt = np.array([0.001, 0.0, 1.0])
     far = map_axes(Room(tilt / np.linalg.norm(tilt), 0.0, True), 3.0, np.array([5e5, 5e6, 300.0]))
-    np.testing.assert_allclose(far[:2, 3], [1.5e6, 1.5e7])  # where it is on a map of the world
+    np.testing.assert_allclose(far.translation[:2], [1.5e6, 1.5e7])  # where it is on a map of the world
     sideways = map_axes(Room(np.array([1.0, 0, 0]), 0.0, True), 1.0)
-    assert np.isfinite(sideways).all()
+    assert np.isfinite(sideways.matrix).all()
 
 
 def test_a_room_is_free_within_its_walls():
@@ -483,12 +483,10 @@ def test_goals_are_reachable_and_face_a_thing_with_nothing_between():
     plan, thing = plan_of(PLAN), np.array([[4.5, 4.5]])
     where = reachable(plan, 0.4, (1.5, 1.5))
     goal = find_goal(plan, where, thing)
-    assert goal is not None
     assert goal.x >= 4  # not through the wall, where it would be as near
     islands, _ = ndimage.label(where)  # of cells that share an edge
     assert islands[int(goal.x), int(goal.y)] == islands[1, 1] > 0
     far = find_goal(plan, where, thing, 1.5)
-    assert far is not None
     assert far.distance >= 1.5
     assert np.hypot(4.5 - far.x, 4.5 - far.y) == pytest.approx(far.distance)
     assert far.yaw == pytest.approx(np.arctan2(4.5 - far.y, 4.5 - far.x))
@@ -509,7 +507,7 @@ def test_a_robot_stays_where_it_fits_and_where_it_is():
 @pytest.mark.parametrize("share", [0.03, 0.3, 0.5, 0.8])
 def test_a_collider_is_closed_around_what_is_occupied(share):
     hits = (np.random.default_rng(0).random((9, 8, 7)) < share).astype(np.uint16)
-    corners, triangles = collider(Occupancy(np.eye(4), np.full(3, -1.0), 0.5, hits, np.zeros_like(hits)))
+    corners, triangles = collider(Occupancy(IDENTITY, np.full(3, -1.0), 0.5, hits, np.zeros_like(hits)))
     assert_watertight(corners, triangles)
     a, b, c = (corners[triangles[:, k]] for k in range(3))
     assert (np.cross(a, b) * c).sum() / 6 == pytest.approx(0.125 * hits.sum(), rel=0.06)
