@@ -83,6 +83,17 @@ def real_data() -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def coarse_light():
+    """Rooms are drawn in light of few samples."""
+    from assets.making import dataset
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "LIGHT_SAMPLES", 2)
+        patch.setattr(dataset, "LIGHT_CELL", 0.0)
+        yield
+
+
 @pytest.fixture
 def bounded():
     """Fails the test when Python and NumPy together ever held more than 32 MiB, or a warning was given."""

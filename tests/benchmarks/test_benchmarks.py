@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from assets.making import dataset
 from assets.making.dataset import FIRST_ROOM, MIN_REGION, SEED, Phrase, Region, Truth, TruthMasks, read_truth
 from assets.making.objects import EVERYTHING
 from assets.making.world import furnished
@@ -474,12 +473,10 @@ TINY = Rooms(tiers=("separate",), seeds=(101,), settings=SETTINGS, budget=True, 
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(tmp_path_factory, coarse_light):
     """The whole command on a tiny room: its output, its figures, and its work folder."""
     folder = tmp_path_factory.mktemp("benchmark")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "LIGHT_SAMPLES", 2)
-        patch.setattr(dataset, "LIGHT_CELL", 0.0)
         patch.setattr(scoring, "MIN_PIXELS", 12)
         command = replace(TINY, work=folder / "work", out=folder / "out")
         written = []

@@ -14,6 +14,7 @@ from langsplat_core.errors import STRICTNESS, FormatError, InputError, report_lo
 from langsplat_core.io import apart
 from langsplat_core.io.hostile import PictureError
 from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
+from tests.support.processes import stop_at
 
 log = logging.getLogger("langsplat")
 
@@ -102,11 +103,8 @@ def test_a_process_that_ends_early_is_an_error(number: int, said: str) -> None:
 
 
 def test_cancelled_work_ends_at_once(tmp_path: Path) -> None:
-    def stop(_: Report) -> None:
-        raise WorkCancelledError
-
     with pytest.raises(WorkCancelledError):
-        apart.run(wait, tmp_path / "pid", progress=Progress(stop))
+        apart.run(wait, tmp_path / "pid", progress=stop_at())
     assert not is_alive(int((tmp_path / "pid").read_text()))
 
 

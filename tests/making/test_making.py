@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from assets.making import dataset
 from assets.making import encoder as demo_encoder
 from assets.making.crops import EncoderConfig, plain_crops, room_crops
 from assets.making.dataset import (
@@ -29,22 +28,15 @@ from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import EncoderError
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
+from langsplat_core.progress import Progress, WorkCancelledError, silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
 from tests.benchmarks.scoring import masks_and_peaks
+from tests.support.processes import stop_at
 
 pytestmark = pytest.mark.long
-
-
-@pytest.fixture(scope="module")
-def coarse_light():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "LIGHT_SAMPLES", 2)
-        patch.setattr(dataset, "LIGHT_CELL", 0.0)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -130,13 +122,8 @@ def test_interrupted_training_goes_on_and_answers(monkeypatch, few_crops, tmp_pa
     """Two steps, an interruption, the rest: what is written loads and answers; all steps were taken."""
     monkeypatch.setattr(demo_encoder, "SAVE_EVERY", 2)
     config = EncoderConfig(steps=4, batch=8, phrases=8)
-
-    def interrupt(at: Report) -> None:
-        if at.fraction > 0.7:
-            raise WorkCancelledError
-
     with pytest.raises(WorkCancelledError):
-        train_encoder(tmp_path, config, Progress(interrupt))
+        train_encoder(tmp_path, config, stop_at(fraction=0.7))
     seen = []
     figures = train_encoder(tmp_path, config, Progress(lambda at: seen.append(at.fraction)))
     assert "| colour |" in report_table(figures)

@@ -29,9 +29,10 @@ from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.render import render, splat_colours, view_of
-from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Camera, Gaussians, Scene
+from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from tests.support.backends import Measure
+from tests.support.fakes import Fluent
 from tests.support.file_samples import random_field
 from tests.support.processes import Tab, open_browser, open_tab
 from tests.support.scenes import DEMO, random_camera, random_gaussians
@@ -281,23 +282,6 @@ def test_page_without_encoder_answers_phrasebook_and_taught_words(browser, demo,
         tab.page.press("#phrase", "Enter")
         assert "zebra" in tab.page.inner_text("#verdict")
         assert tab.page.locator("#answer").is_hidden()
-
-
-class Fluent:
-    """Knows every word, each by numbers of its own; the canonical phrases as the bundled scene has them."""
-
-    def __init__(self, canonical: Array) -> None:
-        self.known = dict(zip(CANONICAL_PHRASES, canonical, strict=True))
-
-    def encode_texts(self, texts: list[str]) -> Array:
-        seeds = [list(text.encode()) for text in texts]
-        drawn = [np.random.default_rng(seed).normal(size=512) for seed in seeds]
-        return np.float32([self.known.get(text, unit(own)) for text, own in zip(texts, drawn, strict=True)])
-
-    def unknown_words(self, text: str) -> tuple[str, ...]:
-        return ()
-
-    near_words = unknown_words
 
 
 def test_page_without_small_encoder_knows_encoded_phrases(browser: Any, demo: Scene, tmp_path: Path) -> None:

@@ -47,6 +47,7 @@ from tests.support.fakes import (
     PER_BLOB,
     WORDS,
     FakeEncoder,
+    Fluent,
     axis,
     blob_scene,
     blobs,
@@ -305,7 +306,7 @@ def test_basis_names_a_calibration_where_there_is_one(encoder, calibration, ever
 def test_own_calibration_is_used_and_named_as_from_drawn_rooms(tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     by_chance = QueryEngine(scene_of("lab/clip")).run("mug")
-    encoder = Speaker()
+    encoder = Fluent(np.tile(axis(3), (4, 1)))
     encoder.id = "lab/clip"
     path = keep_calibration(encoder, CALIBRATED)
     assert path.is_relative_to(tmp_path)
@@ -326,20 +327,8 @@ def test_own_calibration_is_used_and_named_as_from_drawn_rooms(tmp_path, monkeyp
     assert str(path) in caplog.text
 
 
-class Speaker(FakeEncoder):
-    """Knows every word; what is in no scene has a vector of its own."""
-
-    def encode_texts(self, texts: list[str]) -> Array:
-        drawn = [np.random.default_rng(list(text.encode())).normal(size=DIM) for text in texts]
-        own = [axis(3) if text in CANONICAL_PHRASES else row for text, row in zip(texts, drawn, strict=True)]
-        return unit(np.array(own, np.float32))
-
-    def unknown_words(self, text: str) -> tuple[str, ...]:
-        return ()
-
-
 def test_everyday_phrases_of_the_encoder_are_used_once_loaded():
-    engine = QueryEngine(scene_of("lab/clip", everyday=False), lambda _: Speaker())
+    engine = QueryEngine(scene_of("lab/clip", everyday=False), lambda _: Fluent(np.tile(axis(3), (4, 1))))
     published = engine.basis
     assert engine.run("mug").judgement.reached == "chance"
     assert engine.basis.short != published.short

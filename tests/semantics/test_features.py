@@ -9,7 +9,7 @@ import pytest
 
 from langsplat_core.arrays import unit
 from langsplat_core.errors import InputError
-from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
+from langsplat_core.progress import Progress, WorkCancelledError, silent
 from langsplat_core.semantics.features import (
     FeatureStore,
     ImageFeatures,
@@ -20,6 +20,7 @@ from langsplat_core.semantics.features import (
     masked_crop,
 )
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
+from tests.support.processes import stop_at
 
 
 def test_a_square_region_of_the_right_size_is_copied_exactly() -> None:
@@ -169,13 +170,9 @@ def test_the_key_changes_with_image_mask_source_and_encoder() -> None:
 
 def test_an_interrupted_run_continues_where_it_stopped(tmp_path: Path) -> None:
     source, encoder, store = Halves(), ColourEncoder(), FeatureStore(tmp_path)
-
-    def stop_at_c(at: Report) -> None:
-        if at.note == "c" and at.fraction > 0.5:  # while its masks are being found
-            raise WorkCancelledError
-
+    stop = stop_at(fraction=0.51, note="c")  # while its masks are being found
     with pytest.raises(WorkCancelledError):
-        describe_capture(IMAGES, NAMES, source, encoder, store, Progress(stop_at_c))
+        describe_capture(IMAGES, NAMES, source, encoder, store, stop)
     assert [store.has(name) for name in NAMES] == [True, True, False, False]
     assert len(list(tmp_path.iterdir())) == 2  # and nothing half written
     seen: list[float] = []

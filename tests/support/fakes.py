@@ -109,6 +109,24 @@ class FakeEncoder:
         return tuple(get_close_matches(word, self.words))
 
 
+class Fluent(FakeEncoder):
+    """Knows every word, each by a direction of its own; the canonical phrases as they are given."""
+
+    def __init__(self, canonical: Array) -> None:
+        """Canonical: (4, D) unit."""
+        self.given = dict(zip(CANONICAL_PHRASES, canonical, strict=True))
+
+    def encode_texts(self, texts: list[str]) -> Array:
+        return np.float32([self.given.get(text, self.vector(text)) for text in texts])
+
+    def vector(self, text: str) -> Array:
+        dim = len(self.given[CANONICAL_PHRASES[0]])
+        return unit(np.random.default_rng(list(text.encode())).normal(size=dim))
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        return ()
+
+
 def calibrated_for(phrase: str, logit_of_whole: float) -> Calibration:
     """With which `phrase`, asked of the blobs, has a probability of sigmoid(logit_of_whole)."""
     fits = QueryEngine(blob_scene(), lambda _: FakeEncoder()).run(phrase).fits

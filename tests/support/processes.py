@@ -78,11 +78,11 @@ def files_of_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def stop_at(stage: str, fraction: float = 0.0) -> Progress:
-    """Progress that cancels the work where a stage, named by how it begins, has come so far."""
+def stop_at(stage: str = "", fraction: float = 0.0, note: str = "") -> Progress:
+    """Progress that cancels the work where a stage, named by how it begins, has come so far; at a note."""
 
     def show(at: Report) -> None:
-        if at.stage.startswith(stage) and at.fraction >= fraction:
+        if at.stage.startswith(stage) and at.fraction >= fraction and note in at.note:
             raise WorkCancelledError
 
     return Progress(show)

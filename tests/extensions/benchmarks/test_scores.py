@@ -9,7 +9,6 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 from PIL import Image
 
-from assets.making import dataset
 from assets.making.dataset import MIN_PIXELS, read_truth, write_labelled
 from langsplat_core.cli.app import parse
 from langsplat_core.errors import FormatError, InputError
@@ -134,14 +133,11 @@ SEED, VIEWS, DRAWN = 2, 9, (160, 120)  # the room of the bundled scene
 
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
-    """The same room in both layouts, in plain light."""
+def rooms(tmp_path_factory, coarse_light):
+    """The same room in both layouts."""
     out = tmp_path_factory.mktemp("rooms")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "LIGHT_SAMPLES", 2)
-        patch.setattr(dataset, "LIGHT_CELL", 0.0)
-        for layout in ("lerf-ovs", "3d-ovs"):
-            write_labelled(out / layout, layout, SEED, VIEWS, DRAWN, silent)
+    for layout in ("lerf-ovs", "3d-ovs"):
+        write_labelled(out / layout, layout, SEED, VIEWS, DRAWN, silent)
     return out
 
 
