@@ -14,7 +14,8 @@ from langsplat_core.cli.export import Convert
 from langsplat_core.io.scenes import companion_path, load_scene, save_scene
 from langsplat_core.io.sidecar import SUFFIX as SIDECAR
 from langsplat_core.io.sidecar import write_language
-from langsplat_core.scene import Scene, TaughtWord
+from langsplat_core.scene import Scene
+from tests.support.file_kinds import taught_word
 from tests.support.file_samples import assert_same_extras, random_field, sog_files, write_folder
 from tests.support.processes import refusal, run
 from tests.support.scenes import random_camera, random_extras, random_gaussians, tree_of_wholes
@@ -91,8 +92,7 @@ N = 60
 def scene() -> Scene:
     """With every kind of companion, and none of its Gaussians far from a camera."""
     field = random_field(N, phrases=("red mug",))
-    vector = np.eye(1, field.codec.vector_dim, dtype=np.float32)
-    taught = (TaughtWord("thing", 2, vector, np.zeros(1, np.float32)),)
+    taught = (taught_word("thing", field.codec.vector_dim),)
     field = replace(field, tree=tree_of_wholes(np.arange(N) // 9), taught=taught)
     extras = {"age": np.arange(N, dtype=np.float32)}
     cameras = tuple(random_camera(seed) for seed in range(3))

@@ -32,7 +32,7 @@ from tests.support.photographs import (
     write_photos,
     write_picture,
 )
-from tests.support.scenes import random_camera
+from tests.support.scenes import random_camera, ring
 
 
 def captured(error: float = 0.0) -> Capture:
@@ -85,20 +85,13 @@ UP = np.array([0.0, 0.0, 1.0])
 SIZE = (32, 24)
 
 
-def ring(count: int, radius: float = 3.0) -> list[Camera]:
-    """Cameras on a circle that look at its centre."""
-    around = 2 * np.pi * np.arange(count) / count
-    eyes = np.stack([radius * np.cos(around), radius * np.sin(around), np.full(count, 1.0)], 1)
-    return [look_at(eye, np.zeros(3), UP, SIZE) for eye in eyes]
-
-
 def row(count: int) -> list[Camera]:
     return [look_at(np.array([k, 0, 0.0]), np.array([k, 5.0, 0]), UP, SIZE) for k in range(count)]
 
 
 @pytest.mark.parametrize(("count", "expected"), [(3, 0), (5, 0), (6, 1), (7, 1), (12, 2), (40, 5)])
 def test_one_view_in_eight_is_held_out_of_enough(count, expected):
-    for cameras in (ring(count), row(count)):
+    for cameras in (ring(count, SIZE), row(count)):
         found = surrounded_views(cameras, 8)
         assert len(found) == len(set(found)) == expected
     assert FEWEST_VIEWS == 6
@@ -115,7 +108,7 @@ def test_the_ends_of_a_walk_and_their_neighbours_are_trained_on():
 def test_a_view_on_its_own_is_trained_on():
     alone = look_at(np.array([0.0, 0, 9]), np.zeros(3), np.array([0.0, 1, 0]), SIZE)
     turned = look_at(np.array([3.0, 0, 1]), np.array([9.0, 0, 1]), UP, SIZE)  # looks away from the rest
-    found = surrounded_views([alone, *ring(14), turned], 4)
+    found = surrounded_views([alone, *ring(14, SIZE), turned], 4)
     assert len(found) == 4
     assert not {0, 15} & set(found)
 
@@ -128,13 +121,13 @@ def test_held_out_views_survive_rounding_and_similarity():
     assert surrounded_views([to.camera(camera) for camera in cameras], 8) == surrounded_views(cameras, 8)
     shaken = [
         replace(camera, world_to_camera=camera.world_to_camera * (1 + 1e-13 * rng.normal()))
-        for camera in ring(24)
+        for camera in ring(24, SIZE)
     ]
-    assert surrounded_views(shaken, 8) == surrounded_views(ring(24), 8)
+    assert surrounded_views(shaken, 8) == surrounded_views(ring(24, SIZE), 8)
 
 
 def test_every_eighth_view_by_name_is_held_out():
-    cameras = tuple(replace(camera, name=f"v{k}") for k, camera in enumerate(ring(10)))
+    cameras = tuple(replace(camera, name=f"v{k}") for k, camera in enumerate(ring(10, SIZE)))
     images = tuple(np.zeros((SIZE[1], SIZE[0], 3), np.uint8) for _ in cameras)
     capture = Capture(cameras, images, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     assert split_views(capture, DatasetConfig(hold_out="every", test_every=4))[1] == [0, 4, 8]
@@ -283,7 +276,7 @@ def drawn(cameras: list[Camera], known: Array = NONE, seed: int = 0) -> tuple[Ar
 
 
 def test_points_lie_where_half_of_the_cameras_look():
-    cameras = ring(8)
+    cameras = ring(8, SIZE)
     points, colours = drawn(cameras)
     assert points.shape == colours.shape == (500, 3)
     assert colours.dtype == np.uint8
@@ -294,7 +287,7 @@ def test_points_lie_where_half_of_the_cameras_look():
 
 
 def test_depths_follow_known_points():
-    cameras = ring(6)
+    cameras = ring(6, SIZE)
     known = np.random.default_rng(3).uniform(-0.1, 0.1, (200, 3))
     points, _ = drawn(cameras, known)
     assert np.linalg.norm(points, axis=1).max() < 3

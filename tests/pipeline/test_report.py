@@ -24,17 +24,11 @@ from langsplat_core.pipeline.report import (
     work_folder,
     write_reports,
 )
-from langsplat_core.scene import Camera, Gaussians, look_at
+from langsplat_core.scene import look_at
 from tests.support.processes import open_browser
+from tests.support.scenes import random_gaussians, ring
 
 UP = np.array([0.0, 0.0, 1.0])
-
-
-def ring(count: int, centre=(0.0, 0.0, 0.0)) -> list[Camera]:
-    angles = 2 * np.pi * np.arange(count) / count
-    middle = np.array(centre)
-    eyes = [middle + 3 * np.array([np.cos(a), np.sin(a), 0.3]) for a in angles]
-    return [look_at(eye, middle, UP, (64, 48)) for eye in eyes]
 
 
 def score(psnr: float, covered: float = 0.9) -> ViewScore:
@@ -62,7 +56,7 @@ def warnings_of(held_out=(), trained=(), **fields) -> tuple[str, ...]:
         ({"held_out": [score(22)], "trained": [score(30)]}, "8.0 dB worse"),
         ({"points": np.zeros((66, 3))}, "only 66 points"),
         ({"cameras": [look_at(np.array([0, -3, k / 99]), 0 * UP, UP, (64, 48)) for k in range(12)]}, "3.7 %"),
-        ({"cameras": (*ring(7), *ring(5, (500.0, 0, 0)))}, "2 groups far apart (7 and 5 photographs)"),
+        ({"cameras": (*ring(7), *ring(5, centre=500.0))}, "2 groups far apart (7 and 5 photographs)"),
         ({"matches": Matches(tuple("abcdefg"), (9,) * 6 + (-1,), (), frozenset(range(4)))}, "2 of 6"),
     ],
 )
@@ -132,17 +126,6 @@ def capture(names: Sequence[str], matches: Matches | None = None) -> Capture:
     return Capture(tuple(cameras), images, none, none.astype(np.uint8), masks=masks, matches=matches)
 
 
-def gaussians(count: int = 50) -> Gaussians:
-    rng = np.random.default_rng(1)
-    return Gaussians(
-        means=rng.uniform(-1, 1, (count, 3)),
-        log_scales=np.full((count, 3), -2.0),
-        quats_wxyz=np.tile([1.0, 0, 0, 0], (count, 1)),
-        opacity_logits=np.full(count, 2.0),
-        sh=rng.normal(size=(count, 1, 3)),
-    )
-
-
 def report(held_out: Sequence[str], **fields: object) -> TrainReport:
     scores = tuple(ViewScore(name, 21.4, 0.7123, 0.9) for name in held_out)
     stated = {
@@ -166,7 +149,7 @@ def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path)
         held_out_rule="one in 4",
     )
     others = [ViewScore(name, 30.0, 0.9, 0.9) for name in names if name not in names[2:4]]
-    write_reports(tmp_path, warned, capture(names, matches=matches), gaussians(), others)
+    write_reports(tmp_path, warned, capture(names, matches=matches), random_gaussians(50), others)
     assert read_report(tmp_path) == warned
     page = Read(tmp_path / PAGE)
     assert not {"link", "iframe", "light"} & {tag for tag, _ in page.tags}

@@ -83,6 +83,16 @@ def random_camera(
     return Camera(width, height, camera.fx * 1.1, camera.fy * 0.95, cx, cy, camera.world_to_camera)
 
 
+def ring(
+    count: int, size: tuple[int, int] = (64, 48), radius: float = 3.0, centre: Array | float = 0.0
+) -> list[Camera]:
+    """Cameras on a circle about z, a third of its radius above the centre, at which they look."""
+    around = 2 * np.pi * np.arange(count) / count
+    eyes = radius * np.stack([np.cos(around), np.sin(around), np.full(count, 1 / 3)], 1)
+    middle = np.zeros(3) + centre
+    return [look_at(middle + eye, middle, np.array([0.0, 0.0, 1.0]), size) for eye in eyes]
+
+
 def transforms(cameras: Sequence[Camera], files: Sequence[str], **more: object) -> str:
     """nerfstudio's transforms.json of cameras of one lens and their photographs; more: at its top."""
     one = cameras[0]

@@ -29,8 +29,9 @@ def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[st
             f"codec {field.codec.kind} of {field.codec.size}, encoder {field.encoder_id}"
         )
     if foreign.codec is not None:
-        every, told = np.arange(len(scene.gaussians)), [i for i in range(3) if foreign.levels[i] is not None]
-        lengths = np.linalg.norm(np.concatenate([foreign.rows(level, every) for level in told]), axis=1)
+        every = np.arange(len(scene.gaussians))
+        latents = np.concatenate([foreign.rows(level, every) for level in foreign.told])
+        lengths = np.linalg.norm(latents, axis=1)
         lengths = lengths[lengths > SHORTEST]
         if (np.abs(lengths - 1) > 0.01).any():
             low, high = lengths.min(), lengths.max()

@@ -41,14 +41,15 @@ TOPK = 4  # codewords of a Gaussian in LangSplatV2
 class Features:
     """The vectors, or latents, of N Gaussians at one level."""
 
+    path: Path  # the file that they come from
     dim: int  # numbers per vector
     # (n,) whole numbers below N -> (n, dim) float32 vectors of any length; zero for no features
     rows: Callable[[Array], Array]
 
 
-def whole_vectors(values: Array) -> Features:
+def whole_vectors(values: Array, path: Path) -> Features:
     """Return (N, D) floats: vectors of Occam's LGS and Feature-3DGS, latents of LangSplat."""
-    return Features(int(values.shape[1]), lambda indices: np.asarray(values[indices], np.float32))
+    return Features(path, int(values.shape[1]), lambda indices: np.asarray(values[indices], np.float32))
 
 
 def sparse_codes(logits: Array, codewords: Array, path: Path) -> Features:
@@ -73,7 +74,7 @@ def sparse_codes(logits: Array, codewords: Array, path: Path) -> Features:
             mixed += _largest_of_softmax(chosen[:, layer * size : (layer + 1) * size]) @ words
         return np.where(np.ptp(chosen, axis=1, keepdims=True) != 0, mixed, np.float32(0))
 
-    return Features(int(dim), rows)
+    return Features(path, int(dim), rows)
 
 
 def _largest_of_softmax(logits: Array) -> Array:
@@ -96,7 +97,7 @@ def rearranged(features: Features, partner: Array) -> Features:
         out[chosen >= 0] = features.rows(chosen[chosen >= 0])
         return out
 
-    return Features(features.dim, rows)
+    return replace(features, rows=rows)
 
 
 # One file of what people give to an import, recognised by what it holds, never by its name or length. A
@@ -149,7 +150,7 @@ class Clusters:
     @property
     def features(self) -> Features:
         """The vectors of the Gaussians."""
-        return rearranged(whole_vectors(self.vectors), self.index)
+        return rearranged(whole_vectors(self.vectors, self.path), self.index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +196,7 @@ def _from_ply(path: Path) -> Carrier:
         raise FormatError(f"{path}: {len(names)} properties semantic_*, not counted from 0 without gaps")
     vectors = np.stack([scene.extras[name].astype(np.float32) for name in ordered], axis=1)
     rest = {name: values for name, values in scene.extras.items() if name not in names}
-    return Carrier(path, FEATURE_3DGS, replace(scene, extras=rest), whole_vectors(vectors))
+    return Carrier(path, FEATURE_3DGS, replace(scene, extras=rest), whole_vectors(vectors, path))
 
 
 def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
@@ -259,7 +260,7 @@ def _language(elements: tuple[Any, ...], count: int, path: Path, tell: Tell) -> 
         wide = [flat for array in late if (flat := _wide(array, count)) is not None]
         if len(wide) > 1:
             tell(f"it has vectors {len(wide)} times, and the first are taken")
-        return (FEATURE_3DGS, whole_vectors(wide[0])) if wide else (PLAIN, None)
+        return (FEATURE_3DGS, whole_vectors(wide[0], path)) if wide else (PLAIN, None)
     if len(first) != count:
         raise FormatError(f"{path}: features {first.shape} for {count} Gaussians")
     if first.dtype.kind != "f":
@@ -268,7 +269,7 @@ def _language(elements: tuple[Any, ...], count: int, path: Path, tell: Tell) -> 
         return V2, sparse_codes(first, second, path)
     if second is not None and first.shape == second.shape == (count, INSTANCE):
         return OPEN_GAUSSIAN, None
-    return UNNAMED, whole_vectors(first)
+    return UNNAMED, whole_vectors(first, path)
 
 
 def _wide(array: Array | None, count: int) -> Array | None:

@@ -68,29 +68,36 @@ class ForeignScene:
     method: str
     scene: Scene  # without a language field
     levels: tuple[Features | None, ...] = (None, None, None)  # of subpart, part and whole, each for all N
-    paths: tuple[Path | None, ...] = (None, None, None)  # the files that these come from
     codec: AutoencoderCodec | None = None  # that the features are latents of; None where they are vectors
     clusters: Clusters | None = None  # that the features come from
     notes: tuple[str, ...] = ()  # what was taken for granted, for people
+
+    @property
+    def told(self) -> dict[int, Features]:
+        """The features that there are, by their level."""
+        return {level: features for level, features in enumerate(self.levels) if features is not None}
 
     @property
     def dim(self) -> int:
         """Length D of the vectors; 0 where there are no features."""
         if self.codec is not None:
             return self.codec.vector_dim
-        return next((features.dim for features in self.levels if features is not None), 0)
+        return next((features.dim for features in self.told.values()), 0)
+
+    @property
+    def first_path(self) -> Path:
+        """The file of the first features, for messages."""
+        return next(features.path for features in self.told.values())
 
     def rows(self, level: int, indices: Array) -> Array:
         """(n, D or d) float32 of any length at `level`, zero for none; FormatError if infinite or huge."""
-        features = self.levels[level]
-        if features is None:
-            raise ValueError(f"no features of level {LEVELS[level]}")
+        features = self.told[level]
         with np.errstate(invalid="ignore", over="ignore"):
             rows = features.rows(indices)
         faulty = np.flatnonzero(~(np.abs(rows) <= HUGE).all(1))
         if len(faulty):
             raise FormatError(
-                f"{self.paths[level]}: features are not finite, or huge, as those of Gaussian "
+                f"{features.path}: features are not finite, or huge, as those of Gaussian "
                 f"{indices[faulty[0]]}; the training has diverged, take an earlier checkpoint"
             )
         return rows
@@ -164,7 +171,6 @@ def _of_clusters(carrier: Carrier | None, clusters: Clusters) -> ForeignScene:
         OPEN_GAUSSIAN,
         _scene(carrier),
         (None, None, clusters.features),
-        (None, None, clusters.path),
         clusters=clusters,
         notes=("OpenGaussian knows no levels: whole is filled, subpart and part are empty",),
     )
@@ -189,7 +195,6 @@ def _of_levels(
     if base.method == OCCAM:  # which removes what no view saw, so that levels keep different Gaussians
         base = replace(base, scene=replace(base.scene, gaussians=all_gaussians(carriers)))
     levels: list[Features | None] = [None] * len(LEVELS)
-    paths: list[Path | None] = [None] * len(LEVELS)
     pruned = 0
     for number, carrier in zip(numbers, featured, strict=True):
         features = carrier.features
@@ -197,16 +202,15 @@ def _of_levels(
         rows = partners(base.gaussians.means, carrier, method == OCCAM)
         pruned += rows is not None
         levels[number] = features if rows is None else rearranged(features, rows)
-        paths[number] = carrier.path
-    told = ", ".join(f"{name} from {path}" for name, path in zip(LEVELS, paths, strict=True) if path)
+    told = ", ".join(f"{name} from {own.path}" for name, own in zip(LEVELS, levels, strict=True) if own)
     notes = [f"levels ({how}): {told}"]
-    empty = [name for name, path in zip(LEVELS, paths, strict=True) if path is None]
+    empty = [name for name, own in zip(LEVELS, levels, strict=True) if own is None]
     if empty:
         notes.append(f"without features: {', '.join(empty)}")
     if pruned:
         notes.append(f"{pruned} of the checkpoints lack some Gaussians, which have no features there")
     codec = autoencoder.codec if autoencoder is not None and method == LANGSPLAT else None
-    return ForeignScene(method, _scene(base), tuple(levels), tuple(paths), codec, notes=tuple(notes))
+    return ForeignScene(method, _scene(base), tuple(levels), codec, notes=tuple(notes))
 
 
 def _scene(carrier: Carrier) -> Scene:
@@ -249,7 +253,7 @@ def import_scene(
     encoder = load_text_encoder(encoder_id or OPEN_MODEL)
     if encoder.dim != foreign.dim:
         raise InputError(
-            f"{_first_path(foreign)}: vectors of {foreign.dim} numbers, those of the encoder {encoder.id} "
+            f"{foreign.first_path}: vectors of {foreign.dim} numbers, those of the encoder {encoder.id} "
             f"have {encoder.dim}; name the encoder they were made with by --encoder"
         )
     vocabulary = everyday_vocabulary(encoder, phrases)
@@ -257,10 +261,6 @@ def import_scene(
     latents, confidence = _latents(foreign, codec, progress)
     field = field_of((latents, confidence), codec, encoder, phrases)
     return replace(foreign.scene, language=replace(field, calibration=None)), loss
-
-
-def _first_path(foreign: ForeignScene) -> object:
-    return next(path for path in foreign.paths if path is not None)
 
 
 def _codec(
@@ -286,15 +286,11 @@ def _samples(foreign: ForeignScene, seed: int) -> tuple[Array, Array]:
     judges = min(JUDGED, len(order) // 6)
     samples = []
     for rows in (order[judges : judges + FITTED], order[:judges]):
-        parts = [_unit_rows(foreign, level, np.sort(rows)) for level in _told(foreign)]
+        parts = [_unit_rows(foreign, level, np.sort(rows)) for level in foreign.told]
         samples.append(np.concatenate([vectors[known] for vectors, known in parts]))
     if len(samples[0]) == 0:
-        raise InputError(f"{_first_path(foreign)}: no Gaussian has a meaning, all features are zero")
+        raise InputError(f"{foreign.first_path}: no Gaussian has a meaning, all features are zero")
     return samples[0], samples[1]
-
-
-def _told(foreign: ForeignScene) -> list[int]:
-    return [level for level in range(len(LEVELS)) if foreign.levels[level] is not None]
 
 
 def _has_meaning(vectors: Array) -> Array:
@@ -314,13 +310,12 @@ def _latents(foreign: ForeignScene, codec: Codec, progress: Progress) -> tuple[A
     count = len(foreign.scene.gaussians)
     latents = np.zeros((len(LEVELS), count, codec.latent_dim), codec.dtype)
     confidence = np.zeros((len(LEVELS), count), np.float32)
-    told = _told(foreign)
-    for done, level in enumerate(told):
+    for done, level in enumerate(foreign.told):
         for start in range(0, count, BLOCK):
             rows = np.arange(start, min(start + BLOCK, count))
             values, known = _unit_rows(foreign, level, rows)
             made = values if foreign.codec is not None else codec.encode(values)
             latents[level, rows[known]] = made[known]
             confidence[level, rows] = known
-            progress("reading features", (done + (start + len(rows)) / count) / len(told))
+            progress("reading features", (done + (start + len(rows)) / count) / len(foreign.told))
     return latents, confidence

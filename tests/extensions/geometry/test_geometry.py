@@ -48,7 +48,7 @@ from langsplat_core.io import apart
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.scene import NO_NODE, NO_ORIGIN, Gaussians, Scene, TaughtWord, look_at
+from langsplat_core.scene import NO_NODE, NO_ORIGIN, Gaussians, Scene, look_at
 from langsplat_core.scene.transform import (
     AXES,
     IDENTITY,
@@ -59,10 +59,19 @@ from langsplat_core.scene.transform import (
     turning,
 )
 from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, named_scene
-from tests.support.file_kinds import FileKind, drawable_share, few_and_many, in_json
+from tests.support.file_kinds import FileKind, drawable_share, few_and_many, in_json, taught_word
 from tests.support.file_samples import glb_column, parts, random_field
 from tests.support.processes import refusal, run
-from tests.support.scenes import DEMO, FLOOR, WALL, box_room, random_camera, random_gaussians, tree_of_wholes
+from tests.support.scenes import (
+    DEMO,
+    FLOOR,
+    WALL,
+    box_room,
+    random_camera,
+    random_gaussians,
+    ring,
+    tree_of_wholes,
+)
 
 pytest.importorskip("open3d")
 
@@ -253,8 +262,8 @@ N = 40
 
 def scene(seed: int, name: str, degree: int = 1) -> Scene:
     field = random_field(N, "codebook", phrases=(f"red {name}",), seed=seed)
-    taught = TaughtWord(name, 2, np.eye(1, field.codec.vector_dim, dtype=np.float32), np.zeros(1, np.float32))
-    field = replace(field, tree=tree_of_wholes(np.arange(N) // 9), taught=(taught,))
+    taught = (taught_word(name, field.codec.vector_dim),)
+    field = replace(field, tree=tree_of_wholes(np.arange(N) // 9), taught=taught)
     cameras = random_camera(seed), random_camera(seed + 1)
     return Scene(random_gaussians(N, seed, sh_degree=degree), field, cameras)
 
@@ -580,8 +589,7 @@ def test_a_ply_holds_a_mesh(tmp_path):
 
 
 ASIDE = np.array([2.0, 1.0, -1.5])
-EYES = [ASIDE + 6 * np.array([np.cos(angle), np.sin(angle), 0.3]) for angle in range(14)]
-RING = tuple(look_at(eye, ASIDE, AXES["z"], (320, 320)) for eye in EYES)
+RING = tuple(ring(14, (320, 320), 6.0, ASIDE))
 
 
 @pytest.mark.parametrize(("cameras", "metres"), [((), None), (RING, 0.25)])
