@@ -1,7 +1,8 @@
 """A viewer without a window: a fake picture, fake files, and frames on demand."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +18,8 @@ from langsplat_viewer.marks import Marks, unmarked
 from langsplat_viewer.rendering.renderer import Backend, open_renderer
 from langsplat_viewer.rendering.request import Clip, RenderRequest, Splats
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
-from langsplat_viewer.viewer import Viewer
-from tests.support.fakes import PER_BLOB, WORDS, blob_scene
+from langsplat_viewer.viewer import Services, Viewer
+from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene
 
 SCENES = {
     "blobs.ply": blob_scene(),
@@ -82,6 +83,14 @@ def load(path: Path) -> Scene:
     if path.name not in SCENES:
         raise FormatError(f"{path}: broken; export it again")
     return SCENES[path.name]
+
+
+@contextmanager
+def new_viewer() -> Iterator[Viewer]:
+    """Nothing is open."""
+    made = Viewer(Services(load, lambda encoder_id: FakeEncoder()), surface=FakeSurface())
+    yield made
+    made.worker.close()
 
 
 def settle(viewer: Viewer, seconds: float = 120.0) -> None:

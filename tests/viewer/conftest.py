@@ -10,17 +10,16 @@ import pytest
 
 from langsplat_viewer import options, program
 from langsplat_viewer.actions import settings
-from langsplat_viewer.viewer import Services, Viewer
+from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import FakeEncoder
-from tests.support.windowless import FakeSurface, ask, load, open_scene
+from tests.support.windowless import ask, new_viewer, open_scene
 
 
 @pytest.fixture
 def viewer() -> Iterator[Viewer]:
     """Nothing is open."""
-    made = Viewer(Services(load, lambda encoder_id: FakeEncoder()), surface=FakeSurface())
-    yield made
-    made.worker.close()
+    with new_viewer() as made:
+        yield made
 
 
 @pytest.fixture

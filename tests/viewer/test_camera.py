@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, affine
 from langsplat_core.config import PictureConfig
 from langsplat_core.scene import Camera, Intrinsics, Scene
 from langsplat_viewer.actions import editing, settings, viewpoint
@@ -297,8 +297,7 @@ ODD = Intrinsics(500, 400, 450, 300, 180, 260)  # a principal point off the cent
 @pytest.mark.parametrize("inner", [WIDE, TALL, ODD])
 def test_the_share_is_held_and_a_step_nearer_loses_it(sample, inner):
     def held(eye: Array) -> float:
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = ROTATION, -ROTATION @ eye
+        matrix = affine(ROTATION, -ROTATION @ eye)
         size = int(inner.width), int(inner.height)
         return share(sample, Camera(*size, inner.fx, inner.fy, inner.cx, inner.cy, matrix))
 

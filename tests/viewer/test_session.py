@@ -6,8 +6,7 @@ import tracemalloc
 import weakref
 import zlib
 from base64 import b64encode
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -33,20 +32,18 @@ from langsplat_viewer.projects import (
 )
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.session import Note, Preferences, Query, Ruler, Things
-from langsplat_viewer.viewer import GESTURE, MOST_STEPS, Services, Viewer
-from tests.support.fakes import FakeEncoder
+from langsplat_viewer.viewer import GESTURE, MOST_STEPS, Viewer
 from tests.support.file_kinds import FileKind, few_and_many, in_json
 from tests.support.windowless import (
     SCENES,
-    FakeSurface,
     act,
     answer,
     ask,
     blob,
     errors,
     go,
-    load,
     marked,
+    new_viewer,
     open_scene,
     phrases,
     render_image,
@@ -275,15 +272,6 @@ def save_session(opened: Viewer, folder: Path) -> Path:
     path = saving.save_project(opened, folder)
     assert path.name == "blobs-001.langsplat"
     return path
-
-
-@contextmanager
-def new_viewer() -> Iterator[Viewer]:
-    """Nothing is open."""
-    services = Services(load, lambda encoder_id: FakeEncoder())
-    made = Viewer(services, surface=FakeSurface())
-    yield made
-    made.worker.close()
 
 
 @pytest.fixture

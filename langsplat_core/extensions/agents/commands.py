@@ -171,9 +171,9 @@ class Door:
         view = view.within(MOST_SIDE)
         said = f"by {''.join(number)}{view.name or 'a new camera'}, {view.width} x {view.height} pixels"
         if answer is not None and answer.place is not None:
-            (pixel,), (depth,) = view.project(answer.place[None])
-            inside = depth > 0 and ((pixel >= 0) & (pixel < (view.width, view.height))).all()
-            at = f"pixel {pixel[0]:.0f} {pixel[1]:.0f}" if inside else "outside of this image"
+            pixels, depths = view.project(answer.place[None])
+            (x, y), inside = pixels[0], view.in_image(pixels, depths).all()
+            at = f"pixel {x:.0f} {y:.0f}" if inside else "outside of this image"
             said += f"; {phrase}: {answer.said}, place {unit.place(answer.place)} {unit.name}, {at}"
         colours = render(shown, view).colours
         return np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8), said

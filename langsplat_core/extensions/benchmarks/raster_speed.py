@@ -14,7 +14,7 @@ import platform
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from importlib.metadata import version
@@ -76,7 +76,8 @@ class BenchRaster:
                 raise InputError(f"{path}: no such file; check the spelling and the folder")
         with TerminalProgress() as progress:
             machine, rows = run_plan(self, progress)
-        text = report_text(machine, rows)
+        told = "".join(f"- {name}: {value}\n" for name, value in machine.items())
+        text = f"# Rasterizers: time against error\n\n{told}\n{table(rows)}\n{_NOTES}"
         figures = {"machine": machine, "measurements": [asdict(row) for row in rows]}
         write_report(self.out, "raster", text, figures)
         print(text)
@@ -381,12 +382,6 @@ def reference_window(
 
 
 # The report.
-
-
-def report_text(machine: Mapping[str, object], rows: Sequence[Measurement]) -> str:
-    """Return the machine and the measurements as Markdown."""
-    told = "".join(f"- {name}: {value}\n" for name, value in machine.items())
-    return f"# Rasterizers: time against error\n\n{told}\n{table(rows)}\n{_NOTES}"
 
 
 def table(rows: Sequence[Measurement]) -> str:

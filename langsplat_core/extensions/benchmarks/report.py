@@ -162,11 +162,6 @@ class BenchmarkReport:
     queries: tuple[QueryScore, ...]
     left_out: tuple[str, ...]  # labels that cannot be asked, each "frame: phrase (why)"
 
-    @property
-    def scenes(self) -> list[str]:
-        """Names of the scenes."""
-        return list(dict.fromkeys(query.scene for query in self.queries))
-
 
 def means(queries: Sequence[QueryScore], group: Callable[[QueryScore], Hashable] = id) -> Means:
     """Return the mean of the means of groups of queries, by default of queries; zeros without any."""
@@ -183,7 +178,8 @@ def means(queries: Sequence[QueryScore], group: Callable[[QueryScore], Hashable]
 def summary(report: BenchmarkReport) -> dict[str, Means]:
     """Return the table's rows: scenes, then means of scenes, frames, queries, answered and held-out ones."""
     queries = report.queries
-    rows = {name: means([one for one in queries if one.scene == name]) for name in report.scenes}
+    scenes = dict.fromkeys(query.scene for query in queries)
+    rows = {name: means([one for one in queries if one.scene == name]) for name in scenes}
     rows["macro, mean of scenes"] = means(queries, lambda query: query.scene)
     rows["macro, mean of frames"] = means(queries, lambda query: (query.scene, query.frame))
     rows["micro, mean of queries"] = means(queries)

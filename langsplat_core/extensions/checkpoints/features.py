@@ -19,7 +19,7 @@ from langsplat_core.extensions.checkpoints.langsplat_files import (
     autoencoder_from,
     gaussians_of,
     is_autoencoder,
-    is_layer,
+    layer_name,
     model_tuple,
 )
 from langsplat_core.extensions.checkpoints.unpickling import (
@@ -239,7 +239,7 @@ def _from_torch(content: Any, path: Path) -> Part:
     mapping = plain_mapping(content)
     named = {"": content} if mapping is None else mapping
     if is_autoencoder(named):
-        report_losses(path, [unread("entries", (quoted(name, 40) for name in named if not is_layer(name)))])
+        report_losses(path, [unread("entries", (quoted(name, 40) for name in named if not layer_name(name)))])
         return Autoencoder(path, autoencoder_from(named, path))
     arrays = {str(name): plain_array(value, path) for name, value in named.items()}
     found = {name: array for name, array in arrays.items() if array is not None}

@@ -33,13 +33,13 @@ Layer = dict[str, Array]
 
 def is_autoencoder(content: Mapping[Any, Any]) -> bool:
     """Return whether these are weights of an encoder and a decoder."""
-    parts = {found[1] for name in content if isinstance(name, str) and (found := _NAME.fullmatch(name))}
+    parts = {found[1] for name in content if (found := layer_name(name))}
     return parts == {"encoder", "decoder"}
 
 
-def is_layer(name: Any) -> bool:
-    """Return whether an entry's name is that of a layer's weights."""
-    return isinstance(name, str) and _NAME.fullmatch(name) is not None
+def layer_name(name: object) -> re.Match[str] | None:
+    """Return part, number and kind of a layer's weights of that name; None for another entry."""
+    return _NAME.fullmatch(name) if isinstance(name, str) else None
 
 
 def autoencoder_from(content: Mapping[str, Any], path: Path) -> AutoencoderCodec:
@@ -63,7 +63,7 @@ def _layers(content: Mapping[str, Any], part: str, path: Path) -> list[Layer]:
     """Named weights of every layer that has any, in the network's order."""
     layers: dict[int, Layer] = {}
     for name, value in content.items():
-        found = _NAME.fullmatch(name) if isinstance(name, str) else None
+        found = layer_name(name)
         array = plain_array(value, path) if found and found[1] == part else None
         if found and array is not None:
             layers.setdefault(int(found[2]), {})[found[3]] = array.astype(np.float64)

@@ -69,8 +69,9 @@ def register(
         unit, scaled = moving.metres_per_unit / fixed.metres_per_unit, False
     elif scaled:
         unit = fixed.bounds()[1] / moving.bounds()[1]
-    turns = quarter_turns(fixed)
-    radius = fixed.bounds()[1]
+    centre, radius = fixed.bounds()
+    # Rooms are nearly alike from all sides.
+    turns = [rotating(fixed.up(), -90.0 * quarter).about(centre).matrix for quarter in range(4)]
     mine, theirs = (sample_surface(scene.gaussians, SAMPLES, seed)[0] for scene in (moving, fixed))
     best: Registration | None = None
     sizes = [unit * factor for factor in SIZES] if scaled else [unit] * AGAIN
@@ -86,12 +87,6 @@ def register(
     progress(STAGE, 1.0)
     assert best is not None
     return best
-
-
-def quarter_turns(scene: Scene) -> list[Array]:
-    """Four (4, 4) rotations about up through the middle of a scene: rooms are nearly alike from all sides."""
-    centre, up = scene.bounds()[0], scene.up()
-    return [rotating(up, -90.0 * quarter).about(centre).matrix for quarter in range(4)]
 
 
 def _aligned(

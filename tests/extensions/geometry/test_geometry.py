@@ -336,9 +336,8 @@ def test_merge_refuses_scenes_of_two_encoders():
 
 
 def transform_files(_):
-    turned = np.eye(4)
-    turned[:3, :3], turned[:3, 3] = 0.5 * Rotation.from_rotvec([0.3, 1, 0]).as_matrix(), (1, 2, 3)
-    return [json.dumps({"matrix": matrix.tolist(), "scale": 1.0}).encode() for matrix in (np.eye(4), turned)]
+    turned = similarity((0.3, 1, 0), (1, 2, 3), 0.5)
+    return [json.dumps({"matrix": to.matrix.tolist(), "scale": 1.0}).encode() for to in (IDENTITY, turned)]
 
 
 def laid_over(path):

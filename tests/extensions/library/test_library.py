@@ -12,7 +12,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, affine
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.extensions.library import commands as library_commands
 from langsplat_core.extensions.library.changes import Change, changes, colour_term, to_lab
@@ -311,8 +311,7 @@ def test_another_frame_and_scale_change_nothing(scene):
     g = scene.gaussians
     means, quats = 2 * g.means @ turn.T + (3.0, -1, 2), np.tile(np.sqrt([0.5, 0, 0.5, 0]), (len(g), 1))
     turned = with_gaussians(scene, means=means, log_scales=g.log_scales + np.log(2), quats_wxyz=quats)
-    into = np.eye(4)
-    into[:3, :3], into[:3, 3] = turn.T / 2, -turn.T @ (3.0, -1, 2) / 2
+    into = affine(turn.T / 2, -turn.T @ (3.0, -1, 2) / 2)
     second = replace(turned, cameras=())  # those of the first are enough
     assert compared(scene, second, into) == ()
     (change,) = compared(scene, without(second, MUG), into)
