@@ -170,7 +170,7 @@ def arc(centre: tuple[float, float], radius: float, start: float, stop: float, c
     )
 
 
-def slab(outline: list[tuple[float, float]], thickness: float, cell: float = 0.02) -> TriMesh:
+def slab(outline: list[tuple[float, float]], thickness: float) -> TriMesh:
     """Return a convex polygon (counter-clockwise, x and z) extruded along y by `thickness`, centred in y."""
     points = np.array(outline)
     n = len(points)
@@ -186,7 +186,7 @@ def slab(outline: list[tuple[float, float]], thickness: float, cell: float = 0.0
         vertices = np.stack([front[i], front[j], back[j], back[i]])
         triangles = np.array([[0, 2, 1], [0, 3, 2]])
         faces.append(TriMesh(vertices, triangles, _vertex_normals(vertices, triangles)))
-    return _refined(join(faces), cell)
+    return _refined(join(faces), 0.02)
 
 
 def _refined(mesh: TriMesh, cell: float) -> TriMesh:

@@ -45,13 +45,13 @@ TAUGHT = (
 )
 
 
-def full_field(kind: str = "autoencoder", calibration: Calibration | None = CALIBRATION) -> LanguageField:
+def full_field(kind: str = "autoencoder") -> LanguageField:
     leaves = (np.arange(N) // 7).astype(np.int32)
     leaves[::5] = NO_NODE
     parents = np.array([9, 9, 9, 10, 10, 10, 10, 10, 10, NO_NODE, NO_NODE], np.int32)
     levels = np.array([0] * 9 + [1, 2], np.uint8)
     tree = Tree(leaves, parents, levels, np.arange(22, dtype=np.uint16).reshape(11, 2))
-    made = replace(random_field(N, kind), tree=tree, temperature=11.7, found=0.73, calibration=calibration)
+    made = replace(random_field(N, kind), tree=tree, temperature=11.7, found=0.73, calibration=CALIBRATION)
     return replace(made, taught=TAUGHT)
 
 

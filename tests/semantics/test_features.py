@@ -110,10 +110,10 @@ def test_each_row_describes_its_own_region() -> None:
     np.testing.assert_allclose(vectors, [[0, 0, 1], [1, 0, 0], [1, 0, 0]], atol=1e-4)
 
 
-def random_features(seed: int = 0, count: int = 7) -> ImageFeatures:
-    rng = np.random.default_rng(seed)
-    vectors = unit(rng.normal(size=(count, 512)).astype(np.float32))
-    return ImageFeatures(rng.integers(-1, count, (3, 9, 8)).astype(np.int32), vectors)
+def random_features() -> ImageFeatures:
+    rng = np.random.default_rng(0)
+    vectors = unit(rng.normal(size=(7, 512)).astype(np.float32))
+    return ImageFeatures(rng.integers(-1, 7, (3, 9, 8)).astype(np.int32), vectors)
 
 
 def test_a_store_returns_what_was_saved(tmp_path: Path) -> None:

@@ -36,12 +36,12 @@ from tests.support.tiny_models import change_json, tiny_sam, tiny_sam2, tiny_sam
 pytestmark = pytest.mark.long
 
 
-def rendering(seed: int = 0, height: int = 120, width: int = 160) -> tuple[np.ndarray, np.ndarray]:
+def rendering() -> tuple[np.ndarray, np.ndarray]:
     """Three shaded balls on a grey floor: image (H, W, 3) uint8 and (H, W) which ball, -1 for the floor."""
-    rng = np.random.default_rng(seed)
-    y, x = np.mgrid[0:height, 0:width] * (120 / height)
-    image = np.full((height, width, 3), 0.55)
-    ball = np.full((height, width), -1)
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[0:120, 0:160]
+    image = np.full((120, 160, 3), 0.55)
+    ball = np.full((120, 160), -1)
     paints = [(0.8, 0.15, 0.1), (0.15, 0.6, 0.2), (0.15, 0.25, 0.8)]
     for k, (cx, cy, r) in enumerate([(35, 40, 24), (85, 75, 28), (125, 30, 18)]):
         u, v = (x - cx) / r, (y - cy) / r

@@ -33,9 +33,9 @@ from tests.support.scenes import transforms, unturned_gaussians
 COUNT = 64
 
 
-def everyday_about(canonical: Array, spread: float = 0.2, seed: int = 8) -> Array:
+def everyday_about(canonical: Array, spread: float = 0.2) -> Array:
     """Return (64, D) float32 unit vectors around a (D,) canonical phrase: nothing in particular fits them."""
-    noise = np.random.default_rng(seed).normal(scale=spread, size=(COUNT, len(canonical)))
+    noise = np.random.default_rng(8).normal(scale=spread, size=(COUNT, len(canonical)))
     return unit(canonical + noise).astype(np.float32)
 
 
@@ -147,8 +147,8 @@ def named_field(codebook: bool = True) -> LanguageField:
     return replace(made, codec=codec, latents=codes.argmax(1).astype(np.uint16).reshape(3, -1, 1))
 
 
-def named_scene(codebook: bool = True, path: Path | None = None) -> Scene:
-    return Scene(blobs(), named_field(codebook), cameras(), path)
+def named_scene(codebook: bool = True) -> Scene:
+    return Scene(blobs(), named_field(codebook), cameras())
 
 
 def as_trained(path: Path, scene: Scene, features: Sequence[ImageFeatures]) -> None:

@@ -278,13 +278,14 @@ def write_folder(folder: Path, files: dict[str, bytes]) -> Path:
     return folder
 
 
-def random_codec(kind: str, d: int = 3, big: int = 16, seed: int = 0) -> Codec:
+def random_codec(kind: str, seed: int = 0) -> Codec:
+    """Of vectors of 16 numbers, with latents of 3 where they blend."""
     rng = np.random.default_rng(seed)
     if kind == "codebook":
-        vectors = unit(rng.normal(size=(11, big))).astype(np.float32)
+        vectors = unit(rng.normal(size=(11, 16))).astype(np.float32)
         return CodebookCodec(vectors, rng.uniform(size=(11, 3)).astype(np.float32))
     if kind == "linear":
-        return LinearCodec(np.linalg.qr(rng.normal(size=(big, d)))[0].T.astype(np.float32).copy())
+        return LinearCodec(np.linalg.qr(rng.normal(size=(16, 3)))[0].T.astype(np.float32).copy())
 
     def layers(*widths: int) -> tuple[tuple[Array, Array], ...]:
         return tuple(
@@ -292,7 +293,7 @@ def random_codec(kind: str, d: int = 3, big: int = 16, seed: int = 0) -> Codec:
             for into, out in pairwise(widths)
         )
 
-    return AutoencoderCodec(layers(big, 8, d), layers(d, 5, 8, big))
+    return AutoencoderCodec(layers(16, 8, 3), layers(3, 5, 8, 16))
 
 
 def random_field(
@@ -367,7 +368,7 @@ def _smallest_three(xyzw: Array) -> bytes:
     return struct.pack("<I", word)
 
 
-def spz_blocks(g: Gaussians, version: int, bits: int = 12, turn: Array = HALF_TURN) -> list[bytes]:
+def spz_blocks(g: Gaussians, version: int, turn: Array = HALF_TURN) -> list[bytes]:
     """The attributes in the order of the file, unzipped."""
     blocks: list[list[bytes]] = [[], [], [], [], [], []]
     sh = turned_coefficients(g.sh, turn)
@@ -376,7 +377,7 @@ def spz_blocks(g: Gaussians, version: int, bits: int = 12, turn: Array = HALF_TU
         if version == 1:
             blocks[0].append(struct.pack("<3e", *mean))
         else:
-            codes = (round(float(x) * 2**bits) for x in mean)
+            codes = (round(float(x) * 2**12) for x in mean)
             blocks[0].append(b"".join(code.to_bytes(3, "little", signed=True) for code in codes))
         blocks[1].append(bytes([_opacity(g, i)]))
         blocks[2].append(bytes(_byte(255 * (0.5 + 0.15 * float(c))) for c in g.sh[i, 0]))
@@ -393,17 +394,11 @@ def spz_blocks(g: Gaussians, version: int, bits: int = 12, turn: Array = HALF_TU
 
 
 def spz_bytes(
-    g: Gaussians,
-    version: int = 3,
-    *,
-    flags: int = 0,
-    records: bytes = b"",
-    bits: int = 12,
-    turn: Array = HALF_TURN,
+    g: Gaussians, version: int = 3, *, flags: int = 0, records: bytes = b"", turn: Array = HALF_TURN
 ) -> bytes:
     """A whole file; `records` are extensions, which need the flag 2."""
-    blocks = spz_blocks(g, version, bits, turn)
-    head = b"NGSP" + struct.pack("<IIBBB", version, len(g), g.sh_degree, bits, flags)
+    blocks = spz_blocks(g, version, turn)
+    head = b"NGSP" + struct.pack("<IIBBB", version, len(g), g.sh_degree, 12, flags)
     if version < 4:
         return gzip.compress(head + b"\0" + b"".join(blocks) + records)
     blocks = [block for block in blocks if block]

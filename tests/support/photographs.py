@@ -100,12 +100,10 @@ def sensor_picture(intrinsics: PhotoIntrinsics, pose: bytes) -> Image.Image:
     return Image.fromarray(photograph(fine, np.frombuffer(pose).reshape(4, 4))).reduce(3)
 
 
-def write_photos(
-    folder: Path, intrinsics: PhotoIntrinsics, matrices: list[Array], stem: str = "view"
-) -> list[str]:
-    """PNG files ``<stem>_<index>.png`` in `folder`; returns their names."""
+def write_photos(folder: Path, intrinsics: PhotoIntrinsics, matrices: list[Array]) -> list[str]:
+    """PNG files ``view_<index>.png`` in `folder`; returns their names."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = [f"{stem}_{index}.png" for index in range(len(matrices))]
+    names = [f"view_{index}.png" for index in range(len(matrices))]
     for name, matrix in zip(names, matrices, strict=True):
         sensor_picture(intrinsics, matrix.tobytes()).save(folder / name)
     return names
@@ -201,9 +199,7 @@ def block(left: int, top: int, right: int, bottom: int, size: tuple[int, int] = 
     return mask
 
 
-def lerf_frame(
-    folder: Path, name: str, objects: Sequence[tuple[str, Polygon]], size: tuple[int, int] = SIZE
-) -> Path:
+def lerf_frame(folder: Path, name: str, objects: Sequence[tuple[str, Polygon]]) -> Path:
     """label file `name`.json in `folder`; boxes are the polygons' own."""
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
@@ -212,7 +208,7 @@ def lerf_frame(
         box = [*corners.min(0).tolist(), *corners.max(0).tolist()]
         rows.append({"category": category, "bbox": box, "segmentation": polygon, "group": 1})
     path = folder / f"{name}.json"
-    info = {"name": f"{name}.jpg", "width": size[0], "height": size[1], "depth": 3, "note": ""}
+    info = {"name": f"{name}.jpg", "width": SIZE[0], "height": SIZE[1], "depth": 3, "note": ""}
     path.write_text(json.dumps({"info": info, "objects": rows}))
     return path
 

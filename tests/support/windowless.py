@@ -93,20 +93,20 @@ def new_viewer() -> Iterator[Viewer]:
     made.worker.close()
 
 
-def settle(viewer: Viewer, seconds: float = 120.0) -> None:
+def settle(viewer: Viewer) -> None:
     """Frames until the worker has nothing left to do."""
 
     def frame() -> None:
         viewer.take_results()
         viewpoint.tick(viewer, 0.0)
 
-    _repeat(frame, lambda: viewer.worker.current is not None, seconds)
+    _repeat(frame, lambda: viewer.worker.current is not None)
     frame()
 
 
-def _repeat(step: Callable[[], object], goes_on: Callable[[], object], seconds: float) -> None:
+def _repeat(step: Callable[[], object], goes_on: Callable[[], object]) -> None:
     """Steps, one after another, as long as something goes on."""
-    end = time.monotonic() + seconds
+    end = time.monotonic() + 120
     while goes_on():
         assert time.monotonic() < end, "it never finished"
         step()
@@ -138,9 +138,9 @@ def ask(viewer: Viewer, *phrases: str) -> None:
     settle(viewer)
 
 
-def recorded(viewer: Viewer, seconds: float = 60.0) -> None:
+def recorded(viewer: Viewer) -> None:
     """Until the recorder has nothing left to do."""
-    _repeat(viewer.take_results, lambda: viewer.recorder.current is not None, seconds)
+    _repeat(viewer.take_results, lambda: viewer.recorder.current is not None)
     viewer.take_results()
 
 
@@ -187,7 +187,7 @@ def on_screen(canvas: Canvas) -> list[np.ndarray]:
 
 def rest(canvas: Canvas, state: ViewerState, now: float) -> None:
     """Update until the fine picture is there, whoever rasterizes it."""
-    _repeat(lambda: None, lambda: canvas.update(state, now) and canvas.waits, 60)
+    _repeat(lambda: None, lambda: canvas.update(state, now) and canvas.waits)
 
 
 # The scene of three blobs: what is selected, hidden and deleted in it, and a flight around it.
