@@ -130,7 +130,7 @@ TITLE = "LangSplat viewer"
 DEFAULT_SIZE = (1280, 800)
 IDLE_FPS = 0.01  # frames per second while nothing happens: an event, or the worker, wakes the window at once
 AWAKE_SECONDS = 0.4  # after an event: tooltips come, and widgets take their places in a few frames
-AWAKE_FRAMES = 4  # after news from the worker, for the same reason
+AWAKE_FRAMES = 4  # after an event, and after news from the worker, for the same reason
 
 RECORDER_PATIENCE = 5.0  # seconds for a film that is being drawn to leave nothing half written
 
@@ -342,7 +342,8 @@ class Window:
         news = (viewer.worker.delivered, viewer.recorder.delivered)
         seen = (state.view, state.nothing, state.hover, state.leaving, state.may_close)
         now = (news, seen, self.unfinished, viewer.watch.changed)
-        self._frames = AWAKE_FRAMES if now != self._last else max(self._frames - 1, 0)
+        heard = len(imgui.get_current_context().input_events_trail) > 0  # in this frame, however slow it is
+        self._frames = AWAKE_FRAMES if heard or now != self._last else max(self._frames - 1, 0)
         self._last = now
         awaits = any(canvas.waits for canvas in self._canvases)  # and is woken
         busy = (

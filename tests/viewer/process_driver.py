@@ -32,7 +32,7 @@ from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.canvas import MOVING_BUDGET
 from langsplat_viewer.options import ViewerOptions
 from langsplat_viewer.viewer import Services
-from langsplat_viewer.window import Window, open_window
+from langsplat_viewer.window import AWAKE_SECONDS, Window, open_window
 from tests.support.fakes import FakeEncoder
 from tests.support.scenes import repeated
 
@@ -58,22 +58,23 @@ class Orbiting:
     cpu_to_sharp: list[float] = field(default_factory=list)
 
 
+def cpu() -> float:
+    """Return the processor time of this process, seconds."""
+    times = psutil.Process().cpu_times()
+    return times.user + times.system
+
+
 class Rider:
     """Moves the camera once a frame and keeps time."""
 
     def __init__(self, window: Window, seconds: float) -> None:
         self.window, self.seconds = window, seconds
         self.seen = Orbiting()
-        self._process = psutil.Process()
         self._moving_since: float | None = None
         self._resting_since: float | None = None
         self._started = self._waited = 0.0
         self._pictures: list[float] = []
         self._framed = self._longest = 0.0
-
-    def _cpu(self) -> float:
-        times = self._process.cpu_times()
-        return times.user + times.system
 
     def frame(self) -> None:
         viewer, now = self.window.viewer, time.monotonic()
@@ -86,7 +87,7 @@ class Rider:
         elif self._resting_since is not None:
             self._rest(now)
         elif self._moving_since is None:
-            self._moving_since, self._started, self._pictures = now, self._cpu(), [0.0]
+            self._moving_since, self._started, self._pictures = now, cpu(), [0.0]
             self._longest, self.window.idles = 0.0, False
             self._turn()
         elif now - self._moving_since < self.seconds:
@@ -105,12 +106,12 @@ class Rider:
     def _stop(self, now: float) -> None:
         stats, count = self.window.viewer.state.stats, len(self._pictures)
         self.seen.pictures_per_second.append(count / (now - self._moving_since))
-        self.seen.cpu_per_picture.append((self._cpu() - self._started) / count)
+        self.seen.cpu_per_picture.append((cpu() - self._started) / count)
         self.seen.picture.append(statistics.median(self._pictures))
         self.seen.sizes.append((stats.width, stats.height))
         self.seen.merged.append(stats.merged)
         self.seen.longest_moving.append(self._longest)
-        self._resting_since, self._started, self._longest = now, self._cpu(), 0.0
+        self._resting_since, self._started, self._longest = now, cpu(), 0.0
         self.window.idles = True
 
     def _rest(self, now: float) -> None:
@@ -118,7 +119,7 @@ class Rider:
             return
         self.seen.longest_resting.append(self._longest)
         self.seen.sharp_after.append(now - self._resting_since)
-        self.seen.cpu_to_sharp.append(self._cpu() - self._started)
+        self.seen.cpu_to_sharp.append(cpu() - self._started)
         self._moving_since = self._resting_since = None
         if len(self.seen.sharp_after) == ROUNDS:
             glfw.set_window_should_close(glfw_window_hello_imgui(), True)
@@ -180,22 +181,30 @@ def window_of(path: Path) -> Window:
 def idle(path: Path) -> None:
     window = window_of(path)
     params = window.params()
-    frames, gui = [], params.callbacks.show_gui
+    frames, gui, is_slow = 0, params.callbacks.show_gui, False
 
     def counted() -> None:
-        frames.append(time.monotonic())
+        nonlocal frames
+        frames += 1
         gui()
+        time.sleep(1.5 * AWAKE_SECONDS * is_slow)
 
     def measure() -> None:
         while window.viewer.state.scene is None or window.viewer.worker.current is not None:
             time.sleep(0.05)
-        time.sleep(SETTLE)
-        process = psutil.Process()
-        before, count = process.cpu_times(), len(frames)
+        nonlocal is_slow
+        count = -1
+        while count != frames:  # something may still happen, where the cores are busy
+            count = frames
+            time.sleep(SETTLE)
+        before = cpu()
         time.sleep(MEASURE)
-        after = process.cpu_times()
-        used = after.user + after.system - before.user - before.system
-        print(f"frames {len(frames) - count} share {used / MEASURE:.4f}", flush=True)
+        print(f"frames {frames - count} share {(cpu() - before) / MEASURE:.4f}")
+        is_slow, count = True, frames
+        imgui.get_io().add_mouse_pos_event(400, 300)
+        glfw.post_empty_event()
+        time.sleep(MEASURE)
+        print(f"awake {frames - count}", flush=True)
         close()
 
     params.callbacks.show_gui = counted
@@ -204,11 +213,7 @@ def idle(path: Path) -> None:
 
 
 def leave(path: Path) -> None:
-    def wait() -> None:
-        time.sleep(3)
-        close()
-
-    threading.Thread(target=wait, daemon=True).start()
+    threading.Timer(3, close).start()
     options = ViewerOptions(size="860x620", fresh=True)
     open_window(path, options, Services(slow_load, lambda encoder_id: FakeEncoder()))
 
@@ -260,10 +265,8 @@ def typing(window: Window) -> Iterator[None]:
     assert state.session.picture.display == "rgb"
     state.drafts["##phrase"] = "mug"
     yield from press(window, "Ctrl+F", "enter", *"plant", "enter", *"bo")
-    assert ([query.phrase for query in state.session.queries], state.drafts["##phrase"]) == (
-        ["mug", "plant"],
-        "bo",
-    )
+    asked = [query.phrase for query in state.session.queries]
+    assert (asked, state.drafts["##phrase"]) == (["mug", "plant"], "bo")
     yield from press(window, "tab")
     assert (state.drafts["##phrase"], state.show_panel) == ("book", True)
     yield from press(window, "up_arrow")

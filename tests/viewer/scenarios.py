@@ -860,13 +860,12 @@ def travel_by_keys(s: Any) -> None:
         seen.add(imgui.internal.get_focus_id())
     assert len(seen) > 5
     assert s.state.show_panel
+    s.state.preferences = s.state.preferences.with_recent(s.folder / "plain.ply")
     for words, done in (
         ("light theme", lambda: s.state.preferences.theme == "light"),
         ("larger text", lambda: s.state.preferences.ui_scale == 1.25),
         ("open plain", lambda: s.state.path.name == "plain.ply"),
     ):
-        if words == "open plain":
-            s.state.preferences = s.state.preferences.with_recent(s.folder / "plain.ply")
         s.key("Ctrl+Shift+P", frames=3)
         s.ctx.key_chars_append_enter(words)
         s.until(done)

@@ -348,11 +348,8 @@ def test_second_scene_follows_view_and_queries(two):
     act(viewpoint.move, two, lambda view: orbit(view, 0.2, 0.1))
     meet(two)
     assert {query.phrase: query.slot for query in other.session.queries} == {"mug": 0, "book": 1}
-    assert (other.session.level, other.session.picture.display, other.size) == (
-        "whole",
-        "segmentation",
-        (77, 55),
-    )
+    seen = other.session.level, other.session.picture.display, other.size
+    assert seen == ("whole", "segmentation", (77, 55))
     assert other.view is two.state.view
     queries.show(two, "mug", shown=False)
     queries.remove(two, "book")
