@@ -20,7 +20,7 @@ SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be 
 
 
 @dataclass(frozen=True, eq=False)
-class Outline:
+class PolygonMask:
     """A polygon on the label's grid."""
 
     size: Size
@@ -51,7 +51,7 @@ class LabelledPhrase:
     """A phrase that is asked in a frame, with the true masks and boxes."""
 
     phrase: str
-    masks: tuple[Outline | MaskFile, ...]  # of the things that it names; of none where it names nothing
+    masks: tuple[PolygonMask | MaskFile, ...]  # of the things that it names; of none where it names nothing
     # (B, 4) left, top, right, bottom on the label's grid, inclusive; None: no place is scored
     boxes: Array | None
     targets: int | None = None  # things that it names in the frame; None: one at least
@@ -200,12 +200,12 @@ def _read_frame(path: Path) -> tuple[Frame, list[str]]:
     """Return the frame, and the categories of it that have no polygon with an inside."""
     content = _stated(path, _LabelFile, "LERF-OVS")
     size = content.info.width, content.info.height
-    drawn: dict[str, list[tuple[Outline, Array]]] = {}  # each with its box
+    drawn: dict[str, list[tuple[PolygonMask, Array]]] = {}  # each with its box
     for number, item in enumerate(content.objects):
         own = drawn.setdefault(item.category.strip(), [])
         corners = _corners(item.segmentation, size, f"{path}: object {number}")
         if len(corners) >= 3:
-            own.append((Outline(size, corners), _box(item.bbox, corners)))
+            own.append((PolygonMask(size, corners), _box(item.bbox, corners)))
     labels = tuple(
         LabelledPhrase(phrase, tuple(outline for outline, _ in own), np.stack([box for _, box in own]))
         for phrase, own in drawn.items()
@@ -328,7 +328,7 @@ def _referred_frame(path: Path, scene: Path) -> Frame:
         size = picture_size(photograph)
     else:
         raise FormatError(f"{path}: has no info of width and height; add it, or images/{path.stem}.jpg")
-    masks: dict[str, list[Outline | MaskFile]] = {}
+    masks: dict[str, list[PolygonMask | MaskFile]] = {}
     for item in (*content.object, *content.objects):
         for sentence in item.sentence or [item.category]:
             own = masks.setdefault(" ".join(sentence.split()), [])
@@ -336,7 +336,7 @@ def _referred_frame(path: Path, scene: Path) -> Frame:
                 own.append(_mask_in(scene, item.segmentation, path))
             elif item.segmentation:
                 corners = _corners(item.segmentation, size, f"{path}: {sentence!r}")
-                own.append(Outline(size, np.resize(corners, (max(len(corners), 3), 2))))
+                own.append(PolygonMask(size, np.resize(corners, (max(len(corners), 3), 2))))
     labels = (LabelledPhrase(phrase, tuple(own), None, len(own)) for phrase, own in masks.items() if phrase)
     return Frame(path.stem, size, tuple(labels))
 
