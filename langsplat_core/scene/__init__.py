@@ -1,4 +1,4 @@
-"""The nouns of the project: plain typed data, no behaviour that needs a device or a file."""
+"""Data types of a scene: Gaussians, codecs, language fields and cameras, without devices or files."""
 
 from langsplat_core.scene.codec import AutoencoderCodec, CodebookCodec, Codec, LinearCodec, codec_from_tensors
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians

@@ -1,4 +1,4 @@
-"""Codecs: how a Gaussian keeps a CLIP vector: unit vectors of D numbers to latents of d numbers and back.
+"""Codecs, which compress CLIP vectors for Gaussians: unit vectors of D numbers to latents of d and back.
 
 They are fitted in `training.language.codec_fit`, and used in plain NumPy, without torch. Callers ask a codec
 for what they need (`cosines`, `distances`, `unique`) and never which kind it is.
@@ -16,23 +16,23 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array, pieces, unit
 from langsplat_core.errors import quoted
 
-SHORTEST = 1e-6  # a latent of numbers shorter than this has no meaning
-LARGEST = 65_535  # codewords: indices are 16 bits, and one number stays free for "no meaning"
+SHORTEST = 1e-6  # a numeric latent of a smaller norm encodes no vector
+LARGEST = 65_535  # codewords: indices are 16 bits, and one index stays free for "no codeword"
 ROWS = 16_384  # vectors compared with all codewords at a time
-LARGEST_SUM = 1e15  # in a network: its square still fits float32
+LARGEST_SUM = 1e15  # largest activation of a network: its square still fits float32
 PAIRS = 65_536  # pairs of latents compared at a time
 
 Layers = tuple[tuple[Array, Array], ...]  # ((out, in) weight, (out,) bias) from input to output
 
 
 class Codec(ABC):
-    """Latents of numbers, of which a blend lies between what was blended; other codecs override more."""
+    """Codec of numeric latents, whose weighted means are latents too; other codecs override more."""
 
-    kind: ClassVar[str]  # its name in the scene file
-    names: ClassVar[tuple[str, ...]]  # there, of its arrays, in the order of its fields
+    kind: ClassVar[str]  # name in the scene file
+    names: ClassVar[tuple[str, ...]]  # names of the arrays in the scene file, in the order of the fields
     dtype: ClassVar[type[np.generic]] = np.float32  # of latents
     blends: ClassVar[bool] = True  # a weighted mean of latents is a latent
-    unit_latents: ClassVar[bool] = False  # they have length 1: of 3 numbers, cosines are smooth on a sphere
+    unit_latents: ClassVar[bool] = False  # latents have length 1: those of 3 numbers lie on a sphere
 
     @property
     @abstractmethod
@@ -51,7 +51,7 @@ class Codec(ABC):
 
     @property
     def size(self) -> int:
-        """The number that a report gives beside the kind: numbers per latent, or codewords."""
+        """Size shown beside the kind in reports: numbers per latent, or codewords."""
         return self.latent_dim
 
     @abstractmethod
@@ -63,7 +63,7 @@ class Codec(ABC):
         """Map (M, d) latents to (M, D) float32 unit vectors."""
 
     def cosines(self, latents: Array, vectors: Array) -> Array:
-        """Return (M, Q) float32 cosines of (M, d) latents and (Q, D) unit vectors; zero gives zeros."""
+        """Return (M, Q) float32 cosines of (M, d) latents and (Q, D) unit vectors; 0 for zero latents."""
         towards, known = _directions(latents)
         return np.where(known[:, None], self.decode(towards) @ vectors.T, 0).astype(np.float32)
 
@@ -77,18 +77,18 @@ class Codec(ABC):
         return cls(*(tensors[name] for name in cls.names))
 
     def check(self, latents: Array) -> None:  # noqa: B027  any numbers will do
-        """ValueError for (M, d) latents that no vector has."""
+        """Raise ValueError for (M, d) latents that `encode` cannot return."""
 
     def known(self, latents: Array) -> Array:
-        """Return (M,) bool, False for latents without a meaning: vectors of zeros."""
+        """Return (M,) bool, False for latents that encode no vector: those of length zero."""
         return np.asarray(np.linalg.norm(latents, axis=1) > SHORTEST)
 
     def unique(self, latents: Array) -> tuple[Array, Array]:
-        """Return (U, d) latents, distinct where they repeat, and (M,) int64 index of each in them."""
+        """Return (U, d) latents, each once if the codec is discrete, and (M,) int64 indices into them."""
         return latents, np.arange(len(latents))
 
     def directions(self, latents: Array) -> Array:
-        """Return (M, c) float32 unit vectors, or zero, with about the cosines of the decoded latents."""
+        """Return (M, c) float32 unit or zero vectors whose cosines approximate those of decoded latents."""
         return _directions(latents)[0]
 
     def distances(self, latents: Array, first: Array, second: Array) -> Array:
@@ -109,7 +109,7 @@ class Codec(ABC):
         return max(1 - float(mean @ mean), 0.0)
 
     def colours(self, latents: Array, weights: Array) -> Array:
-        """Return (M, 3) float32 in [0, 1], near for near vectors; weights: (M,) how often each occurs."""
+        """Return (M, 3) float32 in [0, 1], similar for similar vectors; weights: (M,) counts of each."""
         return principal_colours(latents, weights)
 
 
@@ -142,7 +142,7 @@ class LinearCodec(Codec):
         return unit(np.asarray(latents, np.float32) @ self.basis)
 
     def cosines(self, latents: Array, vectors: Array) -> Array:
-        # cos(B^T l, q) = l.(B q) / |l| for orthonormal rows of B: the big vectors never appear.
+        # cos(B^T l, q) = l.(B q) / |l| for orthonormal rows of B: no (M, D) array is made.
         towards, known = _directions(latents)
         return np.where(known[:, None], towards @ (vectors @ self.basis.T).T, 0).astype(np.float32)
 
@@ -166,7 +166,7 @@ class AutoencoderCodec(Codec):
         if self.encoder[-1][0].shape[0] != self.latent_dim or self.decoder[-1][0].shape[0] != self.vector_dim:
             raise ValueError("codec: the decoder does not mirror the encoder's widths")
         largest = max(map(_largest, (self.encoder, self.decoder)))
-        if LARGEST_SUM < largest < math.inf:  # what is not finite is named by whoever read it
+        if LARGEST_SUM < largest < math.inf:  # the file's reader names what is not finite
             raise ValueError(f"codec: the weights add up to {largest:.0e}; at most {LARGEST_SUM:.0e} is used")
 
     @property
@@ -192,13 +192,13 @@ class AutoencoderCodec(Codec):
         return cls(_layers(tensors, "encoder"), _layers(tensors, "decoder"))
 
 
-EPSILON = 1e-5  # that batch normalisation adds to the variance, in torch and in LangSplat
+EPSILON = 1e-5  # added to the variance by batch normalisation, in torch and in LangSplat
 
 
 def folded(network: Iterable[Mapping[str, Array]]) -> Layers:
-    """Return the linear layers of a network, float32, batch normalisations made part of those before them.
+    """Return a network's linear layers, float32, each batch normalisation folded into the layer before it.
 
-    network: the weights of each layer by their names in torch; without any, it is of no concern here.
+    network: the weights of each layer by their names in torch; layers without weights are skipped.
     ValueError or KeyError for other kinds of layers.
     """
     layers: list[tuple[Array, Array]] = []
@@ -216,7 +216,7 @@ def folded(network: Iterable[Mapping[str, Array]]) -> Layers:
 
 
 def _largest(layers: Layers) -> float:
-    """Return a bound of all numbers that the layers make of a vector of length 1."""
+    """Return an upper bound of the activations of the layers for an input of length 1."""
     bound = 1.0
     for weight, bias in layers:
         bound = float((np.abs(weight).sum(1, dtype=np.float64) * bound + np.abs(bias)).max(initial=0))
@@ -224,7 +224,7 @@ def _largest(layers: Layers) -> float:
 
 
 def _run(layers: Layers, x: Array) -> Array:
-    """Linear layers with ReLU between them; weights are (out, in)."""
+    """Return the (M, out) outputs of linear layers, with ReLU between them, for (M, in) inputs."""
     for index, (weight, bias) in enumerate(layers):
         x = x @ weight.T + bias
         if index + 1 < len(layers):
@@ -239,10 +239,10 @@ def _layers(tensors: dict[str, Array], part: str) -> Layers:
 
 @dataclass(frozen=True, eq=False)
 class CodebookCodec(Codec):
-    """K unit vectors in CLIP space; a latent is the number of one, and blended numbers mean nothing."""
+    """K codewords, unit vectors in CLIP space; a latent is the index of one, so latents cannot be blended."""
 
     vectors: Array  # (K, D) float32 unit vectors, 1 <= K <= LARGEST
-    palette: Array  # (K, 3) float32 in [0, 1]; near codewords have near colours
+    palette: Array  # (K, 3) float32 in [0, 1]; similar codewords have similar colours
     kind: ClassVar[str] = "codebook"
     names: ClassVar[tuple[str, ...]] = ("vectors", "colours")
     dtype: ClassVar[type[np.generic]] = np.uint16
@@ -298,10 +298,10 @@ class CodebookCodec(Codec):
 
 
 def principal_colours(vectors: Array, weights: Array) -> Array:
-    """Return (K, 3) float32 colours in [0, 1] of (K, c) vectors, near ones for near vectors.
+    """Return (K, 3) float32 colours in [0, 1] of (K, c) vectors, similar ones for similar vectors.
 
-    Their first three principal axes, each between its 2 % and 98 % quantiles; an axis that is missing or flat
-    is grey. weights: (K,) >= 0, how often each occurs; axes and quantiles are those of what occurs.
+    Channels are the first three principal components (the numbers themselves if c = 3) between their 2 % and
+    98 % quantiles; 0.5 where missing or constant. weights: (K,) >= 0, of the vectors in both statistics.
     """
     axes, colours = vectors.astype(np.float64), np.full((len(vectors), 3), 0.5, np.float32)
     if vectors.shape[1] != 3:

@@ -1,4 +1,4 @@
-"""The Gaussians of a scene, raw as in the INRIA PLY, and fewer, larger ones that look much the same."""
+"""The Gaussians of a scene, raw as in the INRIA PLY, and their merging into fewer, larger ones."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -14,7 +14,7 @@ from langsplat_core.progress import Progress, silent
 
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16}  # degree -> coefficients per colour channel
 LARGEST_COEFFICIENT = 1e20  # of the spherical harmonics: sums of sixteen and their gradients fit a float32
-FAULTS = (  # for which a row is not drawn
+FAULTS = (  # reasons for which a row is not drawn
     *("position not finite", "scale not a number or above e^80", "rotation zero or not finite"),
     *("opacity not a number", "colour not finite or above 1e20"),
 )
@@ -63,12 +63,12 @@ class Gaussians:
 
     @cached_property
     def sample(self) -> "Gaussians":
-        """Some of those that can be seen, at most 10 000, evenly taken."""
+        """At most 10 000 valid Gaussians of at least INRIA's `alpha_min` opacity, evenly sampled."""
         some = self.take(np.arange(0, len(self), len(self) // 10_000 + 1))
         return some.take(some.valid() & (some.opacity_logits >= float(logit(np.array(INRIA.alpha_min)))))
 
     def valid(self) -> Array:
-        """Return (N,) True where a row can be drawn, see `invalid_rows` for why it cannot."""
+        """Return (N,) bool, True where a row can be drawn; `invalid_rows` says why others cannot."""
         return self._faults == 0
 
     def invalid_rows(self) -> dict[str, int]:
@@ -93,7 +93,7 @@ class Gaussians:
                 sound_colour,
             )
             for number in range(len(FAULTS), 0, -1):
-                if not sound[number - 1].all():  # of each row takes far longer
+                if not sound[number - 1].all():  # a test of each row takes far longer
                     each = sound[number - 1].reshape(len(faults[rows]), -1).all(1)
                     faults[rows][~each] = number
         return faults
@@ -114,16 +114,16 @@ def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians(**{name: np.concatenate(column) for name, column in columns.items()})
 
 
-# Fewer and larger Gaussians, for images that have to be fast. Neighbours are merged four at a time where
-# together they are about one blob: mean and covariance become those of the mixture, weighted by opacity times
-# area, and the optical depth is kept.
+# Level of detail: fewer and larger Gaussians, for fast images. Four neighbours are merged where their mixture
+# is about one blob: the merged Gaussian has the mean and covariance of the mixture, weighted by opacity times
+# area, and the same optical depth.
 
-GROUP = 4  # that become one
+GROUP = 4  # Gaussians that are merged into one
 SPREAD = 2.0  # the largest ratio of the variance of the mixture to that of its members
 BLOCK = 1 << 15  # groups handled at a time, some 40 MB
-_OPAQUE = 0.999  # more would be an infinite optical depth
+_OPAQUE = 0.999  # largest opacity: the optical depth of 1 is infinite
 _TINY = 1e-30
-_GRID_BITS = 20  # of each coordinate on the curve that orders the Gaussians
+_GRID_BITS = 20  # bits of each coordinate in a Morton code
 _SPACED = (  # shifts and masks that put two free bits behind every bit
     *((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F)),
     *((4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)),
@@ -132,7 +132,7 @@ _SPACED = (  # shifts and masks that put two free bits behind every bit
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """M Gaussians that stand for N, and the weights of the N in each."""
+    """M Gaussians merged from N, with the weights of the originals in each."""
 
     gaussians: Gaussians
     sources: Array  # (M, GROUP) rows of the N that each is made of
@@ -150,7 +150,7 @@ _Part = tuple[Gaussians, Array, Array]
 
 
 def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
-    """Return what stands for the valid rows: a quarter as many, up to all of them, in another order."""
+    """Return the valid Gaussians merged, from a quarter as many up to all of them, in another order."""
     rows = np.flatnonzero(gaussians.valid())
     rows = rows[np.argsort(along_curve(gaussians.means[rows]))]
     grouped = rows[: len(rows) // GROUP * GROUP].reshape(-1, GROUP)
@@ -164,7 +164,7 @@ def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
 
 
 def along_curve(points: Array) -> Array:
-    """Return the (N,) places of points on a Morton curve: near numbers are mostly near points."""
+    """Return (N,) uint64 Morton codes of (N, 3) points: close codes are mostly close points."""
     if len(points) == 0:
         return np.zeros(0, np.uint64)
     # Neither a single floater nor a far background may use up the grid.
@@ -186,13 +186,13 @@ def _kept(gaussians: Gaussians, rows: Array) -> _Part:
 
 
 def _area(scales: Array) -> Array:
-    """Return what ellipsoids of (..., 3) scales cover, seen from everywhere, up to a constant."""
+    """Return (...) areas of ellipsoids of (..., 3) scales in projection: about the mean, up to a constant."""
     a, b, c = np.moveaxis(scales, -1, 0)
     return np.asarray(a * b + b * c + c * a)
 
 
 def _merge(gaussians: Gaussians, rows: Array) -> Iterator[_Part]:
-    """Merge (G, GROUP) rows, each into one Gaussian; yield these, then those that stay as they are."""
+    """Merge each of (G, GROUP) rows into one Gaussian; yield the merged ones, then the unmerged members."""
     members = gaussians.take(rows.ravel())
     scales = np.exp(members.log_scales.astype(np.float64))
     axes = rotation_matrices(members.quats_wxyz.astype(np.float64)) * scales[:, None, :]

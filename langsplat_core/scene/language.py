@@ -1,7 +1,7 @@
-"""The language field of a scene: what every Gaussian means, the tree of things, and calibration.
+"""The language field of a scene: language features, tree of instances, calibration; and the text of phrases.
 
-First, phrases as they are written. Quotes and punctuation around words are no part of a phrase: an encoder
-that met them would answer another question, and the demo encoder's tokenizer would end the phrase there.
+Phrases first. Quotes and punctuation around words are removed from them: they would change the text vector,
+and the demo encoder's tokenizer would end the phrase there.
 """
 
 import re
@@ -20,7 +20,7 @@ _APOSTROPHES = str.maketrans(dict.fromkeys("’‘ʼ′＇´`", "'"))
 
 
 def split_phrases(text: str) -> list[str]:
-    """Return the phrases in a line, tidy, separated by ";" or ","; "mug, not red" is one, and "" is none."""
+    """Return the tidy phrases of a text, split at ";", "," and line ends; "mug, not red" is one phrase."""
     return [part for part in (tidy(part) for part in _SEPARATE.split(_composed(text))) if part]
 
 
@@ -30,13 +30,13 @@ def tidy(text: str) -> str:
 
 
 def phrase_key(text: str) -> str:
-    """Key by which a phrase is looked up and encoded: its words, in lower case as of CLIP's tokenizers."""
+    """Return the key by which a phrase is looked up and encoded: its words, lower case as CLIP has them."""
     return " ".join(token for token in tokens(text) if token != ",").lower()
 
 
 @lru_cache(2**14)  # a phrase is looked up a dozen times while it is answered, beside thousands of others
 def tokens(text: str) -> tuple[str, ...]:
-    """Words without quotes and punctuation around them, and commas, none at the end."""
+    """Return the words of a text, without punctuation around them, and its commas, none at the end."""
     text = "".join(" " if unicodedata.category(mark) in ("Cc", "Cs") else mark for mark in _composed(text))
     text = re.sub(r"(?<=\w)\s+'s\b", "'s", text)
     found = []
@@ -50,12 +50,12 @@ def tokens(text: str) -> tuple[str, ...]:
 
 
 def _composed(text: str) -> str:
-    """`text` with plain apostrophes, and letters of full width or with separate accents as usual (NFKC)."""
+    """Return `text` in Unicode's normal form NFKC, with ASCII apostrophes."""
     return unicodedata.normalize("NFKC", text.translate(_APOSTROPHES))
 
 
 def _bare(word: str) -> str:
-    """`word` without punctuation around it; a possessive's apostrophe stays. "" where it is nothing else."""
+    """Return `word` without punctuation around it, "" if nothing is left; a possessive's apostrophe stays."""
     if word == "&" or word.isalnum():
         return word
     kinds = [unicodedata.category(mark) for mark in word]
@@ -69,8 +69,8 @@ def _bare(word: str) -> str:
     return word[first:last] + ("'" if owns else "")
 
 
-# The tree of a scene: wholes with their parts and these with their subparts. Gaussians vary, things do not:
-# an answer of whole nodes has the borders of things and no speckles, and its peak is a mean over a patch.
+# The tree of a scene: wholes, their parts and the subparts of these. Relevancy varies between the Gaussians
+# of an instance: an answer of whole nodes has its borders and no speckles, and its peak is a patch's mean.
 
 LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
 NO_NODE = -1
@@ -81,9 +81,9 @@ class Tree:
     """K nodes, each a set of Gaussians within its parent's. Children come before their parents."""
 
     leaves: Array  # (N,) int32 smallest node that each Gaussian is in; NO_NODE for those in none
-    parents: Array  # (K,) int32 node that each is part of, a later one; NO_NODE for what is part of none
-    levels: Array  # (K,) uint8 index into LEVELS of what a node means; never above its parent's
-    # (K, 2) uint16 photographs with a mask of just this node, and those that show it without one
+    parents: Array  # (K,) int32 parent of each node, which is a later node; NO_NODE for roots
+    levels: Array  # (K,) uint8 level of each node, an index into LEVELS; never above its parent's
+    # (K, 2) uint16 counts of photographs: with a mask of just this node, and showing it without one
     votes: Array
 
     def __post_init__(self) -> None:
@@ -106,9 +106,9 @@ class Tree:
         return len(self.parents)
 
     def at(self, level: int) -> Array:
-        """Return (N,) int32 largest node of at most `level` of each Gaussian, or its smallest, or NO_NODE."""
+        """Return (N,) int32 largest node up to `level` of each Gaussian, else its smallest, else NO_NODE."""
         owners = [*range(self.count), NO_NODE]
-        low = [*(self.levels <= level).tolist(), False]  # the last: of what is part of none
+        low = [*(self.levels <= level).tolist(), False]  # the last: of NO_NODE, the parent of roots
         for node, parent in zip(range(self.count - 1, -1, -1), self.parents[::-1].tolist(), strict=True):
             if low[parent]:
                 owners[node] = owners[parent]
@@ -116,7 +116,7 @@ class Tree:
 
     @cached_property
     def voted_wholes(self) -> Array:
-        """`at` the level of wholes, NO_NODE where no mask voted for it: what divides answers into things."""
+        """(N,) int32 whole of each Gaussian, NO_NODE if no mask voted for it; splits answers in instances."""
         at, votes = self.at(len(LEVELS) - 1), np.append(self.votes[:, 0] > 0, False)
         return np.where(votes[at], at, np.int32(NO_NODE))
 
@@ -129,7 +129,7 @@ class Tree:
         return np.array(inside)[self.leaves]
 
     def totals(self, own: Array) -> Array:
-        """Return the (K,) int64 numbers of nodes with those of their descendants, of the (K,) they have."""
+        """Return (K,) int64 sums over each node and its descendants of the nodes' (K,) `own` numbers."""
         totals = own.tolist()
         for node, parent in enumerate(self.parents.tolist()):
             if parent != NO_NODE:
@@ -137,7 +137,7 @@ class Tree:
         return np.array(totals, np.int64)
 
     def gaussians(self) -> "NodeGaussians":
-        """Return the Gaussians of every node: those of each follow each other in one order of all."""
+        """Return the Gaussians of every node, as ranges of one common order of Gaussians."""
         inside = self.leaves != NO_NODE
         own = np.bincount(self.leaves[inside], minlength=self.count)
         sizes = self.totals(own)
@@ -160,8 +160,8 @@ class NodeGaussians:
     """The Gaussians of the K nodes of a tree, without a copy for each node."""
 
     order: Array  # (M,) numbers of Gaussians
-    starts: Array  # (K,) place in it of a node's first
-    sizes: Array  # (K,) how many there are from there on
+    starts: Array  # (K,) index into `order` of a node's first Gaussian
+    sizes: Array  # (K,) number of a node's Gaussians
 
     def __getitem__(self, node: int) -> Array:
         """Return the Gaussians of a node, ascending."""
@@ -175,10 +175,10 @@ class NodeGaussians:
         return np.asarray(running[self.starts + self.sizes] - running[self.starts])
 
 
-# Calibration of one text encoder's cosines: how probable it is that what is asked for is there at all.
+# Calibration of one text encoder's cosines: the probability that what a phrase names is present at all.
 
-LARGEST = 1e6  # number of a calibration: cosines are rounded to 1e-7
-Fits = tuple[float, float, float]  # of each level, the best, see `semantics.relevancy.Scale.fit`
+LARGEST = 1e6  # of the coefficients of a calibration: cosines are rounded to 1e-7
+Fits = tuple[float, float, float]  # the best at each level, see `semantics.relevancy.Scale.fit`
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class PlattScaling:
     """Platt scaling (Platt 1999): the probability as a logistic function of the best fits of an answer.
 
     ``probability = sigmoid(constant + whole * fit of whole things + finer * the better one of the finer
-    levels + common * mean fit of all regions)``, present and absent being as likely beforehand.
+    levels + common * mean fit of all regions)``, with equal priors for present and absent.
     """
 
     constant: float
@@ -202,7 +202,7 @@ class PlattScaling:
             raise ValueError(f"{self}: expected up to {LARGEST:g}, rising with fits, and found in [0.5, 1]")
 
     def probability(self, fits: Fits, common: float = 0.0) -> float:
-        """Return the probability, in (0, 1), that what is asked for is there; common: its mean fit."""
+        """Return the probability, in (0, 1), that what a phrase names is present; common: its mean fit."""
         subpart, part, whole = fits
         logit = self.constant + self.whole * whole + self.finer * max(subpart, part) + self.common * common
         return float(sigmoid(np.array(logit)))
@@ -210,12 +210,12 @@ class PlattScaling:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Platt scaling for each of the ways in which something is looked for: their fits differ."""
+    """Platt scaling for each kind of phrase, since the fits of the kinds differ."""
 
-    thing: PlattScaling  # "mug": anything, among all that there is
-    part: PlattScaling  # "handle": a part of whatever has one
-    inside: PlattScaling  # "handle of the mug": a part, among what is on a thing that is there
-    coloured_thing: PlattScaling | None = None  # "red mug", which lies farther from everything than "mug"
+    thing: PlattScaling  # "mug": a thing, searched in the whole scene
+    part: PlattScaling  # "handle": a part of any thing
+    inside: PlattScaling  # "handle of the mug": a part, searched on a thing that is present
+    coloured_thing: PlattScaling | None = None  # "red mug", whose fits are lower than those of "mug"
     coloured_part: PlattScaling | None = None  # "red handle"; None: as without the colour
 
     def __post_init__(self) -> None:
@@ -223,10 +223,10 @@ class Calibration:
         object.__setattr__(self, "coloured_part", self.coloured_part or self.part)
 
 
-# The language field: what every Gaussian means, at three levels.
+# The language field: the language features of every Gaussian at three levels.
 
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")  # LERF's negatives, used by LangSplat
-MOST_SHOWN = 8  # examples of a taught word; the more there are, the more is like one of them by chance
+MOST_SHOWN = 8  # examples of a taught word; with more of them, more of a scene resembles one by chance
 LONGEST_NAME = 80  # characters
 
 
@@ -236,7 +236,7 @@ class TaughtWord:
 
     name: str  # as it is shown, see `tidy`
     level: int  # index into LEVELS of what was shown
-    vectors: Array  # (T, D) float32 unit: the mean meaning of each example, less that of its scene
+    vectors: Array  # (T, D) float32 unit: mean language feature of each example, less that of its scene
     rivals: Array  # (T,) float32 in [0, 1]: cosine of different things in the scene of each example
 
     def __post_init__(self) -> None:
@@ -254,7 +254,7 @@ class TaughtWord:
 
     @property
     def key(self) -> str:
-        """Key by which it is looked up."""
+        """Key by which the word is looked up."""
         return phrase_key(self.name)
 
 
@@ -271,9 +271,9 @@ class LanguageField:
     temperature: float = 10.0  # of the softmax over cosines; 10 in the code of LERF and LangSplat, for CLIP
     found: float = 0.6  # peak relevancy, as published, from which a phrase counts as present
     calibration: Calibration | None = None  # None: no probability is known to hold here
-    tree: Tree | None = None  # of N Gaussians; None: where it is asked, one is built
-    everyday: Array | None = None  # (V, D) float32 unit vectors of phrases most of which name nothing here
-    taught: tuple[TaughtWord, ...] = ()  # no two of one key
+    tree: Tree | None = None  # of the N Gaussians; None: one is built when needed
+    everyday: Array | None = None  # (V, D) float32 unit vectors of common phrases, most absent from the scene
+    taught: tuple[TaughtWord, ...] = ()  # their keys are distinct
 
     def __post_init__(self) -> None:
         d, big = self.codec.latent_dim, self.codec.vector_dim
@@ -306,7 +306,7 @@ class LanguageField:
 
     @property
     def known(self) -> Array:
-        """(3, N) whether a Gaussian has a meaning at a level."""
+        """(3, N) bool, whether a Gaussian has a language feature at a level."""
         flat = self.codec.known(self.latents.reshape(-1, self.latents.shape[2]))
         return np.asarray((self.confidence > 0) & flat.reshape(self.confidence.shape))
 

@@ -1,4 +1,4 @@
-"""Scenes: cameras, in OpenCV's frame (x right, y down, z forward), and all that is known of the Gaussians."""
+"""Scenes: Gaussians with cameras, in OpenCV's frame (x right, y down, z forward), and a language field."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from langsplat_core.scene.language import LanguageField
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Focal lengths and principal point. Sizes may be fractions where no image is meant."""
+    """Size of an image, focal lengths and principal point; only a `Camera` needs whole numbers of pixels."""
 
     width: float  # pixels, > 0, finite
     height: float
@@ -54,15 +54,15 @@ class Intrinsics:
         return math.degrees(2 * math.atan(0.5 * min(self.width, self.height) / min(self.fx, self.fy)))
 
 
-FARTHEST = 1e9  # world units along an axis, of cameras in files: there, float32 positions are 64 units apart
+FARTHEST = 1e9  # largest coordinate of cameras in files, world units: float32 steps there are 64 units
 
 
 @dataclass(frozen=True, eq=False)
 class Camera(Intrinsics):
-    """A pinhole camera without distortion, or an orthographic one, which looks along its z axis everywhere.
+    """A pinhole camera without distortion, or an orthographic one, whose rays are parallel to its z axis.
 
-    Pixel (0, 0) is the top left one and its centre lies at (0.5, 0.5). Focal lengths of an orthographic one
-    are pixels per world unit.
+    Pixel (0, 0) is the top left one and its centre lies at (0.5, 0.5). Focal lengths of an orthographic
+    camera are pixels per world unit.
     """
 
     width: int  # pixels, >= 1
@@ -70,7 +70,7 @@ class Camera(Intrinsics):
     world_to_camera: Array  # (4, 4) float64, rigid
     name: str = ""  # file stem of the photograph it belongs to, if any
     orthographic: bool = False
-    __eq__, __hash__ = object.__eq__, object.__hash__  # not by intrinsics alone
+    __eq__, __hash__ = object.__eq__, object.__hash__  # by identity, not by intrinsics
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,7 +89,7 @@ class Camera(Intrinsics):
 
     @property
     def position(self) -> Array:
-        """Centre of projection (3,), or the point of the principal pixel in the plane z = 0; world units."""
+        """(3,) world units: centre of projection, or where an orthographic principal ray meets z = 0."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
     @property
@@ -107,7 +107,7 @@ class Camera(Intrinsics):
         return Intrinsics(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def within(self, side: int) -> "Camera":
-        """Return the same view, no side of whose image is longer than `side` pixels."""
+        """Return the same view with an image of at most `side` pixels along its longer side."""
         share = min(side / max(self.width, self.height), 1.0)
         return self.resized(max(round(share * self.width), 1), max(round(share * self.height), 1))
 
@@ -119,7 +119,7 @@ class Camera(Intrinsics):
         return np.stack([x / safe * self.fx + self.cx, y / safe * self.fy + self.cy], -1), depth
 
     def unproject(self, pixels: ArrayLike, depths: ArrayLike) -> Array:
-        """Map (..., 2) pixel positions and (...) depths along z, or one for all to (..., 3) world points."""
+        """Map (..., 2) pixel positions and depths along z, (...) or one number, to (..., 3) world points."""
         places, z = np.asarray(pixels, np.float64), np.asarray(depths, np.float64)[..., None]
         offsets = (places - (self.cx, self.cy)) / (self.fx, self.fy) * (1.0 if self.orthographic else z)
         in_camera = np.concatenate([offsets, np.broadcast_to(z, (*offsets.shape[:-1], 1))], -1)
@@ -131,7 +131,7 @@ class Camera(Intrinsics):
         return np.stack([x, y], -1) + 0.5
 
     def in_image(self, pixels: Array, depths: Array) -> Array:
-        """Return (N,) bool, which points, as of `project`, lie before the camera and inside its image."""
+        """Return (N,) bool: points, as returned by `project`, in front of the camera and inside its image."""
         (x, y), inside = pixels.T, depths > 0
         return np.asarray(inside & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height))
 
@@ -173,17 +173,17 @@ def look_at(
     return Camera(width, height, focal, focal, width / 2, height / 2, affine(rotation, -rotation @ eye))
 
 
-NEAR = 0.05  # of the depth of the middle of what is seen, or of the radius of what no camera sees
-LEAST_NEAR = 0.01  # the same where things are nearer: what is nearer yet is fog before the eye
-NEAREST, NEAR_OF_NEAREST = 0.01, 0.25  # of what is seen, that passes for the nearest, and of its depth
-NEAR_CAMERAS = 16  # that are enough to tell
+NEAR = 0.05  # near plane over the median depth that cameras see, or over the radius if they see nothing
+LEAST_NEAR = 0.01  # its least value over the median depth: Gaussians nearer than that are fog before the lens
+NEAREST, NEAR_OF_NEAREST = 0.01, 0.25  # quantile of depths that counts as the nearest; near plane over it
+NEAR_CAMERAS = 16  # cameras that are evaluated at most
 
 
 def near_plane(gaussians: Gaussians, cameras: Sequence[Camera], most: float | None = None) -> float:
-    """Return the camera z up to which nothing is drawn, world units, > 0: a share of what cameras see.
+    """Return the near plane, camera z in world units, > 0: a fraction of the depths that cameras see.
 
-    most: it is no farther; None: it is `NEAR` of the middle's. Published code has 0.2 in every unit
-    (`config.INRIA`). Orthographic cameras do not tell.
+    most: its upper bound; None: `NEAR` of the median depth. Published code has 0.2 whatever the unit
+    (`config.INRIA`). Orthographic cameras are ignored.
     """
     points = gaussians.sample.means.astype(np.float64)
     telling = [camera for camera in cameras if not camera.orthographic]
@@ -199,21 +199,21 @@ def near_plane(gaussians: Gaussians, cameras: Sequence[Camera], most: float | No
 
 
 def bounds_of(gaussians: Gaussians) -> tuple[Array, float]:
-    """Robust centre (3,) and radius > 0, world units: medians without floaters, however the axes lie."""
+    """Return the geometric median (3,) and the 70 % quantile of distances from it, > 0, world units."""
     valid = gaussians.valid()
     means = gaussians.means[valid].astype(np.float64)
     if len(means) == 0:
         return np.zeros(3), 1.0
     centre = geometric_median(means[:: len(means) // SAMPLES + 1])
     radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.7))
-    # One Gaussian alone has a radius too; and far from the origin float32 positions are coarse, and a camera
-    # needs a distance that it can tell.
+    # A single Gaussian has a radius too. Far from the origin, where float32 positions are coarse, cameras,
+    # placed at multiples of the radius, need a distance above their rounding.
     size = float(np.exp(np.median(gaussians.log_scales[valid].astype(np.float64))))
     return centre, max(radius, size, 1e-6 * float(np.abs(centre).max()))
 
 
 def geometric_median(points: Array) -> Array:
-    """Return (3,) float64, from where the sum of distances to (N, 3) points is least (Weiszfeld)."""
+    """Return the (3,) float64 point of least summed distance to (N, 3) points (Weiszfeld)."""
     centre = np.median(points, axis=0)
     for _ in range(100):
         offsets = points - centre
@@ -228,21 +228,21 @@ def geometric_median(points: Array) -> Array:
     return np.asarray(centre)
 
 
-# Far from zero float32 is coarse: at a northing of 5 400 000 m positions lie half a metre apart. So what is
-# far is kept relative to an origin in float64, which is subtracted where files are read.
+# Far from zero float32 is coarse: at a northing of 5 400 000 m positions lie half a metre apart. A far
+# scene is therefore kept relative to a float64 origin, which is subtracted where files are read.
 
 NO_ORIGIN = np.zeros(3)
 NO_ORIGIN.flags.writeable = False
-FAR = 100.0  # radii from zero, from which on steps of float32 are more than 1e-5 of a radius
+FAR = 100.0  # distance from zero, in radii, beyond which float32 steps are more than 1e-5 of a radius
 LOOKED_AT = 4096  # positions, evenly taken: enough for a median
 
 
-@np.errstate(over="ignore", invalid="ignore")  # whatever a file holds
+@np.errstate(over="ignore", invalid="ignore")  # a file may hold any number
 def origin_of(points: Array) -> Array:
     """Return the (3,) float64 origin about which float32 holds (N, 3) positions: zero unless they are far.
 
-    Along the axes on which they are, it is their middle, to a power of two below their radius, so that what
-    float32 held already is subtracted without rounding.
+    Along the axes on which they are far, it is their median, rounded to multiples of a power of two below
+    their radius, so that it is subtracted from float32 positions without rounding.
     """
     some = points[:: len(points) // LOOKED_AT + 1].astype(np.float64)
     some = some[np.isfinite(some).all(1)]
@@ -250,7 +250,7 @@ def origin_of(points: Array) -> Array:
         return NO_ORIGIN
     centre = np.median(some, axis=0)
     distance = float(np.abs(centre).max())
-    radius = float(np.quantile(np.linalg.norm(some - centre, axis=1), 0.7)) or 1.0  # of a single place
+    radius = float(np.quantile(np.linalg.norm(some - centre, axis=1), 0.7)) or 1.0  # all in one place
     if not FAR * radius < distance <= FARTHEST:
         return NO_ORIGIN
     grid = 2.0 ** math.floor(math.log2(max(radius, 1e-12 * distance)))
@@ -263,10 +263,10 @@ def about_origin(points: Array) -> tuple[Array, Array]:
     return (points - origin if origin.any() else points), origin
 
 
-# The opening view of a scene without cameras is from where it covers the most of a grid; lengths in radii.
+# Opening view of a scene without cameras: from where the scene covers most cells of a grid; lengths in radii.
 SAMPLES, TURNS, REACH, CELL = 20_000, 12, 3.0, 0.06
-WIDEST = 0.2  # of an image's width: shorter focal lengths, 136 degrees, are of no lens
-MORE = 1.25  # how many times as much another side has to cover, to be better
+WIDEST = 0.2  # least focal length over an image's width, 136 degrees: shorter ones belong to no lens
+MORE = 1.25  # how many times the cells of the first side another has to cover to be preferred
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,10 +281,10 @@ class Scene:
     cameras: tuple[Camera, ...] = ()  # training cameras, in the dataset's order
     path: Path | None = None
     antialiased: bool = False  # trained with Mip-Splatting's compensation, as its file says
-    extras: Mapping[str, Array] = field(default_factory=dict)  # (N,) properties not read here
-    metres_per_unit: float | None = None  # > 0; None: nobody said how long a world unit is
-    unread: tuple[str, ...] = ()  # why files that lie beside it could not be read, a line each
-    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) float64, zero unless it lies far away
+    extras: Mapping[str, Array] = field(default_factory=dict)  # (N,) other properties of the file
+    metres_per_unit: float | None = None  # > 0; None: the length of a world unit is unknown
+    unread: tuple[str, ...] = ()  # why files beside the scene could not be read, a line each
+    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) float64, zero unless the scene is far off
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "origin", np.asarray(self.origin, np.float64))
@@ -306,7 +306,7 @@ class Scene:
             f"<Scene of {len(self.gaussians):,} Gaussians {what} a language field: {self.path or 'no file'}>"
         )
 
-    # Layers above are asked by the public names, which load them.
+    # `show` belongs to a higher layer, which is imported when its public name is used.
     def show(self, phrase: str = "", **options: Any) -> Any:
         """Return the page of `langsplat_core.show`, with `phrase` asked, which a notebook shows."""
         return langsplat_core.show(self, phrase, **options)
@@ -319,7 +319,7 @@ class Scene:
         return np.asarray(points, np.float64) + self.origin
 
     def world_gaussians(self) -> Gaussians:
-        """Return the Gaussians where they lie in the world, as near as float32 has it."""
+        """Return the Gaussians at their positions in the world, rounded to float32."""
         if not self.origin.any():
             return self.gaussians
         return replace(self.gaussians, means=self.in_world(self.gaussians.means))
@@ -335,24 +335,24 @@ class Scene:
         )
 
     def recoloured(self, gaussians: Gaussians) -> "Scene":
-        """Return the scene with `gaussians` in the same places; what follows from these is handed on."""
+        """Return the scene with `gaussians`, which have the same positions: the near plane is handed on."""
         made = replace(self, gaussians=gaussians)
         vars(made)["near"] = self.near
         return made
 
     def raster_settings(self, profile: RasterSettings | None = None) -> RasterSettings:
-        """`profile`, or what is published with the scene's near plane, with the scene's own filters."""
+        """Return `profile`, or INRIA's settings with the scene's near plane, with the scene's own filters."""
         formed = replace(INRIA, near=self.near) if profile is None else profile
         return replace(formed, antialiased=self.antialiased, focal=self._focal)
 
     @cached_property
     def near(self) -> float:
-        """Camera z up to which nothing is drawn, world units, > 0: see `near_plane`."""
+        """Near plane: camera z up to which nothing is drawn, world units, > 0; see `near_plane`."""
         return near_plane(self.gaussians, self.cameras)
 
     @cached_property
     def _focal(self) -> float | None:
-        """Median focal length of the cameras, px; None where it is of no lens, as in files in other units."""
+        """Median focal length of pinhole cameras, px; None if shorter than any lens's, as in other units."""
         pinholes = [camera for camera in self.cameras if not camera.orthographic]
         lengths = [(np.sqrt(camera.fx * camera.fy), camera.width) for camera in pinholes]
         focal, width = np.median(lengths, axis=0) if lengths else (0.0, 1.0)
@@ -371,14 +371,14 @@ class Scene:
         return bounds_of(self.gaussians)
 
     def _level(self, up: Array) -> tuple[Array, Array]:
-        """Two (3,) unit directions across `up` and each other: the first camera's right, else of an axis."""
+        """Return two orthogonal (3,) unit vectors across `up`, the first along the first camera's right."""
         right = self.cameras[0].rotation[0] if self.cameras else across(up)
         right = right - (right @ up) * up
         side = unit(right if np.linalg.norm(right) > 0.1 else across(up))
         return side, np.cross(up, side)
 
     def _across(self, centre: Array, radius: float, up: Array) -> Array:
-        """Return (3,) the level direction along which the scene covers the most of an image."""
+        """Return the (3,) level viewing direction along which the scene covers most of an image."""
         side, ahead = self._level(up)
         some = self.gaussians.take(np.arange(0, len(self.gaussians), len(self.gaussians) // SAMPLES + 1))
         offsets = (some.means[some.valid()] - centre) / radius
@@ -387,7 +387,7 @@ class Scene:
             directions.append(np.cos(angle) * side + np.sin(angle) * ahead)
             places = np.stack([offsets @ np.cross(up, directions[-1]), heights], 1)
             cells = np.floor(places[(np.abs(places) < REACH).all(1)] / CELL)
-            covered.append(len(np.unique(cells @ (1.0, 4 * REACH / CELL))))  # a number for each cell
+            covered.append(len(np.unique(cells @ (1.0, 4 * REACH / CELL))))  # one key per cell
         broadest = int(np.argmax(covered))
         return np.asarray(directions[broadest if covered[broadest] > MORE * covered[0] else 0])
 

@@ -1,7 +1,7 @@
-"""The surface that Gaussians lie on, as the nearest neighbours of each, and its patches: the scene's tree.
+"""The surface of a scene, a neighbour graph of its Gaussians, and its segmentation into the scene's tree.
 
-Connected parts are found by an own breadth-first search: those of an answer are a few of all Gaussians, and
-cutting their graph out for `scipy.sparse.csgraph` takes ten times as long.
+Connected components are found by an own breadth-first search: an answer has few of all Gaussians, and
+extracting their subgraph for `scipy.sparse.csgraph` takes ten times as long.
 """
 
 from dataclasses import dataclass
@@ -17,25 +17,25 @@ from langsplat_core.scene.gaussians import Gaussians
 from langsplat_core.scene.language import LEVELS, NO_NODE, Tree
 
 NEIGHBOURS = 16
-FAINTEST = 1e-3  # weight of a Gaussian whose opacity is less, so that no mean divides by nothing
+FAINTEST = 1e-3  # least weight of a Gaussian, so that no mean divides by zero
 SOME = 1 << 18  # Gaussians whose distances are held at a time: all of five million take gigabytes
 REACH = 4.0  # times the median distance of a Gaussian's neighbours: what is farther is another surface
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The M Gaussians that count, each with its k nearest, itself first; near ones have near numbers."""
+    """Graph of the M visible Gaussians and their k nearest neighbours; close ones have close numbers."""
 
     rows: Array  # (M,) int64 indices of the Gaussians: valid, and visible to the eye
     positions: Array  # (M, 3) float64 their means, world units
-    neighbours: Array  # (M, k) int32 numbers in [0, M)
+    neighbours: Array  # (M, k) int32 numbers in [0, M), nearest first: each itself
     weights: Array  # (M,) float32 opacity
-    links: "scipy.sparse.csr_matrix"  # (M, M) who is next to whom on one surface; symmetric
-    anchors: Array  # (N,) int32 number of every Gaussian, if it is too faint of the nearest; -1: none is near
+    links: "scipy.sparse.csr_matrix"  # (M, M) bool adjacency on one surface; symmetric
+    anchors: Array  # (N,) int32 number of each Gaussian, or of the nearest to a faint one; -1: none is near
 
     @cached_property
     def ends(self) -> tuple[Array, Array]:
-        """The (E,) int32 numbers at either end of the links, each link once."""
+        """(E,) int32 numbers of the first ends and of the second ends of the links, each link once."""
         links = self.links.tocoo()
         once = links.row < links.col
         return links.row[once].astype(np.int32), links.col[once].astype(np.int32)
@@ -43,8 +43,8 @@ class Surface:
     def smooth(self, values: Array, numbers: Array | None = None) -> Array:
         """Return (K,) float32 opacity-weighted means over neighbourhoods of all Gaussians' (N,) values.
 
-        numbers: (K,) whose neighbourhoods, by default those of all M. In 3D what the paper's mean filter is
-        in an image (section 4.1, "implementation details"): one stray Gaussian decides nothing.
+        numbers: (K,) Gaussians whose neighbourhoods are averaged, by default all M. This is the paper's mean
+        filter of images (section 4.1, "implementation details") in 3D: one stray Gaussian decides nothing.
         """
         chosen = np.arange(len(self.rows)) if numbers is None else numbers
         smoothed = np.empty(len(chosen), np.float32)
@@ -53,19 +53,19 @@ class Surface:
         return smoothed
 
     def parts(self, numbers: Array) -> list[Array]:
-        """Return the numbers of each connected part of the Gaussians `numbers` (K,), in [0, M), ascending."""
+        """Return the connected components of the Gaussians `numbers` (K,), each in ascending order."""
         inside = np.zeros(len(self.rows), bool)
         inside[numbers] = True
         order, starts = _search(self.links.indptr, self.links.indices, numbers, inside)
         return [np.sort(part) for part in np.split(order, starts)]
 
     def connected(self, inside: Array, seed: int) -> Array:
-        """Return numbers of all that are linked to a member of (M,) bool through members."""
+        """Return the numbers in the connected component of `seed` among the members `inside` (M,) bool."""
         return _search(self.links.indptr, self.links.indices, np.array([seed]), inside.copy())[0]
 
 
 def surface_weights(gaussians: Gaussians, min_opacity: float = 0.1) -> Array:
-    """Return (N,) float32 opacity of valid Gaussians with `min_opacity`, of all if none has it; else 0."""
+    """Return (N,) float32 opacity of valid Gaussians above `min_opacity`, of all if none is; else 0."""
     valid = gaussians.valid()
     opacity = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
     counts = opacity >= min_opacity
@@ -74,14 +74,14 @@ def surface_weights(gaussians: Gaussians, min_opacity: float = 0.1) -> Array:
 
 
 def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
-    """Return the surface of what `surface_weights` counts."""
+    """Return the surface of the Gaussians whose `surface_weights` are above 0."""
     valid, every = gaussians.valid(), surface_weights(gaussians, min_opacity)
     rows = np.flatnonzero(every)
     k = min(NEIGHBOURS, len(rows))
     if k == 0:
         nothing = scipy.sparse.csr_matrix((0, 0), dtype=bool), np.full(len(valid), -1, np.int32)
         return Surface(rows, np.zeros((0, 3)), np.zeros((0, 1), np.int32), np.zeros(0, np.float32), *nothing)
-    # Leaf by leaf of a tree: near ones meet.
+    # In the order of a k-d tree's leaves: close Gaussians get close numbers.
     rows = rows[scipy.spatial.cKDTree(gaussians.means[rows].astype(np.float64)).indices]
     positions = gaussians.means[rows].astype(np.float64)
     tree = scipy.spatial.cKDTree(positions)
@@ -90,7 +90,7 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
     for part in pieces(len(rows), SOME):
         distances, found = (of.reshape(-1, k) for of in tree.query(positions[part], k=k, workers=-1))
         neighbours[part] = found
-        reach[part] = REACH * distances[:, middle].mean(1) + 1e-12  # the median: they ascend
+        reach[part] = REACH * distances[:, middle].mean(1) + 1e-12  # the median: distances ascend
         near[part] = distances <= reach[part, None]
     weights = every[rows]
     anchors = np.full(len(gaussians), -1, np.int32)
@@ -102,13 +102,13 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
 
 
 def cross_sections(log_scales: Array, opacity_logits: Array) -> Array:
-    """Return (N,) float64 opacity times the two longest axes, units^2: flat Gaussians have no volume."""
+    """Return (N,) float64 opacity times both longest scales, units^2, which flat Gaussians have too."""
     longest = np.sort(log_scales.astype(np.float64), axis=1)[:, 1:]
     return np.asarray(sigmoid(opacity_logits.astype(np.float64)) * np.exp(longest.sum(1)))
 
 
 def surface_areas(gaussians: Gaussians) -> Array:
-    """Return (N,) float64 `cross_sections`, cut at the 99 % quantile; 0 of what cannot be drawn."""
+    """Return (N,) float64 `cross_sections`, clipped at the 99 % quantile; 0 for invalid Gaussians."""
     valid = gaussians.valid()
     scales = np.where(valid[:, None], gaussians.log_scales, -np.inf)
     areas = cross_sections(scales, np.where(valid, gaussians.opacity_logits, -np.inf))
@@ -147,9 +147,9 @@ def _smooth(
 
 @kernel
 def _search(indptr: Array, indices: Array, seeds: Array, waiting: Array) -> tuple[Array, Array]:
-    """Collect the parts that `seeds` are in, breadth first over what is `waiting` (M,), which is unset.
+    """Collect the connected components of `seeds` in `waiting` (M,) bool, breadth first; clear them there.
 
-    (K,) int32 numbers, part by part, and (C - 1,) where each part but the first begins.
+    Return (K,) int32 numbers, component by component, and the (C - 1,) starts of all but the first.
     """
     order, starts = np.empty(waiting.sum(), np.int32), np.empty(len(seeds), np.int32)
     parts = found = done = 0
@@ -173,15 +173,15 @@ def _search(indptr: Array, indices: Array, seeds: Array, waiting: Array) -> tupl
     return order[:found], starts[1:parts]
 
 
-# The tree of a scene: patches that mean the same at a level. Wholes are found first, parts within each, then
-# subparts within these. What masks of many photographs say is one thing stays one whole, since the encoder
-# may see its front and its back differently; their borders count at all levels.
+# The tree of a scene: patches of similar language features at each level. Wholes are found first, parts
+# within each, then subparts within these. An instance by the masks of many photographs stays one whole, since
+# the encoder may see its front and its back differently; borders of instances count at all levels.
 
-SCALE = 6.8  # of the criterion, in typical steps times Gaussians: larger prefers larger patches
-SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the most similar
-BORDER = 0.6  # added to the step between two things, in typical steps
-UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
-STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
+SCALE = 6.8  # of the merge criterion, in typical steps times Gaussians: larger prefers larger patches
+SMALLEST = 10  # Gaussians; smaller patches join the neighbour with the most similar features
+BORDER = 0.6  # added to the step between two instances, in typical steps
+UNKNOWN = 2.0  # step between a Gaussian with a feature and one without: that between opposite vectors
+STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # distinct ranks per unit of 1 - cosine: 16 bits sort in linear time
 
 
 def divide(surface: Surface, steps: Array, order: Array, scale: float, smallest: int) -> Array:
@@ -200,9 +200,9 @@ def divide(surface: Surface, steps: Array, order: Array, scale: float, smallest:
 def merge_patches(
     count: int, first: Array, second: Array, steps: Array, order: Array, scale: float, smallest: int
 ) -> Array:
-    """Return (M,) a member of each Gaussian's patch, the same for all of a patch."""
+    """Return (M,) int32 root of each Gaussian's patch (union-find), the same for all its members."""
     parent, size = np.arange(count, dtype=np.int32), np.ones(count, np.int32)
-    largest = np.zeros(count, np.float32)  # step within each patch
+    largest = np.zeros(count, np.float32)  # largest step within each patch
     for gathering in range(2):  # the criterion, then the small ones
         for link in order:
             a, b = first[link], second[link]
@@ -233,7 +233,7 @@ def merge_patches(
 def build_tree(
     surface: Surface, codec: Codec, latents: Array, known: Array, things: Array | None = None
 ) -> Tree:
-    """Return the voteless tree of (3, N, d) latents; things: (3, N) int32 by masks, or NO_NODE."""
+    """Return the tree of (3, N, d) latents, votes 0; things: (3, N) int32 instances by masks, or NO_NODE."""
     above: Array | None = None  # (M,) node of the level above
     of: list[Array] = []
     for level in range(len(LEVELS) - 1, -1, -1):
@@ -254,12 +254,12 @@ def build_tree(
 def _divided(
     surface: Surface, codec: Codec, latents: Array, known: Array, above: Array | None, things: Array
 ) -> Array:
-    """Return (M,) int32 number, from 0, of each Gaussian's patch at a level, within `above` (M,)."""
+    """Return (M,) int32 number, from 0, of each Gaussian's patch at a level, within patches `above` (M,)."""
     a, b = surface.ends
-    # 1 - cosine between what the two ends of each link mean.
+    # 1 - cosine between the features at the two ends of each link.
     both, neither = known[a] & known[b], ~known[a] & ~known[b]
     steps = np.where(both, codec.distances(latents, a, b), np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN)
-    # Between two Gaussians drawn by chance, on average: what is far in this encoder's space.
+    # Mean step between two random Gaussians: what is far in this encoder's space.
     typical = codec.spread(latents[known]) if known.any() else 1.0
     told = (things[a] != NO_NODE) & (things[b] != NO_NODE)
     within = 0 if above is None else steps  # a thing is one whole

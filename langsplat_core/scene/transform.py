@@ -1,4 +1,4 @@
-"""Similarity transforms of a scene: move, rotate, scale; positions, shapes, spherical harmonics, cameras."""
+"""Similarity transforms (move, rotate, scale) of a scene: its Gaussians, spherical harmonics and cameras."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
 from langsplat_core.scene.scene import FARTHEST, Camera, Scene, origin_of
 
-SHEAR = 1e-4  # of a matrix over its scale, against a rotation: more is another shape, not another place
+SHEAR = 1e-4  # largest difference of a matrix, divided by its scale, from a rotation
 AXES = {name: np.eye(3)[place] for place, name in enumerate("xyz")}
 AXES |= {f"-{name}": -axis for name, axis in AXES.items()}
 
@@ -59,7 +59,7 @@ class Similarity:
         return moving(-np.asarray(centre)).then(self).then(moving(centre))
 
     def quaternions(self, quats_wxyz: Array) -> Array:
-        """Return (N, 4) rotations followed by this one, float64, of the same lengths; zero stays zero."""
+        """Return (N, 4) float64 quaternions followed by this rotation; lengths are kept, zero stays zero."""
         w, x, y, z = quaternions(self.rotation)
         left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
         with np.errstate(invalid="ignore"):
@@ -114,7 +114,7 @@ def turning(direction: Array, onto: Array) -> Similarity:
 
 
 def similarity(matrix: Array) -> Similarity:
-    """Return a matrix's similarity; InputError: mirrored, flat, sheared, projective or not finite."""
+    """Return the similarity of a matrix; InputError: mirrored, flat, sheared, projective or not finite."""
     matrix = np.asarray(matrix, np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError("a transform is a matrix of 4 x 4 numbers, or 3 x 4")
@@ -139,10 +139,10 @@ def similarity(matrix: Array) -> Similarity:
 
 
 def turned_origin(rotation: Array, origin: Array) -> Array:
-    """Return where the `origin` (3,) of a scene comes by a `rotation` (3, 3) that stands it upright.
+    """Return the `origin` (3,) of a scene after the `rotation` (3, 3) that stands the scene upright.
 
-    Where that is nearly one of the world's axes onto others, by less than 0.1, it is taken for it: estimated
-    from a floor or cameras, it is a hair aslant, and about zero would move a far scene by metres.
+    A rotation within 0.1 of one that maps axes onto axes is replaced by it: estimates from a floor or from
+    cameras are slightly aslant, and such a rotation about zero would move a far scene by metres.
     """
     near = np.rint(rotation)
     return np.asarray((near if np.abs(rotation - near).max() < 0.1 else rotation) @ origin)
@@ -164,7 +164,7 @@ def transform_gaussians(gaussians: Gaussians, to: Similarity) -> Gaussians:
 
 
 def transform_scene(scene: Scene, to: Similarity, selected: Array | None = None) -> Scene:
-    """Return the scene with its cameras and metres per unit transformed, or `selected` (N,) bool alone."""
+    """Return the scene, cameras and metres per unit transformed, or only the `selected` (N,) Gaussians."""
     if to.is_identity:
         return scene
     if selected is not None:
@@ -184,12 +184,12 @@ def transform_scene(scene: Scene, to: Similarity, selected: Array | None = None)
 
 
 def between_worlds(to: Similarity, origin: Array, target: Array) -> Similarity:
-    """Return in the world what maps from a scene with an `origin` (3,) into one whose origin is `target`."""
+    """Return `to`, a map from a scene with `origin` (3,) to one with origin `target`, as one of the world."""
     return moving(-origin).then(to).then(moving(target))
 
 
 def place_scene(scene: Scene, to: Similarity = IDENTITY, origin: Array | None = None) -> Scene:
-    """Return the scene under a map of the world, relative to `origin` (3,), else that of `origin_of`."""
+    """Return the scene moved by `to`, a map of the world; relative to `origin` (3,), else `origin_of` it."""
     centre, radius = scene.bounds()
     if origin is None:
         axes = np.concatenate([np.eye(3), -np.eye(3)])
