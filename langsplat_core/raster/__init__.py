@@ -1,4 +1,4 @@
-"""Rasterizers: one small interface (`protocol`), one file each, loaded when first asked for."""
+"""Rasterizers: one small interface (`protocol`), one file each, loaded at first use."""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -18,7 +18,7 @@ class _Backend(NamedTuple):
     module: str
     class_name: str
     lifts: bool  # whether its views can gather
-    otherwise: str  # what to try where it cannot load
+    otherwise: str  # backend to suggest where this one cannot load
 
 
 BACKENDS: Mapping[str, _Backend] = MappingProxyType(

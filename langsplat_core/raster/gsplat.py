@@ -6,7 +6,7 @@ atomics, so its last digits vary between runs; numbers are float32. A view's foo
 float64 by the CPU's kernels, are shown to gsplat as flat Gaussians in pixels: it rounds a mean to 6e-8 of the
 image's size, and a covariance, whose inverse loses 6e-8 times the ratio of its variances and overflows beyond
 4e9 pixels. In training (`draw`) gsplat projects: equal float32 depths stay in the order of rows, covariances
-are formed in 3D, antialiasing lacks INRIA's floor of 0.005, smaller images their pixels' means (`dilation`).
+are formed in 3D, antialiasing lacks INRIA's floor of 0.005, smaller images the pixels' box of `dilation`.
 """
 
 import subprocess
@@ -29,16 +29,16 @@ from langsplat_core.scene import Camera, Gaussians, look_at
 DEVICE = "cuda"
 RAW = ("means", "log_scales", "quats_wxyz", "opacity_logits")  # of what is drawn
 has_device = torch.cuda.is_available
-FARTHEST = 1e10  # world units: where gsplat's far plane is when it is not told
+FARTHEST = 1e10  # world units: gsplat's default far plane
 
 
-# N Gaussians by the names of `Gaussians`, as float32 tensors on the CUDA device, raw as there; without sh.
+# N Gaussians: the raw fields of `Gaussians` without sh, by name, as float32 tensors on the CUDA device.
 DeviceGaussians = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True, eq=False)
 class DifferentiableImage:
-    """One image, still attached to the Gaussians and values that it came from."""
+    """One image that can be differentiated by the Gaussians and values that it came from."""
 
     image: Tensor  # (H, W, C) blended values on black, not clamped above
     alpha: Tensor  # (H, W) in [0, 1]
@@ -52,7 +52,7 @@ class DifferentiableImage:
 
 
 def require_device() -> None:
-    """Raise BackendError unless gsplat draws both ways on a CUDA device; the first use compiles."""
+    """Raise BackendError unless gsplat draws and differentiates on a CUDA device; compiles at first use."""
     if not has_device():
         raise BackendError("torch finds no CUDA device")
     shapes = {"means": (1, 3), "log_scales": (1, 3), "quats_wxyz": (1, 4), "opacity_logits": (1,)}
@@ -75,7 +75,7 @@ def draw(
     settings: RasterSettings,
     sh_degree: int | None = None,
 ) -> DifferentiableImage:
-    """Blend (N, C) `values`, or of `sh_degree` (N, K, 3) harmonics."""
+    """Blend (N, C) `values` or, with `sh_degree`, the colours of (N, K, 3) harmonics."""
     from gsplat import rasterization
 
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
@@ -111,7 +111,7 @@ def to_device(array: Array) -> Tensor:
 
 
 class GsplatView(LiftingView):
-    """M drawn of N Gaussians in depth order: their footprints, on the device."""
+    """View of N Gaussians: the footprints of the M that are drawn, in depth order, on the device."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> None:
         self.camera, self.count, workers = camera, len(gaussians), shared_workers()
@@ -123,7 +123,7 @@ class GsplatView(LiftingView):
         geometry = torch.from_numpy(found.geometry).to(DEVICE)[self._rows]
         x, y, a, k, c, log2_opacity = geometry[:, : projection.HALF_WIDTH].unbind(1)
         xx, yy = projection.HALF_LOG2_E / a**2, projection.HALF_LOG2_E / c**2  # the factors solved for them
-        # gsplat sorts by a float32 depth: the place in our order, in place of a depth, keeps the order.
+        # gsplat sorts by float32 depth: the rank in our order, given as the depth, keeps that order.
         place, xy, none = torch.arange(1, len(rows) + 1, device=DEVICE), k * yy, torch.zeros_like(k)
         self._means, self._opacities = torch.stack([x, y, place], 1).float(), log2_opacity.exp2().float()
         covariances = torch.stack([xx + k * xy, xy, none, xy, yy, none, none, none, none], 1)
@@ -143,7 +143,7 @@ class GsplatView(LiftingView):
             Ks=torch.eye(3, device=DEVICE)[None],
             width=self.camera.width,
             height=self.camera.height,
-            eps2d=0.0,  # footprints are dilated
+            eps2d=0.0,  # footprints are dilated already
             packed=False,
             camera_model="ortho",
         )

@@ -16,10 +16,10 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene import Camera, Gaussians
 
-# Of the dilation, for images 16 times as large as the photographs: with more of it, wrong cameras beside a
-# scene would spread every Gaussian over the whole image.
+# Largest growth of the dilation, in images 16 times as wide as the photographs: without a limit, cameras that
+# do not belong to a scene would spread every Gaussian over the whole image.
 MOST_GROWTH = 256.0
-CHANNELS_AT_ONCE = 32  # of an image: a tile of them stays in the first level cache
+CHANNELS_AT_ONCE = 32  # channels blended in one pass: a tile of them stays in the first level cache
 
 
 class View(ABC):
@@ -27,7 +27,7 @@ class View(ABC):
 
     camera: Camera
     count: int  # N
-    depths: Array  # (N,) camera z of what is drawn, unless `depth` is a view's own
+    depths: Array  # (N,) camera z, defined where drawn; not of views that override `depth`
 
     @abstractmethod
     def splat(self, values: Array) -> tuple[Array, Array]:
@@ -44,7 +44,7 @@ class View(ABC):
 
     def depth(self) -> Array:
         """Return (H, W) alpha-weighted mean depth along camera z, world units; 0 where nothing is drawn."""
-        # Ones are blended along: alpha may be 1 - T, which has no digits left where it is small.
+        # Ones are blended too, since alpha may be 1 - T, which has no digits left where it is small.
         both = np.column_stack([self.depths, np.ones_like(self.depths)])
         return mean_depth(*np.moveaxis(self.splat(both)[0], -1, 0))
 
@@ -67,7 +67,7 @@ class View(ABC):
 
 
 class LiftingView(View):
-    """A view whose backend also has the adjoint."""
+    """View that offers the adjoint `gather` too."""
 
     @abstractmethod
     def gather(self, image: Array) -> Array:
@@ -95,14 +95,14 @@ class LiftingView(View):
         return scipy.sparse.hstack(columns, format="csr")
 
     def check_labels(self, maps: Array, count: int) -> None:
-        """ValueError for maps that `gather_labels` cannot take."""
+        """Raise ValueError for maps that `gather_labels` cannot take."""
         check_array("maps", maps, ("L", self.camera.height, self.camera.width))
         if maps.max(initial=-1) >= count or maps.min(initial=-1) < -1:
             raise ValueError(f"maps: labels {maps.min()} to {maps.max()}, expected -1 to {count - 1}")
 
     @property
     def nbytes(self) -> int:
-        """Memory that the view holds beside its Gaussians, about."""
+        """Approximate memory of the view in bytes, its Gaussians not counted."""
         return 100 * self.count
 
 
@@ -128,12 +128,12 @@ def farthest(settings: RasterSettings) -> float:
 
 
 def mean_depth(sums: Array, weights: Array) -> Array:
-    """Return (H, W) mean depths from blended ones and their weights, 0 where nothing is drawn."""
+    """Return (H, W) mean depths: sums of weighted depths over weights, 0 where nothing is drawn."""
     return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
 
 
 def tangent_limits(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:
-    """Limits of |x/z| and |y/z| at which the Jacobian is taken: left, top, right, bottom of the axis."""
+    """Return the limits of |x/z| and |y/z| in the Jacobian: left, top, right and bottom of the axis."""
     margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
     margin_y = (settings.fov_clamp - 1) * 0.5 * camera.height / camera.fy
     return (
@@ -145,7 +145,7 @@ def tangent_limits(camera: Camera, settings: RasterSettings) -> tuple[float, flo
 
 
 class Dilation(NamedTuple):
-    """Widening of a footprint to one of pixels, px^2."""
+    """Variances that widen a footprint by the extent of pixels, px^2."""
 
     added: float  # to both variances
     # The part of it that opacities were fitted with: they fade by sqrt(det with this / det with all of it)
@@ -155,11 +155,11 @@ class Dilation(NamedTuple):
 def dilation(camera: Camera, settings: RasterSettings) -> Dilation:
     """Return what is added to both variances of a footprint, px^2.
 
-    Gaussians are fitted with the dilation around them, so it is a part of what they look like. In an image
-    of more pixels than the photographs had it covers more of them, up to `MOST_GROWTH`: otherwise what was
-    closed opens, and edges fray into needles (Yu et al. 2024, Mip-Splatting, figure 1). In one of fewer it
-    covers less, and pixels are means of those of the photographs: a box, whose variance less theirs is added
-    without making anything heavier. Antialiased Gaussians were fitted without dilation, by a filter of
+    Gaussians are fitted with the dilation, so it is part of their shape. In images of higher resolution than
+    the photographs it covers more pixels, up to `MOST_GROWTH`: otherwise closed surfaces open, and edges fray
+    into needles (Yu et al. 2024, Mip-Splatting, figure 1). In images of lower resolution it covers less, and
+    a pixel is the mean of several pixels of the photographs: the variance of its box, less that of theirs, is
+    added, and opacities fade in return. Antialiased Gaussians were fitted without dilation, by a filter of
     their own.
     """
     growth = 1.0

@@ -1,4 +1,4 @@
-"""The truth: a float64 rasterizer written to be read. Every other backend is tested against it.
+"""Float64 reference rasterizer, written to be read; every other backend is tested against it.
 
 Image formation, from top to bottom (constants in `config.RasterSettings`):
 
@@ -111,13 +111,13 @@ class Step:
     window: tuple[slice, slice]  # rows and columns of the image that it may touch
     running: Array  # False where the pixel has stopped before
     alpha: Array  # capped, but not cut off
-    before: Array  # transmittance before it
-    weights: Array  # alpha T, 0 where it is not added
-    after: Array  # transmittance behind it
+    before: Array  # transmittance before the Gaussian
+    weights: Array  # alpha T, 0 where the Gaussian is not added
+    after: Array  # transmittance behind the Gaussian
 
 
 def alphas_in(f: Footprints, index: int, window: tuple[slice, slice], settings: RasterSettings) -> Array:
-    """Alpha of one Gaussian at the pixels of a window (rows, columns), capped but not cut off."""
+    """Return alpha of one Gaussian at the pixels of a window (rows, columns), capped but not cut off."""
     rows, columns = window
     dx = np.arange(columns.start, columns.stop) + 0.5 - f.means_px[index, 0]
     dy = (np.arange(rows.start, rows.stop) + 0.5 - f.means_px[index, 1])[:, None]
@@ -127,7 +127,7 @@ def alphas_in(f: Footprints, index: int, window: tuple[slice, slice], settings: 
 
 
 def rim(f: Footprints, settings: RasterSettings, relative: float) -> Array:
-    """Return (N, 2) half extents of the contour alpha = alpha_min (1 - relative), px, a little generous."""
+    """Return (N, 2) half extents of the contour alpha = alpha_min (1 - relative), px, rounded up."""
     squared = 2 * np.log(np.maximum(f.opacities / settings.alpha_min, 1 + 1e-9))
     return f.extents_px * np.sqrt(1 + 2.1 * relative / squared)[:, None] + 1e-3
 
@@ -141,7 +141,7 @@ class ReferenceView(LiftingView):
         self.order = np.argsort(footprints.depths, kind="stable")
 
     def steps(self, wider: float = 0.0) -> Iterator[Step]:
-        """Every Gaussian that is drawn, front to back: steps 3 and 4 of the module's list.
+        """Yield every Gaussian that is drawn, front to back: steps 3 and 4 of the module's list.
 
         Windows only save time: outside of them alpha is below alpha_min (1 - wider).
         """

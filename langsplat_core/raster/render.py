@@ -1,4 +1,4 @@
-"""The front door of the rasterizers: a scene and a camera in, an image out.
+"""Rendering of a scene as a camera sees it, by any of the rasterizers.
 
 >>> import numpy as np
 >>> from langsplat_core import Gaussians, Scene, look_at, render
@@ -52,7 +52,7 @@ def view_of(
 
 @cache
 def _cpu() -> protocol.LiftingRasterizer:
-    """Return the process's CPU rasterizer: one, since views of it use its memory again."""
+    """Return the process's CPU rasterizer: only one, so that all views reuse its memory."""
     return load_lifting_rasterizer("cpu")
 
 
@@ -76,9 +76,9 @@ def render(
 
     values: (N, C) further numbers per Gaussian, finite, to be blended along with the colours. backend: one
     of `raster.BACKENDS` that needs no device handed to it ("cpu", "cuda", "reference"). profile: constants
-    of image formation, such as `config.INRIA`; None: the published ones with the scene's own near plane. Its
-    antialiasing applies to both. Raises InputError for an unknown backend, BackendError for one that cannot
-    load here, ValueError for values of another shape.
+    of image formation, such as `config.INRIA`; None: the published ones with the scene's own near plane. The
+    scene's antialiasing applies to both. Raises InputError for an unknown backend, BackendError for one
+    that cannot load here, ValueError for values of another shape.
     """
     if values is not None:
         check_array("values", np.asarray(values), ("N", "C"), {"N": len(scene.gaussians.means)})
@@ -98,7 +98,7 @@ def splat_colours(view: protocol.View, gaussians: Gaussians, values: Array | Non
 
 
 def colours_seen(gaussians: Gaussians, camera: Camera, rows: Array | None = None) -> Array:
-    """Return (N, 3) float32 colours >= 0 seen from the camera, 0 if invalid; rows: these alone."""
+    """Return (N, 3) float32 colours >= 0 seen from the camera, 0 if invalid; (M, 3) of `rows` (M,)."""
     from langsplat_core.raster.cpu.projection import colours  # numba takes a second to import
 
     if camera.orthographic:
@@ -117,8 +117,8 @@ def pixel_weights(
     """Return (M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and (M,) float32 weights.
 
     The weights, alpha_i T_i > 0, add up to the pixel's alpha; rasterizer and settings as in `view_of`. Only
-    those that could reach the pixel are projected, in their order: weights are those of the whole view. The
-    pixel must lie in the image.
+    Gaussians that could reach the pixel are projected, in the scene's order, so that the weights are those of
+    the whole view. The pixel must lie in the image.
     """
     column, row = pixel
     formed = scene.raster_settings() if settings is None else settings
@@ -141,7 +141,7 @@ def _may_reach(
     beyond sqrt(2 ln(1 / alpha_min)) deviations alpha is below the cut-off. A clamped J is only smaller.
     """
     with np.errstate(all="ignore"):  # invalid rows are dropped by the view
-        points = gaussians.means @ camera.rotation.T.astype(np.float32)  # rounded: this is a sieve
+        points = gaussians.means @ camera.rotation.T.astype(np.float32)  # float32: a sieve
         x, y, z = np.ascontiguousarray((points + camera.world_to_camera[:3, 3].astype(np.float32)).T)
         largest = np.float32(max(camera.fx, camera.fy)) * np.exp(gaussians.log_scales.max(1))
         if not camera.orthographic:

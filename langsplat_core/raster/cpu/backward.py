@@ -6,7 +6,7 @@ alpha gradient (per pixel), and behind_i = sum over j > i of w_j s_j,
 
     d loss / d alpha_i = T_i s_i - behind_i / (1 - alpha_i),
 
-a sum of positive products where s is: nothing is subtracted from a total, T is never divided back.
+whose products are positive where s is: nothing is subtracted from a total, and T is never divided out.
 Alpha at its cap has no gradient. As log2(alpha) is a quadratic in the whitened coordinates (w, v) of
 `projection`, a footprint's gradient needs only the moments of q = alpha d loss / d alpha in (w, v).
 """
@@ -27,17 +27,17 @@ from langsplat_core.raster.cpu.tiles import PIXELS, TILE, Tiles
 Q, QW, QV, QWW, QWV, QVV = range(6)
 MOMENTS = 8
 _ENTRY = 2 * TILE  # numbers of tape per row: alpha and T
-_TAPE = 128 * TILE * _ENTRY  # its first length: 128 Gaussians that fill the tile
+_TAPE = 128 * TILE * _ENTRY  # initial length of a tape: 128 Gaussians that fill the tile
 
 
 @helper
 def _record(tile: int, tiles: Tiles, state: Array, spans: Array, tape: Array) -> tuple[Array, int, int]:
-    """`walk`, but with a tape that may have to grow on the way.
+    """Blend a tile as `walk` does, and write alpha and T of every row to the tape.
 
-    Returns it (a longer one where it was full), its length and the end of the intersections visited.
+    Return the tape (a longer copy if it was full), its used length and the end of the intersections visited.
 
-    spans[s - first] <- rows [low, high) of each intersection that were blended; none where no pixel got any
-    weight, and nothing on the tape.
+    spans[s - first] <- rows [low, high) of each intersection that were blended; low = high where no pixel got
+    any weight, and nothing is on the tape.
     """
     x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
@@ -78,10 +78,10 @@ def backward(
     partial: Array,
     reached: Array,
 ) -> None:
-    """Pull gradients (H, W, C) by the image and (H, W, 1) by alpha back; values: (M, C) in depth order.
+    """Pull back gradients by image (H, W, C) and alpha (H, W, 1); values: (M, C) in depth order.
 
-    Fills (I,) bool `reached`, and (I, 8 + padded(C)) partial sums where that is True. float32, for tiles
-    [first, last).
+    For tiles [first, last), fill (I,) bool `reached` and, where it is True, (I, 8 + padded(C)) float32
+    partial sums.
     """
     image_grad, alpha_grad = grads
     channels, columns = values.shape[1], partial.shape[1]
@@ -147,7 +147,7 @@ class GaussianGradients(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Gradients that `backward` left of the M Gaussians that are drawn."""
+    """Partial sums that `backward` fills, for the M Gaussians that are drawn."""
 
     rank_of: Array  # (N,) int32 place in depth order of every row, -1 where it is not drawn
     partial: Array  # (I, 8 + padded(C))
@@ -156,7 +156,7 @@ class Sums(NamedTuple):
 
 @helper
 def _fetch(i: int, last: int, tiles: Tiles, sums: Sums) -> None:
-    """Ask for the memory of rows after `i`, in steps: each needs what the one before brought."""
+    """Prefetch what rows after `i` need, in three stages: each reads what the one before has loaded."""
     rank = sums.rank_of[min(i + 3 * tiling.AHEAD, last - 1)]
     if rank >= 0:
         ln.prefetch(tiles.firsts, np.int64(rank))
@@ -173,7 +173,7 @@ def _fetch(i: int, last: int, tiles: Tiles, sums: Sums) -> None:
 
 @helper
 def _add_up(rank: int, tiles: Tiles, sums: Sums, out: Array) -> bool:
-    """Add up the rank's partial sums into `out`, in the order of its tiles; False where there are none."""
+    """Add the rank's partial sums up in `out`, in the order of its tiles; return False if there are none."""
     some = False
     for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
         slot = tiles.slots[n]
@@ -184,12 +184,12 @@ def _add_up(rank: int, tiles: Tiles, sums: Sums, out: Array) -> bool:
     return some
 
 
-# From here on eight Gaussians at once: numbers are lanes, vectors tuples of three.
+# From here on, eight Gaussians at once: scalars are lanes, and vectors tuples of three lanes.
 
 
 @helper
 def _footprint_gradient(g: Array, ranks: Array, added: Array, each: Array) -> Any:
-    """Gradients by opacity * d/d opacity, the 2D mean, and the 2D covariance (symmetric: xx, xy, yy).
+    """Return opacity * d/d opacity and the gradients by 2D mean and covariance (symmetric: xx, xy, yy).
 
     With M = [[a, -a k], [0, c]] and u = (w, v) = M (pixel - mean):
     ln alpha = const - ln2 |u|^2, so d/d mean = 2 ln2 M^T u and d/d cov = 2 ln2^2 M^T u u^T M.
@@ -233,7 +233,7 @@ def _with_compensation(by_covariance: cp.Point, a: Any, camera: cp.KernelCamera,
 
 @helper
 def _quat_gradient(quat: Any, inverse: Lanes, d: Any) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Return the gradient by the raw quaternion from `d`, that by its rotation matrix (rows)."""
+    """Return the gradient by the raw quaternion from `d`, the gradient by its rotation matrix (rows)."""
     (d00, d01, d02), (d10, d11, d12), (d20, d21, d22) = d
     w, x, y, z = quat[0] * inverse, quat[1] * inverse, quat[2] * inverse, quat[3] * inverse
     xy, xz, yz = d01 + d10, d02 + d20, d12 + d21
@@ -251,7 +251,7 @@ def _quat_gradient(quat: Any, inverse: Lanes, d: Any) -> tuple[Lanes, Lanes, Lan
 def _point_gradient(
     point: cp.Point, camera: cp.KernelCamera, by_mean: tuple[Lanes, Lanes], db: Any
 ) -> cp.Point:
-    """Gradient by the camera-space point from those by its pixel and by B = J R (two rows).
+    """Return the gradient by the camera-space point from those by its pixel and by B = J R (two rows).
 
     A clamped coordinate is a constant multiple of z in the Jacobian, so it gets no gradient there.
     """
@@ -291,7 +291,7 @@ def _mixed(p: Any, x: cp.Point, q: Any, y: cp.Point) -> cp.Point:
 
 @helper
 def _axes_gradient(matrices: Any, scales: cp.Point, by_covariance: cp.Point) -> Any:
-    """Pull the covariance's gradient G back: A = B turn diag(s) gets 2 G A, then log(s), turn and B."""
+    """Return gradients by log(s), turn and B from G, by the covariance: A = B turn diag(s) has 2 G A."""
     ((t0, t1, t2), (b0, b1), (a0, a1)), (gxx, gxy, gyy) = matrices, by_covariance
     d0, d1 = _mixed(2 * gxx, a0, 2 * gxy, a1), _mixed(2 * gxy, a0, 2 * gyy, a1)
     e0, e1 = _times(d0, scales), _times(d1, scales)
@@ -302,7 +302,7 @@ def _axes_gradient(matrices: Any, scales: cp.Point, by_covariance: cp.Point) -> 
 
 @helper
 def _put(array: Array, rows: Array, values: Any) -> None:
-    """Write numbers, one a column, into eight rows."""
+    """Write eight lanes for each column into eight rows."""
     for column in range(len(values)):
         ln.scatter(array, rows, 0, column, values[column])
 
@@ -311,7 +311,7 @@ def _put(array: Array, rows: Array, values: Any) -> None:
 def _pull_back(
     which: Array, footprints: Any, rows: cp.Rows, camera: cp.KernelCamera, out: GaussianGradients
 ) -> None:
-    """Fill the gradients of the eight Gaussians `which`; footprints: as of `_footprint_gradient`."""
+    """Fill the gradients of the eight Gaussians `which`; footprints: arguments of `_footprint_gradient`."""
     q, by_mean, by_covariance = _footprint_gradient(*footprints)
     point, scales, quat = cp.parameters(rows, which, camera)
     inverse, turn, b, a = cp.axes(point, scales, quat, camera)
@@ -336,9 +336,9 @@ def to_parameters(
     camera: cp.KernelCamera,
     out: GaussianGradients,
 ) -> None:
-    """Fill `out`, which is 0, for rows [first, last) that are drawn.
+    """Fill `out`, initially 0, for those of the rows [first, last) that are drawn.
 
-    Sums what `backward` left, in the order of the tiles, and pulls the moments back through the projection.
+    Partial sums of `backward` are added in the order of tiles; moments pulled back through the projection.
     """
     tiles, sums, rows, camera, out = ln.borrowed((tiles, sums, rows, camera, out))
     added, each = np.empty((8, sums.partial.shape[1])), np.arange(8)

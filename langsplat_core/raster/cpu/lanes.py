@@ -50,7 +50,7 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def _of_llvm(builder: Any, name: str, x: Any) -> Any:
-    """Return a function of LLVM's, of floats or doubles, at each lane."""
+    """Return LLVM's function `name` of each lane, of floats or doubles."""
     name = f"llvm.{name}.v{x.type.count}f{32 if x.type == FLOATS else 64}"
     kind = ir.FunctionType(x.type, [x.type])
     return builder.call(builder.module.declare_intrinsic(name, (), kind), [x])
@@ -77,7 +77,7 @@ def as_lanes(builder: Any, value: Any, kind: Any = FLOATS) -> Any:
 def lanewise(build: Callable[..., Any], symbol: Any = None) -> Any:
     """Let kernels call `build`, or use the operator `symbol`, without its first argument, the builder.
 
-    The others may be lanes or numbers; one at least must be lanes, all of them of one kind.
+    The other arguments may be lanes or numbers; at least one must be lanes, and all lanes of one kind.
     """
     symbol, arity = symbol or build, len(parameters_of(build).parameters) - 1
 
@@ -116,7 +116,7 @@ lanewise(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a
 
 @intrinsic
 def lanes(typing: Any, value: Any) -> Any:
-    """Sixteen times the same float."""
+    """Return sixteen lanes of the same float32."""
     return lanes16(value), lambda context, builder, sig, args: as_lanes(builder, args[0])
 
 
@@ -139,7 +139,7 @@ def where_at_least(builder: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
 
 
 def _polynomial(builder: Any, x: Any, coefficients: list[float]) -> Any:
-    """Polynomial in x; the coefficients are those of rising powers."""
+    """Return a polynomial in x; coefficients: of rising powers."""
     result = _kept(builder, coefficients[-1], x.type)
     for coefficient in coefficients[-2::-1]:
         scaled = builder.fmul(result, x, flags=_FUSE)
@@ -149,11 +149,11 @@ def _polynomial(builder: Any, x: Any, coefficients: list[float]) -> Any:
 
 @lanewise
 def exp2(builder: Any, power: Any) -> Any:
-    """2^power for -126 <= power <= 127, relative error 2e-7; other powers give any number.
+    """Return 2^power for -126 <= power <= 127, relative error 2e-7; undefined for other powers.
 
-    Of doubles for -1022 <= power <= 1023, relative error 2e-16.
+    For doubles: -1022 <= power <= 1023, relative error 2e-16.
     """
-    # So large a number has no digits behind the point: the sum is rounded to an integer, in its lowest bits.
+    # Adding so large a number rounds the power to an integer, which then stands in the sum's lowest bits.
     digits, whole = (23, INTS) if power.type == FLOATS else (52, LONGS)
     large = _kept(builder, 1.5 * 2**digits, power.type)
     shifted = builder.fadd(power, large)
@@ -166,7 +166,7 @@ def exp2(builder: Any, power: Any) -> Any:
 
 @lanewise
 def log2(builder: Any, x: Any) -> Any:
-    """log2 of positive normal doubles, relative error 4e-16: of 2^k m with m from sqrt(1/2) to sqrt(2)."""
+    """Return log2 of positive normal doubles 2^k m, sqrt(1/2) <= m <= sqrt(2), relative error 4e-16."""
     one, digits = _kept(builder, 1, DOUBLES), ir.Constant(LONGS, [52] * EIGHT)
     root = builder.bitcast(_kept(builder, math.sqrt(0.5), DOUBLES), LONGS)
     bits = builder.bitcast(x, LONGS)
@@ -178,12 +178,12 @@ def log2(builder: Any, x: Any) -> Any:
 
 
 def shuffle(builder: Any, a: Any, b: Any, picks: list[int]) -> Any:
-    """Lanes of a (0 to n - 1) and b (n to 2 n - 1)."""
+    """Return the lanes `picks` of a (numbered 0 to n - 1) and b (n to 2 n - 1)."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, len(picks)), picks))
 
 
 def _fold(builder: Any, value: Any, combine: Callable[[Any, Any], Any], width: int = 1) -> Any:
-    """Halve the lanes until `width` are left; one alone is a number."""
+    """Combine halves of the lanes until `width` are left; a single one is returned as a number."""
     while value.type.count > width:
         half = value.type.count // 2
         low, high = list(range(half)), list(range(half, 2 * half))
@@ -211,9 +211,9 @@ def largest(typing: Any, value: Any) -> Any:
 
 @intrinsic
 def borrowed(typing: Any, arrays: Any) -> Any:
-    """Return a kernel's own arguments, a tuple of arrays and tuples of them, without counts of their users.
+    """Return a kernel's arguments, a nested tuple of arrays, without reference counts.
 
-    Their owner waits for the kernel; numba counts, atomically, at every row of an array that a loop takes.
+    The caller owns them until the kernel ends; numba would count, atomically, at every row that a loop takes.
     """
 
     def bare(context: Any, builder: Any, kind: Any, value: Any) -> Any:
@@ -233,14 +233,14 @@ def borrowed(typing: Any, arrays: Any) -> Any:
 
 
 def _pointer(context: Any, builder: Any, sig: Any, arguments: Any, kind: Any = FLOATS) -> Any:
-    """Return where element arguments[1] of the array arguments[0] lies, as a pointer to `kind`."""
+    """Return a pointer of type `kind` to element arguments[1] of the array arguments[0]."""
     data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
     return builder.bitcast(builder.gep(data, [arguments[1]]), kind.as_pointer())
 
 
 @intrinsic
 def load(typing: Any, array: Any, index: Any) -> Any:
-    """array[index : index + 16] of a flat float32 array."""
+    """Return array[index : index + 16] of a flat float32 array."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         value = builder.load(_pointer(context, builder, sig, arguments))
@@ -252,7 +252,7 @@ def load(typing: Any, array: Any, index: Any) -> Any:
 
 @intrinsic
 def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """array[index : index + 16] = value of a flat float32 array."""
+    """Set array[index : index + 16] of a flat float32 array to `value`."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         value = as_lanes(builder, arguments[2])
@@ -271,7 +271,7 @@ def store_totals(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d:
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         def merge(x: Any, y: Any, run: int) -> Any:
-            """Add stretches of `run` lanes pairwise within x and within y; their results take turns."""
+            """Add stretches of `run` lanes pairwise within x and within y; results of both alternate."""
             starts = [n + side for n in range(0, LANES, 2 * run) for side in (0, LANES)]
             even = [n + k for n in starts for k in range(run)]
             odd = [n + run + k for n in starts for k in range(run)]
@@ -297,7 +297,7 @@ def _elements(context: Any, builder: Any, sig: Any, arguments: Any) -> Iterator[
 
 @intrinsic
 def gathered(typing: Any, array: Any, rows: Any, start: Any, column: Any) -> Any:
-    """Eight doubles array[rows[start + j], column] of a float array, 1D (column 0) or 2D; rows: int64."""
+    """Return array[rows[start + j], column], j < 8, of a 1D (column 0) or 2D float array; rows: int64."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         value = ir.Constant(ir.VectorType(context.get_value_type(array.dtype), EIGHT), ir.Undefined)
@@ -310,7 +310,7 @@ def gathered(typing: Any, array: Any, rows: Any, start: Any, column: Any) -> Any
 
 @intrinsic
 def scatter(typing: Any, array: Any, rows: Any, start: Any, column: Any, value: Any) -> Any:
-    """array[rows[start + j], column] = value[j] for eight doubles; a float array as `gathered` takes it."""
+    """Set array[rows[start + j], column] to value[j] for eight doubles; array as in `gathered`."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         kind, value = context.get_value_type(array.dtype), arguments[4]
@@ -324,7 +324,7 @@ def scatter(typing: Any, array: Any, rows: Any, start: Any, column: Any, value: 
 
 @intrinsic
 def prefetch(typing: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line of element `index`."""
+    """Prefetch the cache line of element `index`."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         byte = ir.IntType(8)

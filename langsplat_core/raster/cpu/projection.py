@@ -1,7 +1,7 @@
 """Projection of Gaussians for the CPU backend: steps 1 and 2 of `reference.py`, compiled.
 
 Everything here is float64. Depths are in the reference's order of operations and agree with it bit for bit,
-and coordinates of a million world units lose nothing. Eight at once, a Gaussian costs 0.02 microseconds.
+and coordinates of a million world units lose nothing. Eight are projected at once, at 0.02 microseconds each.
 
 A footprint is kept as the triangular factor of its conic, not as the conic: with (dx, dy) = pixel - mean,
 
@@ -56,9 +56,9 @@ class Rows(NamedTuple):
 class Projection(NamedTuple):
     """Gaussians projected onto the image plane, as `project` returns them."""
 
-    geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; means something only where drawn
-    depths: Array  # (N,) float64 camera z; means something only where drawn
-    drawn: Array  # (M,) int32 rising rows of those that are drawn
+    geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; defined only where drawn
+    depths: Array  # (N,) float64 camera z; defined only where drawn
+    drawn: Array  # (M,) int32 ascending rows of those that are drawn
 
 
 class KernelCamera(NamedTuple):
@@ -79,7 +79,7 @@ class KernelCamera(NamedTuple):
     near: float
     far: float
     dilation: float
-    fitted: float  # of the dilation, see `protocol.Dilation`
+    fitted: float  # part of the dilation, see `protocol.Dilation`
     alpha_min: float
     orthographic: bool
 
@@ -116,13 +116,13 @@ def camera_point(mean: Point, camera: KernelCamera) -> Point:
 
 @helper
 def _over(z: float, camera: KernelCamera) -> float:
-    """Return what turns camera coordinates into tangents: the inverse depth, or 1 without perspective."""
+    """Return the factor from camera coordinates to tangents: the inverse depth, or 1 if orthographic."""
     return z * 0.0 + 1.0 if camera.orthographic else 1.0 / z
 
 
 @helper
 def _jacobian(point: Point, camera: KernelCamera) -> tuple[float, float, float, float]:
-    """Non-zero entries (0,0), (0,2), (1,1), (1,2) of d(pixel)/d(camera point), taken at the clamped point."""
+    """Return entries (0,0), (0,2), (1,1), (1,2) of d(pixel)/d(clamped camera point); others are 0."""
     x, y, z = point
     over = _over(z, camera)
     fx, fy, along = camera.fx * over, camera.fy * over, 0.0 if camera.orthographic else -1.0
@@ -165,7 +165,7 @@ def axes(point: Point, scales: Point, quat: tuple[float, float, float, float], c
 def covariance(
     a: tuple[Point, Point], dilation: float, fitted: float
 ) -> tuple[float, float, float, float, float]:
-    """2D covariance xx, xy, yy with dilation, its determinant, and that with the fitted dilation.
+    """Return the 2D covariance xx, xy, yy with dilation, its determinant, and that with the fitted dilation.
 
     det(A A^T) = |row0 x row1|^2 (Cauchy-Binet): no cancellation, however thin the needle.
     """
@@ -190,7 +190,7 @@ def rows_of(gaussians: Gaussians) -> Rows:
 
 @helper
 def exp(x: Lanes) -> Lanes:
-    """e^x of doubles up to 708, relative error 1e-15 for |x| < 10; as at -708 below that."""
+    """Return e^x of doubles up to 708, relative error 1e-15 for |x| < 10; below -708 as at -708."""
     return exp2(max(x * (2 * HALF_LOG2_E), -1022.0))
 
 
@@ -210,7 +210,7 @@ def parameters(rows: Rows, which: Array, camera: KernelCamera) -> Any:
 
 @helper
 def _footprints(rows: Rows, which: Array, camera: KernelCamera, each: Array, out: Array) -> None:
-    """Fill (8, 10): geometry, depths, and numbers < 0 where no pixel centre is met, of eight Gaussians.
+    """Fill `out` (8, 10) for eight Gaussians: geometry, depth, and a number < 0 if the Gaussian is not drawn.
 
     which: (8,) their rows; each: (8,) 0 to 7.
     """
@@ -267,7 +267,7 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, geometry: A
 def project_all(
     rows: Rows, camera: KernelCamera, workers: Workers, empty: Callable[..., Array] = np.empty
 ) -> Projection:
-    """Return `project` of all rows; empty: gives the memory of their geometry."""
+    """Project all rows; empty: allocates their geometry as `numpy.empty` does."""
     n = len(rows.valid)
     geometry, depths = empty((n, COLUMNS), np.float64), np.empty(n)
     drawn = workers.run(project, n, rows, camera, geometry, depths)
@@ -278,7 +278,7 @@ def project_all(
 
 _C20, _C21, _C22 = C2
 _C30, _C31, _C32, _C33, _C34 = C3
-_AHEAD = 20  # rows between asking for a Gaussian and using it
+_AHEAD = 20  # rows between prefetching a Gaussian and using it
 _NEAREST = 1e-12  # world units; a Gaussian closer to the camera than this has no direction
 
 
@@ -349,7 +349,7 @@ def _forward(
         prefetch(means, 3 * later)
         for start in range(0, numbers, 16):  # cache lines
             prefetch(sh, numbers * later + start)
-        prefetch(sh, numbers * later + numbers - 1)  # in half of them it begins another
+        prefetch(sh, numbers * later + numbers - 1)  # the last may lie in one more
         n = rows[place]
         x, y, z, _ = _direction(means[n], position)
         _basis(x, y, z, b)
@@ -373,7 +373,7 @@ def _backward(
     b, h = np.empty(sh.shape[1]), np.empty(sh.shape[1])
     for n in range(first, last):
         if colour_grad[n, 0] == 0 and colour_grad[n, 1] == 0 and colour_grad[n, 2] == 0:
-            sh_grad[n] = 0  # as half of them, which the view does not show
+            sh_grad[n] = 0  # as for about half, which are out of view
             continue
         x, y, z, inverse = _direction(means[n], position)
         _basis(x, y, z, b)
@@ -394,7 +394,7 @@ def _backward(
 def colours(sh: Array, means: Array, camera_position: Array, rows: Array | None = None) -> Array:
     """Map (N, K, 3) float32 coefficients, (N, 3) float32 means to (N, 3) float32 display colours >= 0.
 
-    With `rows`, (M,) int32, those of these Gaussians.
+    rows: (M,) int32 Gaussians whose (M, 3) colours are returned; by default all.
 
     Invalid rows give 0; see `reference.colours`.
     """
@@ -410,9 +410,9 @@ def colours(sh: Array, means: Array, camera_position: Array, rows: Array | None 
 def colours_backward(
     sh: Array, means: Array, camera_position: Array, colour_grad: Array
 ) -> tuple[Array, Array]:
-    """Gradients (N, K, 3) by the coefficients and (N, 3) by the means, from (N, 3) by the colours; float32.
+    """Return float32 gradients (N, K, 3) by coefficients and (N, 3) by means, from (N, 3) by colours.
 
-    A channel clamped at 0 and an invalid row get none.
+    They are 0 for channels clamped at 0 and for invalid rows.
     """
     n = check_array("sh", sh, ("N", "K", 3), dtype=np.float32)
     check_array("means", means, ("N", 3), n, dtype=np.float32)

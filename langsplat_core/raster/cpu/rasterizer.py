@@ -1,4 +1,4 @@
-"""The CPU backend: compiled, parallel over tiles, exact adjoint, true gradients.
+"""The CPU backend: compiled, parallel over tiles, with the exact adjoint and exact gradients.
 
 Results do not depend on the number of threads: tiles are independent, and sums over tiles are made
 per Gaussian in a fixed order. From top to bottom: the kernels of ``W x``, ``W^T y`` and the depth of half
@@ -111,7 +111,7 @@ def _note_half(work: Any, depth: Any, s: int, row: int, low: int, weight: Lanes,
 
 @kernel
 def median_tiles(first: int, last: int, tiles: Tiles, depths: Array, out: Array) -> None:
-    """Fill (H, W, 1) with the one of (M,) sorted depths that takes T to 0.5 or below, else 0."""
+    """Fill (H, W, 1) with the first of (M,) sorted depths behind which T is 0.5 or below, else 0."""
     found = np.empty(PIXELS, np.float32)
     for i in range(first, last):
         tile = tiling.tile_at(i, tiles)
@@ -131,7 +131,7 @@ class TileRegions(NamedTuple):
     """The regions that each of T tiles meets."""
 
     counts: Array  # (T,) int64
-    labels: Array  # (T, 256 maps) int32, the first counts[t] of a row; 0 behind them
+    labels: Array  # (T, 256 L) int32 labels of L maps, the first counts[t] of row t; 0 behind them
 
 
 @kernel
@@ -181,7 +181,7 @@ def _fill_planes(planes: Array, maps: Array, tile: int, tiles: Tiles, labels: Ar
 def _gather_regions(
     first: int, last: int, tiles: Tiles, maps: Array, labels: Array, lines: Array, offsets: Array, sums: Array
 ) -> None:
-    """Map (L, H, W) int32 maps to tile t has lines[t] `sums` for each intersection, from offsets[t] on."""
+    """Fill `sums`, lines[t] for each intersection of tile t from offsets[t] on, by (L, H, W) int32 maps."""
     planes, weights = np.empty(PIXELS * lines.max(), np.float32), np.empty(PIXELS, np.float32)
     for i in range(first, last):
         tile = tiling.tile_at(i, tiles)
@@ -198,14 +198,14 @@ def _gather_regions(
 def label_weights(
     tiles: Tiles, order: Array, workers: Workers, maps: Array, shape: tuple[int, int], least: float
 ) -> "scipy.sparse.csr_matrix":
-    """Map (L, H, W) int32 maps, labels -1 for none to float32 weights, pixels, of `shape` (N, labels).
+    """Return float32 mask weights, pixels, of `shape` (N, labels) by (L, H, W) int32 maps; -1: no label.
 
     `order`: (M,) rows of the drawn Gaussians. Entries of at most `least` are left out.
     """
     number = len(tiles.starts) - 1
     met = TileRegions(np.empty(number, np.int64), np.empty((number, len(maps) * PIXELS), np.int32))
     workers.run(_meet_regions, number, maps, tiles.columns, met)
-    here, lines = np.diff(tiles.starts), (met.counts + 3) // 4 * 4  # in fours, as `correlate` likes them
+    here, lines = np.diff(tiles.starts), (met.counts + 3) // 4 * 4  # multiples of 4, for `correlate`
     offsets = np.concatenate([[0], np.cumsum(here * lines)])
     sums = np.empty(offsets[-1], np.float32)
     workers.run(_gather_regions, number, tiles, maps, met.labels, lines, offsets, sums)
@@ -229,34 +229,34 @@ def label_weights(
 
 _LINE = 64  # bytes of a cache line; arrays begin with one
 _SPARE_BLOCKS = 16  # a view takes five, its gradients seven
-_IDLE = 60  # requests after which a block that nobody asked for is given back
+_IDLE = 60  # requests after which a block that was not reused is freed
 
 
 class _Loan:
-    """Owner of a block's bytes for as long as an array lies in them."""
+    """Owner of a block of memory for as long as an array uses it."""
 
     def __init__(self, block: Array) -> None:
         self.__array_interface__ = block.__array_interface__
 
 
 class Memory:
-    """Blocks of memory that views use again: the system fills pages that it hands out with zeros.
+    """Pool of memory blocks that views reuse, since the system zeroes the pages that it hands out.
 
-    Views of 500 000 Gaussians take three quarters of the time with it, beside `numpy.empty`.
+    Views of 500 000 Gaussians take three quarters of the time that they take with `numpy.empty`.
     """
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._requests = 0
-        self._spare: list[tuple[int, Array]] = []  # when last asked for
+        self._spare: list[tuple[int, Array]] = []  # request of the last use, and block
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> Array:
-        """Return an array like `numpy.empty` does, in a block that no other array lies in any more."""
+        """Return an array as `numpy.empty` does, in a block that no other array uses any more."""
         size = math.prod(shape) * np.dtype(dtype).itemsize
         with self._lock:
             self._requests += 1
             now, spare = self._requests, list(self._spare)
-            del self._spare[: len(spare)]  # loans that end meanwhile come behind them
+            del self._spare[: len(spare)]  # blocks returned meanwhile are appended behind them
             recent = [one for one in spare[-_SPARE_BLOCKS:] if now - one[0] < _IDLE]
             place = next((i for i, (_, one) in enumerate(recent) if size <= len(one) <= 2 * size), None)
             found = np.empty(size + size // 4 + _LINE, np.uint8) if place is None else recent.pop(place)[1]
@@ -268,7 +268,7 @@ class Memory:
 
 
 class CpuView(LiftingView):
-    """M drawn of N Gaussians, in depth order, with their tiles."""
+    """View of N Gaussians, M of which are drawn: their depth order and their tiles."""
 
     def __init__(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, workers: Workers, memory: Memory
@@ -337,7 +337,7 @@ class CpuView(LiftingView):
     ) -> GaussianGradients:
         """Return gradients of a loss, given those by `splat(values)`: (H, W, C) image and (H, W) alpha.
 
-        They are those of image formation as it is: 0 through a capped alpha and across the cut-offs.
+        They are exact for this image formation: nothing passes a capped alpha or a cut-off.
         """
         n, height, width = self.count, self.camera.height, self.camera.width
         channels = check_array("values", values, (n, "C"))["C"]
@@ -365,13 +365,13 @@ class CpuView(LiftingView):
     def median_rows(self) -> Array:
         """Return (H, W) int64 Gaussian at which the transmittance falls to 0.5 or below, -1 where never.
 
-        Of more than 2^24 that are drawn it may be the next in depth.
+        If more than 2^24 are drawn, it may be the next in depth: ranks are float32.
         """
         place = self._at_half(np.arange(1, len(self.order) + 1, dtype=np.float32)).astype(np.int64)
         return np.append(self.order, -1)[place - 1]
 
     def _at_half(self, values: Array) -> Array:
-        """Return (H, W) that one of (M,) numbers > 0, in depth order, that is of that Gaussian, else 0."""
+        """Return (H, W) the first of (M,) numbers > 0, in depth order, behind which T <= 0.5, else 0."""
         found = np.empty((self.camera.height, self.camera.width, 1), np.float32)
         self._over_tiles(median_tiles, values, found)
         return found[..., 0]

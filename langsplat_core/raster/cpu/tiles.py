@@ -40,9 +40,9 @@ _MOST = 2**31 - 1  # intersections of Gaussians and tiles in one view
 _SPAN, _PLACE = 10, 24  # bits of a span of rows and of a tile's number, beside those of a rank
 _DIGIT, _PASSES = 11, 3  # bits per pass of the radix sort, of 32
 _LOWEST = (1 << _DIGIT) - 1  # mask of a digit
-_MOVES = 4  # for each depth, after which sorting by neighbours is given up
-_BLOCK = 256  # columns of tiles that Gaussians meet, whose rows are found together
-_PIECES = 16  # of the depth order that are binned side by side; the result does not depend on it
+_MOVES = 4  # moves per depth after which the insertion sort is given up
+_BLOCK = 256  # pairs of a Gaussian and a column of tiles whose rows are found together
+_PIECES = 16  # pieces of the depth order that are binned in parallel; the result does not depend on it
 
 Size = tuple[int, int]  # width and height of an image, px
 
@@ -64,7 +64,7 @@ class Tiles(NamedTuple):
     firsts: Array  # (M + 1,) int64: Gaussian r has intersections slots[firsts[r] : firsts[r + 1]]
     slots: Array  # (I,) int32
     columns: int  # tiles per row of tiles
-    # from a tile to the one that is blended next: threads take pieces, and busy tiles lie together
+    # from a tile to the one that is blended next: spreads busy tiles, which lie together, over the threads
     stride: int
     width: int  # of the image, px
     height: int
@@ -73,17 +73,17 @@ class Tiles(NamedTuple):
 
 @helper
 def _pack(rank: int, tile: int, low: int, high: int) -> int:
-    """Return an intersection, rows [low, high) of a tile, as one number; in a tile they rise as ranks do."""
+    """Return an intersection, rows [low, high) of a tile, as a number; in a tile these ascend as ranks do."""
     return (rank << _PLACE | tile) << _SPAN | high << 5 | low
 
 
 @kernel
 def _sort_depths(rows: Array, depths: Array, middle: float, near: bool) -> tuple[Array, bool]:
-    """Return those of (M,) int32 rising rows before `middle`, or else behind it, by depth, ties by row.
+    """Sort those of (M,) int32 ascending rows before `middle` (near), or else behind it, by depth, then row.
 
-    False where it gave up, as very many depths are nearly equal. Sorted by float32 depth, whose bits order as
-    the numbers do (radix, least significant digit first, each pass stable); then neighbours of one key that
-    are in the wrong order change places.
+    Return them and False if the sort gave up, since very many depths are nearly equal. A radix sort by
+    float32 depth, whose bits order as the numbers do (least significant digit first, each pass stable), is
+    followed by an insertion sort of equal keys by float64 depth.
     """
     rows, depths = borrowed((rows, depths))
     number, moves = 0, 0
@@ -121,7 +121,7 @@ def _sort_depths(rows: Array, depths: Array, middle: float, near: bool) -> tuple
 
 
 def depth_order(depths: Array, rows: Array, workers: Workers) -> Array:
-    """Return (M,) int32 rising rows by their depths, (N,) positive float64, ties by row."""
+    """Return (M,) int32 ascending rows sorted by their depths, (N,) positive float64, ties by row."""
     sample = np.sort(depths[rows[::512]])
     middle = sample[len(sample) // 2] if len(sample) else 0.0
     halves = workers.each(_sort_depths, [(rows, depths, middle, near) for near in (True, False)])
@@ -132,7 +132,7 @@ def depth_order(depths: Array, rows: Array, workers: Workers) -> Array:
 
 @helper
 def _columns_of(g: Array, width: int) -> tuple[int, int]:
-    """Columns of tiles [first, last) in which a footprint may meet a pixel centre."""
+    """Return columns of tiles [first, last) in which a footprint may meet a pixel centre."""
     left = min(max(g[cp.MEAN_X] - g[cp.HALF_WIDTH] + 0.5 - _SLACK, 0.0), float(width))
     right = min(max(g[cp.MEAN_X] + g[cp.HALF_WIDTH] + 0.5 + _SLACK, 0.0), float(width))
     return int(left) // TILE, (int(right) + TILE - 1) // TILE if int(left) < int(right) else 0
@@ -140,11 +140,11 @@ def _columns_of(g: Array, width: int) -> tuple[int, int]:
 
 @helper
 def _rows_in_columns(geometry: Array, pairs: Array, k: int, height: int, out: Array) -> None:
-    """out[0 and 1, k : k + 8] <- pixel rows [first, last) in which footprints meet a column of tiles each.
+    """out[0 and 1, k : k + 8] <- pixel rows [first, last) in which each footprint meets its column of tiles.
 
     The footprints' ranks and the columns are pairs[:2, k : k + 8]. At abscissa dx an ellipse spans
-    dy = slope dx +- bulge sqrt(half_width^2 - dx^2); its lowest point over a strip of columns is its own, or
-    else on the strip's border nearest to that.
+    dy = slope dx +- bulge sqrt(half_width^2 - dx^2); its lowest point over a strip of columns is that of the
+    whole ellipse or lies on the strip's border nearest to that point.
     """
     ranks = pairs[0]
     x, y = gathered(geometry, ranks, k, cp.MEAN_X), gathered(geometry, ranks, k, cp.MEAN_Y)
@@ -177,15 +177,15 @@ def _touch(
     """Find the tiles that ranks [first, last) touch, in an image of `size` (width, height).
 
     geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles ranks [first, rank] touch.
-    Returns pairs of numbers, one for each column of tiles that a Gaussian touches: the packed first of its
-    tiles there, and where it ends, in rows from that tile's top; how many numbers; how often each tile was
-    touched.
+    Return pairs of numbers, one for each column of tiles that a Gaussian touches: its first tile there,
+    packed, and its end, in rows from that tile's top; how many numbers these are; and how many Gaussians
+    touch each tile.
     """
     order, footprints, geometry, firsts = borrowed((order, footprints, geometry, firsts))
     width, height = size
     columns, lines_of_tiles = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     found = np.empty(2 * (3 * (last - first) + _BLOCK + columns), np.int64)
-    counts = np.zeros((lines_of_tiles + 1) * columns, np.int64)  # in a column: less those of the line above
+    counts = np.zeros((lines_of_tiles + 1) * columns, np.int64)  # differences from the tile above
     pairs, rows = np.zeros((3, _BLOCK + columns + 8), np.int64), np.zeros((2, _BLOCK + columns + 8))
     pairs[2], used = np.arange(pairs.shape[1]), 0
     begun, total = first, 0
@@ -226,10 +226,10 @@ def _touch(
 
 @kernel
 def _place(first: int, last: int, found: tuple[Array, int], places: Array, start: int, tiles: Tiles) -> None:
-    """Write intersections that `_touch` found of ranks [first, last) into their tiles.
+    """Write the intersections that `_touch` found for ranks [first, last) into their tiles.
 
-    Those of a tile go to places[tile] and on: within a tile ranks ascend, whoever runs which piece. They are
-    the view's from `start` on.
+    A tile's intersections go to places[tile] and on: ranks ascend within a tile, in any order of pieces.
+    start: index into `tiles.slots` of the piece's first intersection.
     """
     (touched, used), places, tiles = borrowed((found, places, tiles))
     for rank in range(first, last):
@@ -301,7 +301,7 @@ def bin_tiles(
 
 
 def padded(channels: int) -> int:
-    """Lines of a tile's planes for so many channels, which go in fours: three have room for a fourth."""
+    """Return the planes of a tile for so many channels, which go in fours: a rest of 3 is padded to 4."""
     return channels + (channels % 4 == 3)
 
 
@@ -311,7 +311,7 @@ padded_inside = helper(padded)
 @helper
 def add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -> None:
     """sums[at + 16 channel : + 16] += weight x[channel]."""
-    if channels == 3:  # a constant, for images: nothing is asked at a row
+    if channels == 3:  # a constant, for images: rows need no branches
         for channel in range(3):
             store(sums, at + channel * TILE, load(sums, at + channel * TILE) + weight * x[channel])
         return
@@ -393,16 +393,16 @@ def correlate(
 #
 # What an operation does on the way is given as three helpers, compiled into the walk:
 #
-# open_(work, rank, later)                     before an intersection's rows: its Gaussian, a later one's
-# row_(work, mine, s, row, low, weight, before)  at a row of rows from `low`: weight alpha T, and T before it
+# open_(work, rank, later)                     before an intersection's rows: its Gaussian, one to prefetch
+# row_(work, mine, s, row, low, weight, before)  at each row, the first is `low`: weight alpha T, T before it
 # close_(work, mine, s, low, high)             after rows [low, high)
 #
 # A row is sixteen lanes, without branches. A tile's state is one flat float32 array, sixteen numbers a row. A
 # pixel's transmittance is stored negative once the pixel has stopped: its size stays readable, and
 # `T - alpha T > transmittance_min` is then false for every later Gaussian.
 
-AHEAD = 16  # intersections between asking for a footprint and using it
-CHECK_EVERY = 16  # Gaussians between two looks at whether a tile still has running pixels
+AHEAD = 16  # intersections between prefetching a footprint and using it
+CHECK_EVERY = 16  # Gaussians between two tests whether a tile still has running pixels
 
 
 @helper
@@ -441,7 +441,7 @@ def rows_to_blend(tiles: Tiles, s: int, top: int, bottom: int) -> tuple[int, int
 
 @helper
 def enter(tiles: Tiles, s: int, later: int) -> tuple[int, int]:
-    """Return the Gaussians of intersections `s` and `later`, whose footprint is asked for: memory is far."""
+    """Return the Gaussians of intersections `s` and `later`, and prefetch the later one's footprint."""
     coming = tiles.met[later] >> _SPAN + _PLACE
     prefetch(tiles.geometry, coming * cp.COLUMNS)
     return tiles.met[s] >> _SPAN + _PLACE, coming
@@ -487,7 +487,7 @@ def walk(
     row_: Callable[..., None],
     close_: Callable[..., None],
 ) -> tuple[Array, int]:
-    """Blend the tile; return its transmittance and the end of the intersections, once no pixel runs."""
+    """Blend the tile until no pixel runs; return its transmittance and the end of visited intersections."""
     x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     transmittance, rows = start_tile(tile, tiles), np.empty(3 * TILE, np.float32)
@@ -511,10 +511,10 @@ def walk(
 
 @helper
 def nothing_to_open(work: Any, rank: int, later: int) -> int:
-    """For operations that keep nothing per intersection."""
+    """`open_` of operations that keep nothing per intersection."""
     return 0
 
 
 @helper
 def nothing_to_close(work: Any, mine: Any, s: int, low: int, high: int) -> None:
-    """For operations that are done with an intersection after its last row."""
+    """`close_` of operations that are done with an intersection after its last row."""

@@ -14,14 +14,14 @@ _WEB_HEAD = (
 def shader(
     name: str, version: str = "410 core", package: str = __name__, **defines: int | float | str
 ) -> str:
-    """Source of `name`.glsl in `package` with its GLSL version and `defines` in front."""
+    """Return the source of `name`.glsl in `package` with its GLSL version and `defines` in front."""
     head = [f"#version {version}", *(_WEB_HEAD if version == WEB else ())]
     head += [f"#define {key} {value}" for key, value in defines.items()]
     return "\n".join([*head, files(package).joinpath(f"{name}.glsl").read_text(encoding="utf-8")])
 
 
 def splat_shaders(values: int, depth: bool, version: str = "410 core") -> tuple[str, str]:
-    """Vertex and fragment shader that splat so many images, and depth."""
+    """Return the vertex and fragment shader that splat `values` images, and depth."""
     each = {"EACH_VALUE(DO)": " ".join(f"DO({number})" for number in range(values))}
     vertex, fragment = (
         shader(name, version, VALUES=values, DEPTH=int(depth), **each)

@@ -3,7 +3,7 @@
 A view is projected once, in a fragment pass with one fragment per Gaussian, and sorted on the CPU; a splat
 then draws one quad per Gaussian, and the fixed-function blender composes back to front. The image formation
 is that of `raster/reference.py` but for one thing: blending back to front cannot stop at T <= 1e-4, so a
-pixel may differ by up to 1e-4 of the largest value behind.
+pixel may differ by up to 1e-2 of the largest value behind.
 
 From top to bottom: a context without a window or a display, tools for drawing with moderngl, the textures of
 a scene, and the rasterizer.
@@ -56,7 +56,7 @@ def create_egl_context() -> moderngl.Context:
 
 
 def set_uniforms(program: moderngl.Program, values: dict[str, object]) -> None:
-    """Set uniforms by name; names that the compiler removed as unused are passed over."""
+    """Set uniforms by name; names that the compiler removed as unused are ignored."""
     for name, value in values.items():
         uniform = program.get(name, None)
         if isinstance(uniform, moderngl.Uniform):
@@ -140,10 +140,10 @@ class SceneTextures:
         self.placement, self.shape, self.colours = (ctx.texture(self.size, 4, dtype="f4") for _ in range(3))
         self.projected = ctx.framebuffer([self.placement, self.shape, self.colours])
         self.order = ctx.buffer(reserve=4 * max(len(kept), 1), dynamic=True)  # int32 texels, back to front
-        self._drawn = 0  # of them
+        self._drawn = 0  # number of texels in `order`
 
     def sort(self, camera: Camera, settings: RasterSettings) -> None:
-        """Fill `order` by camera z between near and far, ties by index."""
+        """Fill `order` with the texels between near and far, back to front, ties by index."""
         # Term by term, as in the reference: a matrix product may round equal rows differently, and equal
         # depths must tie.
         x, y, z = self._means
@@ -154,7 +154,7 @@ class SceneTextures:
         self.order.write(depth_order(depths, ahead, shared_workers())[::-1].tobytes())
 
     def texels(self) -> Array:
-        """(m,) int32 texels that are drawn, back to front, read from `order`."""
+        """Return (m,) int32 texels that are drawn, back to front, read from `order`."""
         return np.frombuffer(self.order.read(4 * self._drawn) if self._drawn else b"", np.int32)
 
     def draw(self, quads: moderngl.VertexArray) -> None:
@@ -164,7 +164,7 @@ class SceneTextures:
 
     @staticmethod
     def _geometry(kept: Gaussians) -> Array:
-        """(n, 12) numbers of each Gaussian: mean, opacity, scales, a free place, unit quaternion."""
+        """Return (n, 12) float32: mean, opacity, scales, an unused 0 and unit quaternion of each Gaussian."""
         scales = np.minimum(np.exp(kept.log_scales.astype(np.float64)), LARGEST_SCALE)
         quats = unit(kept.quats_wxyz.astype(np.float64), 1e-30)
         opacities = sigmoid(kept.opacity_logits.astype(np.float64))
@@ -198,7 +198,7 @@ class SceneTextures:
 
 # Drawing.
 
-MAX_TARGETS = 4  # colour attachments of one pass that is measured, three values each
+MAX_TARGETS = 4  # colour attachments of one pass of `GlView.splat`, three values each
 NOT_CURRENT = "its context is not current in this thread: render inside `with ctx:`"
 Source = moderngl.Texture | Literal["colour"]  # what a target shows
 
@@ -335,7 +335,7 @@ class GlRasterizer:
         with drawing(self.ctx, scene.projected, moderngl.NOTHING):
             self._project_vao.render(moderngl.TRIANGLES, vertices=3)
         wanted = (settings.near, farthest(settings), *camera.world_to_camera[2])
-        if self._sorted != wanted:  # it is kept when only the image plane changed
+        if self._sorted != wanted:  # the order is kept when only the image plane changed
             scene.sort(camera, settings)
         self._current, self._sorted = view, wanted
 

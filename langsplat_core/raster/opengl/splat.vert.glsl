@@ -1,7 +1,7 @@
 // One quad per Gaussian, oriented along its footprint and just large enough for the alpha = alpha_min
 // contour, cut to what the image can see (a needle may be a million pixels long).
 // The host defines VALUES (number of images), EACH_VALUE(DO), which is DO(0) DO(1) ... for all of them, and
-// DEPTH (0 or 1). No loop: WebGL 2 wants constant numbers of samplers and of images.
+// DEPTH (0 or 1). No loop: WebGL 2 wants constant indices of samplers and of images.
 
 uniform sampler2D placement;  // as written by project.frag.glsl
 uniform sampler2D shape;
