@@ -338,6 +338,9 @@ def test_other_errors_of_a_writer_are_raised(tmp_path: Path) -> None:
         raise ValueError("of the writer")
     with pytest.raises(InputError, match="ours"), files_of_at_most(0), atomic_path(tmp_path / "a"):
         raise InputError("ours")
+    with pytest.raises(OSError, match="no room") as caught, atomic_path(tmp_path / "a"):
+        raise OSError(errno.ENOSPC, "no room", "b")  # of two that are written together
+    assert caught.value.filename == "b"
     assert not list(tmp_path.iterdir())
 
 

@@ -33,6 +33,7 @@ def parse(args: list[str]) -> Runnable:
     """Return the command that the words name; SystemExit as of tyro, InputError for none and `--config`."""
     before = list(takewhile(FLAGS.__contains__, args))
     args = args[len(before) :]
+    args = [*args[1:], "--help"] if args[:1] == ["help"] else args
     check_commands(args)
     commands: dict[str, Any]
     groups, name = registry.references("groups"), args[0] if args else ""

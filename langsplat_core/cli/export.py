@@ -228,6 +228,8 @@ class Transform:
 
     def run(self) -> None:
         check_writable(self.out, self.scene)
+        if self == Transform(self.scene, self.out):
+            raise InputError("no step given; say one, such as --up z (`langsplat convert` makes a copy)")
         scene = load_scene(self.scene)
         to = self._similarity(scene)
         save_scene(self.out, replace(place_scene(scene, to), path=self.out))

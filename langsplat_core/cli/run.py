@@ -78,6 +78,10 @@ def one_line(box: str) -> str:
     words = re.sub(r"Missing value for argument 'command\.(\w+)'.*", hint, words)
     optional = r"Error parsing (\S+): no type .*?\|(.*?) could be instantiated from (\[.*?\])\. Got.*"
     words = re.sub(optional, r"\1: expected \2, got \3", words)
+    words = re.sub(r"invalid literal for int\(\) with base 10: ", "expected a whole number, got ", words)
+    if "Perhaps you meant:" in body:
+        near = dict.fromkeys(line.split()[0].strip(",") for line in body if re.match("--[a-z]", line))
+        words += f"; did you mean {' or '.join(near)}?"
     return f"{words or 'unusable arguments'} (see --help)"
 
 

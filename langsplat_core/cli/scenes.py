@@ -43,8 +43,7 @@ class Inspect:
         summary = summarise(scene)
         size = disk_bytes(self.scene)
         if self.json:
-            said = {"scene": str(self.scene), "disk_bytes": size, "unread": scene.unread, **summary}
-            print_json(said)
+            print_json({"scene": str(self.scene), "disk_bytes": size, "unread": scene.unread, **summary})
             return
         lines = [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(summary)]
         if scene.language is not None:

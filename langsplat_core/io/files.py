@@ -58,8 +58,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         cause = _no_room(error, temporary)
         if cause is None and isinstance(error, OSError) and error.errno and error.filename == name:
             cause = error
-        if cause is None:
-            raise
+        if cause is None or getattr(error, "filename", None) not in (None, name):
+            raise  # the second names another file already, of those that are written together
         raise OSError(cause.errno, cause.strerror, str(target)) from error
     finally:
         with suppress(PermissionError):

@@ -324,13 +324,12 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
     if any(scene.name == row.folder_file for row in formats()):
         scene = scene.parent
     row = None if os.path.isdir(scene) else format_of(scene)  # which a name too long is not
-    if row is not None:
-        beside = scene.with_name((scene.name if row.own_companions else scene.stem) + suffix)
-        linked = os.path.islink(scene) and not os.path.lexists(beside)
-        there = companion_path(os.path.realpath(scene), suffix) if linked else beside
-        return there if os.path.exists(there) else beside
-    whole = scene.resolve()  # "." has no name of its own
-    return whole.with_name(whole.name + suffix)
+    if row is None:
+        scene = Path(os.path.abspath(scene))  # "." has no name of its own
+    beside = scene.with_name((scene.stem if row and not row.own_companions else scene.name) + suffix)
+    linked = os.path.islink(scene) and not os.path.lexists(beside)
+    there = companion_path(os.path.realpath(scene), suffix) if linked else beside
+    return there if os.path.exists(there) else beside
 
 
 def scene_files(path: Path | str) -> tuple[Path, ...]:

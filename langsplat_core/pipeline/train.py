@@ -102,7 +102,7 @@ class _Run:
     @property
     def seconds_file(self) -> Path:
         """The file of `seconds`, one for each dataset and settings."""
-        return self.work / f"{stage_key('seconds', 1, str(self.dataset.resolve()), self.config)}.json"
+        return self.work / f"{stage_key('seconds', 1, os.path.realpath(self.dataset), self.config)}.json"
 
     @cached_property
     def seconds(self) -> dict[str, float]:
@@ -186,7 +186,7 @@ def _train(
             psnr_small=_mean(score.psnr_small for score in scores),
             warnings=reports.quality_warnings(capture, train, scores, trained),
             seconds=run.seconds,
-            dataset=str(run.dataset.resolve()),
+            dataset=os.path.realpath(run.dataset),
             taken=capture.taken,
             held_out_views=tuple(scores),
             psnr_trained=_mean(score.psnr for score in trained),

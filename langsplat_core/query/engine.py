@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.scenes import load_scene
@@ -102,13 +102,13 @@ class QueryEngine:
         measure the cells by. rule: "regions" becomes "peak" where neither scene nor encoder has everyday
         phrases. words: taught ones of the user, before the scene's; EncoderError if of another encoder.
         """
+        given: Any = load_encoder
+        if isinstance(scene, str | Path) or isinstance(given, str):
+            raise InputError("no name alone; say QueryEngine(load_scene(path), load_text_encoder(name))")
         self.scene = scene
         self.exact = exact
         self._rule: AnswerRule = rule
-        given: Any = load_encoder
-        self._load_encoder: LoadEncoder | None = (
-            (lambda _: given) if hasattr(given, "encode_texts") else given
-        )
+        self._load_encoder: Any = (lambda _: given) if hasattr(given, "encode_texts") else given
         self._encoder_id = encoder_id
         self._encoder: TextEncoder | None = None
         self._encoder_checked = False
@@ -137,6 +137,8 @@ class QueryEngine:
         """Return the answers of `run` to phrases, which are encoded and compared together."""
         if level not in ("auto", *LEVELS):
             raise InputError(f"no level {level!r}; choose auto or one of {', '.join(LEVELS)}")
+        if isinstance(phrases, str) or not all(isinstance(phrase, str) for phrase in phrases):
+            raise InputError("a phrase is text: run('blue gift'), or run_many(['cup', 'lamp']) for several")
         texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
         vectors = self.text_vectors(texts, progress)  # first: what it refuses leaves nothing cached
         relevancies = self._lookup.relevancies(vectors) if texts else iter(())
@@ -385,8 +387,7 @@ class QueryEngine:
         """EncoderError unless `encoder` makes the scene's canonical vectors: others answer with noise."""
         if self._encoder_checked:
             return
-        assert self.scene.language is not None
-        own, made_with = self.scene.language.canonical, self.field.encoder_id
+        own, made_with = self.field.canonical, self.field.encoder_id
         canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
         if not same_vectors(canonical, own):
             raise EncoderError(
@@ -452,6 +453,8 @@ class QueryEngine:
         return self._by_showing(self._shown("more like this", members, level), "auto")
 
     def _shown(self, name: str, members: Array, level: str) -> TaughtWord:
+        members = np.asarray(members)
+        check_array("members", members, ("N",), {"N": len(self.field)}, bool)
         at = self.regions.level_of(members) if level == "auto" else LEVELS.index(level)
         return shown(self.word_space, self.field, self.regions, name, members, at)
 

@@ -300,6 +300,8 @@ def parse(text: str, names: Collection[str] = ()) -> Phrase:
     Raises InputError where nothing is named, where something is only excluded ("not the cup"), and for a text
     beyond `MAX_CHARACTERS` or `MAX_ATOMS`.
     """
+    if not isinstance(text, str):
+        raise InputError("a phrase is text, such as 'blue gift'; ask several one after the other")
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"a query of {len(text)} characters; use at most {MAX_CHARACTERS}")
     asked = re.sub(_QUESTION, "", " ".join(_with_names(list(tokens_of(text)), names))).strip(", ")

@@ -36,10 +36,7 @@ from tests.support.processes import refusal, run
 from tests.support.scenes import DEMO
 from tests.support.tiny_models import tiny_clip
 
-EVERY = {
-    "viewer": ViewerCommand,
-    **{name: load_command(name) for name in command_names()},
-}
+EVERY = {"viewer": ViewerCommand} | {name: load_command(name) for name in command_names()}
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -109,6 +106,9 @@ def test_bash_completes_and_doctor_names_what_there_is(capsys):
     terminal = {**os.environ, "LC_ALL": "C.UTF-8", "PYTHONUTF8": "1"}  # of others tyro's scripts know nothing
     said = subprocess.check_output(["bash", "-c", COMPLETE], input=script, encoding="utf-8", env=terminal)
     assert said.splitlines() == ["query", "--max-relevancy-error", "good"]
+    with pytest.raises(SystemExit):
+        parse(["help", "train"])
+    assert "--preset" in capsys.readouterr().out
     Doctor().run()
     said = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
     assert said["langsplat"] == __version__

@@ -226,6 +226,7 @@ def described(folder: Path) -> Path:
     other = replace(SCENE.language, encoder_id="other", canonical=np.tile(axis(5), (4, 1)))
     save_scene("other.ply", replace(SCENE, language=other))
     Path("junk.safetensors").write_bytes(b"junk")
+    Path("loop").symlink_to("loop")
     assert run("teach", "named.ply", "--name", "vase", "--at", MUG, "--into", "own.safetensors") == 0
     lists = {"empty": "# nothing", "bad": "mug\n???", "sofas": "sofa", "list": "\n".join([*NAMES, "sofa"])}
     for name, text in lists.items():
@@ -359,19 +360,20 @@ def test_words_taught_at_once_are_all_kept(described, into):
         ("teach named.ply --name vase --remove", "'vase' was not taught here; taught words: none"),
         (f"teach blind.ply --name vase --at {MUG}", "no cameras"),
         ("inspect --jsn", "scene is missing; is there an unknown option"),
+        ("inspect a.ply --jsn", "--jsn; did you mean --json?"),
+        ("query a.ply mug --instances 1e3", "--instances: expected a whole number, got '1e3'"),
+        ("train loop --out b.ply --clip.model demo", "loop does not exist"),
         ("convert a.ply out.txt", "scenes are written as"),
         ("convert b.ply", "name what to read"),
-        ("convert missing.ply b.ply", "no such file"),
         ("convert a.ply out --to nothing", "choose one of scene"),
         ("convert a.ply a.ply", "would replace the original scene"),
         ("transform a.ply a.ply", "would replace"),
         ("clean a.ply a.ply", "would replace"),
         ("crop a.ply a.ply --box -9 -9 -9 9 9 9", "would replace"),
-        ("transform a.ply b.ply --scale 0", "must be above 0"),
+        ("transform a.ply b.ply", "no step given"),
         ("transform a.ply b.ply --rotate x inf", "about no direction"),
         ("transform a.ply b.ply --matrix 1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1", "mirrors"),
         ("transform a.ply b.ply --move 1e11 0 0", "move by less"),
-        ("crop a.ply b.ply", "Missing"),
         ("crop a.ply b.ply --box 100 0 0 101 1 1", "langsplat inspect a.ply"),
         (f"teach named.ply --name vase --at {MUG} --into words.json", "written as .safetensors"),
         (f"teach named.ply --name vase --at {MUG} --into junk.safetensors", "not a whole safetensors file"),
@@ -384,7 +386,7 @@ def test_words_taught_at_once_are_all_kept(described, into):
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_and_nothing_is_written(described, capsys, words, message):
-    before = {path.name: path.read_bytes() for path in described.iterdir()}
+    before = {path.name: path.read_bytes() for path in described.iterdir() if path.exists()}
     out = ("--out", "b.ply") if words.startswith("select") and "--out" not in words else ()
     assert message in refusal(capsys, *words.split(), *out)
-    assert {path.name: path.read_bytes() for path in described.iterdir()} == before
+    assert {path.name: path.read_bytes() for path in described.iterdir() if path.exists()} == before

@@ -156,20 +156,11 @@ def linear(shades: Array) -> Array:
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
-def as_srgb(light: Array) -> Array:
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-
-
 def as_hlg(shades: Array) -> Array:
     """HLG of BT.2020, with diffuse white at 75 %."""
     light = 0.26496 * (linear(shades) @ TO_2020.T)
     high = 0.17883277 * np.log(np.maximum(12 * light - 0.28466892, 1e-9)) + 0.55991073
     return np.where(light <= 1 / 12, np.sqrt(3 * light), high)
-
-
-def as_pq(shades: Array) -> Array:
-    power = (203 / 10_000 * (linear(shades) @ TO_2020.T)) ** 0.1593017578125
-    return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
 
 
 def p3_profile() -> bytes:
@@ -198,7 +189,10 @@ def shown_patches(image: Array) -> Array:
     return image[height // 2, [width * (2 * k + 1) // (2 * len(PATCHES)) for k in range(len(PATCHES))]]
 
 
-P3_CODED = as_srgb(linear(PATCHES) @ TO_P3.T)
+P3_LIGHT = linear(PATCHES) @ TO_P3.T
+P3_CODED = np.where(P3_LIGHT <= 0.0031308, 12.92 * P3_LIGHT, 1.055 * P3_LIGHT ** (1 / 2.4) - 0.055)
+PQ_POWER = (203 / 10_000 * (linear(PATCHES) @ TO_2020.T)) ** 0.1593017578125
+PQ_CODED = ((0.8359375 + 18.8515625 * PQ_POWER) / (1 + 18.6875 * PQ_POWER)) ** 78.84375
 CODED = {
     "profile": (P3_CODED, {"icc_profile": p3_profile()}, []),
     "profile before gAMA": (P3_CODED, {"icc_profile": p3_profile()}, [(b"gAMA", struct.pack(">I", 100_000))]),
@@ -206,7 +200,7 @@ CODED = {
     "gAMA of sRGB": (PATCHES / 255, {}, [(b"gAMA", struct.pack(">I", 45_455))]),
     "cICP of P3": (P3_CODED, {}, [(b"cICP", bytes([12, 13, 0, 1]))]),
     "cICP of HLG": (as_hlg(PATCHES), {}, [(b"cICP", bytes([9, 18, 0, 1]))]),
-    "cICP of PQ": (as_pq(PATCHES), {}, [(b"cICP", bytes([9, 16, 0, 1]))]),
+    "cICP of PQ": (PQ_CODED, {}, [(b"cICP", bytes([9, 16, 0, 1]))]),
     "nothing": (PATCHES / 255, {}, []),
 }
 

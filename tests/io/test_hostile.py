@@ -353,10 +353,6 @@ def glb_of_one_row(count: int) -> bytes:
     return glb(content, np.ones(4 * count, "<f4").tobytes())
 
 
-def many_members(count: int) -> bytes:
-    return zipped({f"{number:06d}": b"" for number in range(count)})
-
-
 BOMBS: dict[str, tuple[str, Callable[[], bytes]]] = {
     "sog": ("a.sog", lambda: flat_sog(870_000, 950)),
     "sog of degree 3": ("a.sog", lambda: flat_sog(200_000, 450, 3)),
@@ -365,7 +361,7 @@ BOMBS: dict[str, tuple[str, Callable[[], bytes]]] = {
     "spz of too many": ("a.spz", lambda: flat_spz(6_000_000)),
     "npz": ("a.npz", lambda: flat_npz(25_000_000, 2)),
     "npz of too much": ("a.npz", lambda: flat_npz(20_000_000, 40)),
-    "npz of many": ("a.npz", lambda: many_members(120_000)),
+    "npz of many": ("a.npz", lambda: zipped({f"{number:06d}": b"" for number in range(120_000)})),
     "glb": ("a.glb", lambda: glb_of_one_row(800_000)),
     "gltf of objects": (
         "a.gltf",

@@ -192,6 +192,12 @@ def test_companions_lie_beside_every_kind_of_scene(tmp_path):
         write_language(place, random_field(N), load_gaussians(path).means)
         loaded = load_scene(path)
         assert_same_field(loaded.language, random_field(N))
+    (tmp_path / "link").symlink_to(folder)
+    assert load_scene(tmp_path / "link").language is not None
+    write_language(
+        tmp_path / "link.langsplat.safetensors", random_field(N, seed=1), load_gaussians(folder).means
+    )
+    assert_same_field(load_scene(tmp_path / "link").language, random_field(N, seed=1))
 
 
 @pytest.mark.parametrize("inner", ["", "meta.json"])

@@ -701,17 +701,13 @@ def test_export_command_writes_a_page_or_one_line(tmp_path: Path, capsys: pytest
     assert "<title>Über &lt;b&gt;</title>" in (tmp_path / "room.html").read_text(encoding="utf-8")
 
 
-def frame_of_docs() -> str:
-    """What the notebook of the docs keeps of its last cell, see `make notebook`."""
-    path = Path(__file__).parents[2] / "docs" / "examples" / "06_in_a_notebook.ipynb"
-    return "".join(json.loads(path.read_text())["cells"][-1]["outputs"][0]["data"]["text/html"])
-
-
 @pytest.mark.parametrize("phrases", [(), ("laptop",), None, "an answer"])
 def test_notebooks_show_a_page_that_was_asked(browser, demo, engine, tmp_path, phrases):
     """In a frame without rights, as a cell has it: bounded, answered over all Gaussians, searchable."""
     if phrases is None:
-        asked, other, shown = "duck", "penguin", frame_of_docs()
+        path = Path(__file__).parents[2] / "docs" / "examples" / "06_in_a_notebook.ipynb"  # `make notebook`
+        shown = "".join(json.loads(path.read_text())["cells"][-1]["outputs"][0]["data"]["text/html"])
+        asked, other = "duck", "penguin"
         engine = QueryEngine(load_scene(DEMO), load_text_encoder)
     elif phrases == "an answer":
         asked, other = "ball near the teddy bear", "ball"

@@ -62,11 +62,17 @@ def test_engine_errors_say_what_to_do():
     scene = named_scene()
     with pytest.raises(EncoderError, match="only the phrases in the scene's phrasebook"):
         QueryEngine(scene).run("sofa")
-    for asked, level, said in (("  ", "auto", "empty"), ("mug", "Whole", "no level 'Whole'; choose")):
+    bad = (("  ", "auto", "empty"), ("mug", "Whole", "no level 'Whole'; choose"), (["mug"], "auto", "text"))
+    for asked, level, said in bad:
         with pytest.raises(InputError, match=said):
             QueryEngine(scene).run(asked, level)
     with pytest.raises(InputError, match="langsplat train"):
         QueryEngine(Scene(scene.gaussians)).run("mug")
+    for wrong in (lambda: QueryEngine(scene).run_many("mug"), lambda: QueryEngine(scene, "demo")):
+        with pytest.raises(InputError, match=r"text:|name alone"):
+            wrong()
+    with pytest.raises(ValueError, match=r"members: expected shape \(N\)"):
+        QueryEngine(scene).like(np.ones(2, bool))
 
     class Other(FakeEncoder):
         def __init__(self, vector: Array) -> None:

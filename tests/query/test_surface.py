@@ -102,11 +102,6 @@ def line(count: int, gaps: tuple[int, ...] = ()) -> Gaussians:
     return unturned_gaussians(np.stack([x, np.zeros(count), np.zeros(count)], 1), 0.0, 3.0)
 
 
-def links_of(surface: Surface) -> list[tuple[int, int]]:
-    links = surface.links.tocoo()
-    return [(int(a), int(b)) for a, b in zip(links.row, links.col, strict=True) if a < b]
-
-
 def plain_step(field: LanguageField, level: int, a: int, b: int) -> float:
     """Between the features of two Gaussians of the scene."""
     known = field.known[level]
@@ -129,7 +124,7 @@ def plain_regions(surface: Surface, field: LanguageField, level: int) -> list[in
     steps, typical = [], plain_typical_step(surface, field, level)
     above = None if level == 2 else plain_regions(surface, field, level + 1)
     things = None if level < 2 or field.tree is None else field.tree.leaves
-    for a, b in links_of(surface):
+    for a, b in np.transpose(np.nonzero(np.triu(surface.links.toarray()))).tolist():
         if above is not None and above[a] != above[b]:
             continue
         one, other = surface.rows[a], surface.rows[b]
