@@ -144,11 +144,9 @@ class _Stages:
     @cached_property
     def inputs(self) -> tuple[list[Array], tuple[Any, ...]]:
         """The vectors of each view's masks, and digests of all that the results are made from."""
-        vectors, digests = [], []
-        for _, features in self.views:
-            vectors.append(features.vectors)
-            digests.append(digest_of(features))
-        return vectors, (digest_of(self.gaussians), digests, self.config.radiance.near)
+        read = [(features.vectors, digest_of(features)) for _, features in self.views]
+        digests = [digest for _, digest in read]
+        return [own for own, _ in read], (digest_of(self.gaussians), digests, self.config.radiance.near)
 
     def path(self, name: str, version: int, *settings: Any) -> Path:
         """Return the file of a stage."""
@@ -300,14 +298,14 @@ class _Stages:
 # that are named best: the sum of what `name_scores` makes of each is the largest.
 
 CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
-NAMED = (0.6, 0.9)  # costs between which wholes are those that have a name
+NAMED = (0.8, 1.3)  # costs between which wholes are those that have a name
 UNNAMED = 2.0  # spreads above everyday phrases that the nearest name of anything reaches
 AREA = 0.75  # power of a node's share of the area, by which its name counts
 VIEWS = 8  # in which the encoder sees a node alone
 OUTLIERS = 0.4  # share of these looks, those least like the others, that does not count
 LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing
 AGREED = "what masks agree on"  # which is drawn, named and described: stages
-VERSION = 2
+VERSION = 3
 
 
 def agreed_features(

@@ -299,9 +299,9 @@ class GraphMasks(MaskSource):
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
         """Masks of an image (H, W, 3) uint8; at every level they cover each pixel exactly once."""
         progress("finding regions", 0.0)
-        levels = (labels == np.arange(labels.max() + 1)[:, None, None] for labels in nested_partitions(image))
-        subparts, parts, wholes = levels
+        labels = nested_partitions(image)
         progress("finding regions", 1.0)
+        subparts, parts, wholes = (one == np.arange(one.max() + 1)[:, None, None] for one in labels)
         return subparts, parts, wholes
 
 

@@ -223,10 +223,13 @@ def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) ->
     of masks of each view.
     """
     sums, labelling = mask_weights.sums(tree.leaves, tree.count, counts)
-    sums, inside = sums.tocsc(), _descendants(tree)
+    sums = sums.tocsc()
     votes = np.zeros((tree.count, 2), np.uint16)
     for pairs, first, count in zip(mask_weights.pairs, np.cumsum([0, *counts]), counts, strict=False):
-        shared = (inside @ sums[:, first : first + count]).toarray()  # (K, M) pixels
+        shared = sums[:, first : first + count].toarray()  # (K, M) pixels, then with those of descendants
+        for node, parent in enumerate(tree.parents):
+            if parent != NO_NODE:
+                shared[parent] += shared[node]
         level_of = labelling[first : first + count] % len(LEVELS)
         visible = np.stack([shared[:, level_of == level].sum(1) for level in range(len(LEVELS))], 1)
         every = np.bincount(pairs["mask"], pairs["weight"], count)
@@ -235,17 +238,6 @@ def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) ->
         shown = visible.max(1) >= SHOWN
         votes += np.stack([shown & agree, shown & ~agree], 1).astype(np.uint16)
     return votes
-
-
-def _descendants(tree: Tree) -> "scipy.sparse.csr_matrix":
-    """Return (K, K) float32, 1 where the column's node is the row's or a descendant of it."""
-    rows, columns = [np.arange(tree.count)], [np.arange(tree.count)]
-    while len(rows[-1]):
-        above = tree.parents[rows[-1]]
-        rows.append(above[above != NO_NODE])
-        columns.append(columns[-1][above != NO_NODE])
-    places = np.concatenate(rows), np.concatenate(columns)
-    return scipy.sparse.csr_matrix((np.ones(len(places[0]), np.float32), places), (tree.count, tree.count))
 
 
 # Lifting by mask weights.

@@ -3,13 +3,17 @@
 The surface of a scene is divided into small patches, and then the two neighbours merge between which least
 stands, until no two are neighbours (average linkage). What stands between two neighbours x and y is
 
-    cost(x, y) = [ SEEN (1 - agreement) + SEEN border + BENT concavity + |difference of chromaticity| ] s
+    cost(x, y) = [ SEEN (1 - agreement) + SEEN border + BENT concavity + |difference of chromaticity|
+                   + STAND standing ] s
 
     agreement     chance that a pixel of x and one of y lie in one mask, mean over views and levels, each
                   weighted by the smaller one's pixels there
     border        share of views and levels in which the two ends of a link across lie in two masks, mean over
                   the links between x and y
     concavity     how much the surface bends towards itself along these links: things meet where it does
+    standing      h / (h + thickness) (1 - size / twice the width) where the smaller one's middle is h before
+                  the plane of the larger one, which is so thick and wide: it stands on a table, hangs on a
+                  wall; 0 behind the plane, and where its size is more
     s             (smaller one's share of the area / PLAIN) ^ SMALL: crumbs join early
 
 A mask of one photograph may be wrong; few are wrong in the same way from all sides. No mask's vector is read,
@@ -37,7 +41,7 @@ from langsplat_core.scene.surface import Surface, divide, surface_areas
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.language.lift import MaskWeights
 
-SEEN, BENT, COLOUR = 0.5, 0.3, 1.0  # weights of the cost's terms
+SEEN, BENT, COLOUR, STAND = 0.5, 0.6, 1.0, 1.0  # weights of the cost's terms
 UNSEEN = 0.5  # disagreement of what no view shows together
 STEP_BENT = 0.1  # weight of concavity in the step between two Gaussians
 SCALE, SMALLEST = 0.6, 10  # of the division into patches, see `surface.divide`
@@ -100,12 +104,12 @@ class MergeTree:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """The masks, colours, areas and borders of P patches, from which they are merged."""
+    """The masks, colours, places and borders of P patches, from which they are merged."""
 
     masses: "scipy.sparse.csr_matrix"  # (P, masks of all views) float32 pixels, columns sorted
     labelling: Array  # (masks of all views,) int32 view and level of each mask, counted through
-    colours: Array  # (P, 3) mean chromaticity
-    areas: Array  # (P,) > 0
+    moments: Array  # (P, 7, 4) sums over the area, > 0, of x, y, z, 1 and the chromaticity times x, y, z, 1
+    eyes: Array  # (V, 3) positions of cameras, from the same origin, which tell the outside
     borders: Array  # (2, B) int32 neighbouring patches, the first one's number is the lower
     sums: Array  # (B, 3) float64 over the links between them: their count, disagreement, concavity
 
@@ -131,17 +135,18 @@ def find_tree(
     steps = disagreement + STEP_BENT * concavity + COLOUR * np.linalg.norm(colours[a] - colours[b], axis=1)
     of = divide(surface, steps, np.argsort(steps, kind="stable").astype(np.int32), SCALE, SMALLEST)
     everywhere[surface.rows] = of
-    sizes = np.bincount(of)
+    count, origin = int(of.max()) + 1, surface.positions.mean(0)
+    areas = np.maximum(surface_areas(gaussians)[surface.rows], 1e-30)
+    values = *(surface.positions - origin).T, np.ones(len(of)), *colours.T
+    moments = np.stack([np.bincount(of, areas * one * other) for one in values for other in values[:4]], 1)
     patches = Patches(
-        *mask_weights.sums(everywhere, len(sizes), counts),
-        np.stack([np.bincount(of, channel) / sizes for channel in colours.T], 1),
-        np.maximum(np.bincount(of, surface_areas(gaussians)[surface.rows]), 1e-30),
+        *mask_weights.sums(everywhere, count, counts),
+        moments.reshape(-1, 7, 4),
+        eyes - origin,
         *find_borders(of, surface.ends, disagreement, concavity),
     )
     children, costs = merge(patches, progress)
-    near = surface.anchors >= 0
-    everywhere[near] = of[surface.anchors[near]]
-    return MergeTree(everywhere, children, costs)
+    return MergeTree(np.append(of, np.int32(-1))[surface.anchors], children, costs)  # an anchor of -1 is none
 
 
 # What stands between two linked Gaussians.
@@ -233,42 +238,56 @@ class _Merger:
     """The nodes that are not merged yet, with their sums and neighbours."""
 
     def __init__(self, patches: Patches) -> None:
-        masses, labelling = patches.masses, patches.labelling
-        self._labelling, ends = labelling, masses.indptr[1:-1]
-        self._columns, self._values = np.split(masses.indices, ends), np.split(masses.data, ends)
-        shape = len(patches.areas), int(labelling.max(initial=-1)) + 1
-        entries = masses.data, labelling[masses.indices], masses.indptr
-        self._pixels: list[Any] = list(scipy.sparse.csr_matrix(entries, shape).toarray())
-        self._areas: list[Any] = patches.areas.tolist()
-        self._colours: list[Any] = list(patches.colours * patches.areas[:, None])
-        self._plain = PLAIN * float(patches.areas.sum())
-        self.neighbours: list[dict[int, Array]] = [{} for _ in self._areas]
+        masses, self._labelling = patches.masses, patches.labelling
+        shape = len(patches.moments), int(self._labelling.max(initial=-1)) + 1
+        entries = masses.data, self._labelling[masses.indices], masses.indptr
+        pixels = scipy.sparse.csr_matrix(entries, shape).toarray()
+        # The masks that show each node, its pixels in these, and those in each view and level.
+        seen = (np.split(of, masses.indptr[1:-1]) for of in (masses.indices, masses.data))
+        self._masks: list[Any] = list(zip(*seen, pixels, strict=True))
+        self._moments, self._eyes = list(patches.moments), patches.eyes
+        self._planes = [self._plane(own) for own in self._moments]
+        self._plain = PLAIN * float(patches.moments[:, 3, 3].sum())
+        self.neighbours: list[dict[int, Array]] = [{} for _ in self._moments]
         for a, b, own in zip(*patches.borders.tolist(), patches.sums, strict=True):
             self.neighbours[a][b] = self.neighbours[b][a] = own
 
     def cost(self, a: int, b: int) -> float:
         links, disagreement, concavity = self.neighbours[a][b]
-        agreement = _agreement(
-            *(self._columns[a], self._values[a], self._columns[b], self._values[b]),
-            *(self._labelling, self._pixels[a], self._pixels[b]),
-        )
-        colours = self._colours[a] / self._areas[a] - self._colours[b] / self._areas[b]
+        agreement = _agreement(self._masks[a], self._masks[b], self._labelling)
+        small, large = sorted((a, b), key=lambda node: self._moments[node][3, 3])
+        area, larger = self._moments[small][3, 3], self._moments[large][3, 3]
+        colours = self._moments[small][4:, 3] / area - self._moments[large][4:, 3] / larger
         between = SEEN * (1 - agreement) + (SEEN * disagreement + BENT * concavity) / links
-        between += COLOUR * float(np.sqrt(colours @ colours))
-        return float(between * (min(self._areas[a], self._areas[b]) / self._plain) ** SMALL)
+        between += COLOUR * np.sqrt(colours @ colours) + STAND * self._standing(small, large)
+        return float(between * (area / self._plain) ** SMALL)
+
+    def _standing(self, small: int, large: int) -> float:
+        """How surely the smaller node stands before the plane of the larger one, in [0, 1)."""
+        (middle, own, _), (base, extents, outwards) = self._planes[small], self._planes[large]
+        height, share = float((middle - base) @ outwards), np.linalg.norm(own) / max(2 * extents[1], 1e-30)
+        return float(height / (height + extents[0]) * (1 - share)) if height > 0 and share < 1 else 0.0
+
+    def _plane(self, moments: Array) -> tuple[Array, Array, Array]:
+        """Return a node's middle, its standard deviations, rising, and the axis of the first, outwards."""
+        middle = moments[3, :3] / moments[3, 3]
+        squares, axes = np.linalg.eigh(moments[:3, :3] / moments[3, 3] - np.outer(middle, middle))
+        nearest = np.linalg.norm(self._eyes - middle, axis=1).argmin()
+        inwards = axes[:, 0] @ (self._eyes[nearest] - middle) < 0
+        return middle, np.sqrt(squares.clip(0)), -axes[:, 0] if inwards else axes[:, 0]
 
     def join(self, a: int, b: int) -> int:
         """Merge the nodes a and b; return the number of the new one."""
         new = len(self.neighbours)
-        columns, place = np.unique(np.concatenate([self._columns[a], self._columns[b]]), return_inverse=True)
-        values = np.bincount(place, np.concatenate([self._values[a], self._values[b]])).astype(np.float32)
-        self._columns.append(columns)
-        self._values.append(values)
-        for sums in (self._pixels, self._areas, self._colours):
-            sums.append(sums[a] + sums[b])
+        masks, values = (np.concatenate([self._masks[a][k], self._masks[b][k]]) for k in (0, 1))
+        masks, place = np.unique(masks, return_inverse=True)
+        values = np.bincount(place, values).astype(np.float32)
+        self._masks.append((masks, values, self._masks[a][2] + self._masks[b][2]))
+        self._moments.append(self._moments[a] + self._moments[b])
+        self._planes.append(self._plane(self._moments[new]))
         self.neighbours.append({})
         for old in (a, b):
-            self._columns[old] = self._values[old] = columns[:0]
+            self._masks[old] = None
             for other, own in self.neighbours[old].items():
                 del self.neighbours[other][old]
                 if other not in (a, b):
@@ -280,38 +299,29 @@ class _Merger:
 
 def merge(patches: Patches, progress: Progress = silent) -> tuple[Array, Array]:
     """Return (K, 2) int32 nodes merged and (K,) float64 costs, in order; of equal ones the older first."""
-    nodes, count = _Merger(patches), len(patches.areas)
+    nodes, count = _Merger(patches), len(patches.moments)
     waiting = [(nodes.cost(a, b), a, b) for a in range(count) for b in nodes.neighbours[a] if a < b]
     heapq.heapify(waiting)
-    children: list[tuple[int, int]] = []
-    costs: list[float] = []
+    made: list[tuple[int, int, float]] = []
     while waiting:
         cost, a, b = heapq.heappop(waiting)
         if b not in nodes.neighbours[a]:  # one of them is part of another node by now
             continue
         new = nodes.join(a, b)
-        children.append((a, b))
-        costs.append(cost)
+        made.append((a, b, cost))
         for other in nodes.neighbours[new]:
             heapq.heappush(waiting, (nodes.cost(other, new), other, new))
-        progress(STAGE, 0.8 + 0.2 * len(children) / count)
-    return np.array(children, np.int32).reshape(-1, 2), np.array(costs, np.float64)
+        progress(STAGE, 0.8 + 0.2 * len(made) / count)
+    table = np.array(made, np.float64).reshape(-1, 3)
+    return table[:, :2].astype(np.int32), table[:, 2]
 
 
 @kernel
-def _agreement(
-    columns_a: Array,
-    values_a: Array,
-    columns_b: Array,
-    values_b: Array,
-    labelling: Array,
-    pixels_a: Array,
-    pixels_b: Array,
-) -> float:
+def _agreement(a: tuple[Array, ...], b: tuple[Array, ...], labelling: Array) -> float:
     """Chance that a pixel of a and one of b lie in one mask; `1 - UNSEEN` where no labelling has both."""
-    seen = agreed = 0.0
-    for k in range(len(pixels_a)):
-        seen += min(pixels_a[k], pixels_b[k])
+    columns_a, values_a, pixels_a = a
+    columns_b, values_b, pixels_b = b
+    agreed, seen = 0.0, np.minimum(pixels_a, pixels_b).sum()
     if seen <= 0:
         return 1.0 - UNSEEN
     i = j = 0

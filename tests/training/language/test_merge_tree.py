@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import combinations, pairwise
+from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -43,15 +44,39 @@ def random_patches(seed: int, count: int = 24, views: int = 4) -> Patches:
         np.arange(count), (first, second), rng.uniform(size=2 * count), rng.uniform(size=2 * count)
     )
     labelling = np.arange(masks, dtype=np.int32) // 5
-    colours, areas = rng.dirichlet(np.ones(3), count), rng.uniform(0.1, 3, count)
-    return Patches(sparse.csr_matrix(masses.astype(np.float32)), labelling, colours, areas, *borders)
+    points = rng.normal(size=(count, 1, 3)) + rng.uniform(-1, 1, (count, 5, 3)) * rng.uniform(
+        0, 1, (count, 1, 3)
+    )
+    moments = moments_of(points, rng.uniform(0.1, 3, count), rng.dirichlet(np.ones(3), count))
+    eyes = rng.normal(size=(views, 3)) * 4
+    return Patches(sparse.csr_matrix(masses.astype(np.float32)), labelling, moments, eyes, *borders)
+
+
+def moments_of(points: np.ndarray, areas: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """Those of patches of (P, n, 3) points, (P,) areas and (P, 3) colours."""
+    ones, each = np.ones_like(points[..., :1]), np.broadcast_to(colours[:, None], points.shape)
+    values = np.concatenate([points, ones, each], -1)
+    return np.einsum("p,pni,pnj->pij", areas / points.shape[1], values, values[..., :4])
 
 
 def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]]:
     """Every cost anew at every step, from the patches themselves."""
     masses = patches.masses.toarray().astype(np.float64)
-    nodes = {number: [number] for number in range(len(patches.areas))}
+    nodes = {number: [number] for number in range(len(patches.moments))}
     children, costs = [], []
+
+    def plane(nodes: list[int]) -> tuple[np.ndarray, ...]:
+        total = patches.moments[nodes].sum(0)
+        middle = total[:3, 3] / total[3, 3]
+        axes, squares, _ = np.linalg.svd(total[:3, :3] / total[3, 3] - np.outer(middle, middle))
+        to_eye = min(patches.eyes - middle, key=np.linalg.norm)
+        return (
+            total[3, 3],
+            total[4:, 3] / total[3, 3],
+            middle,
+            np.sqrt(squares),
+            axes[:, 2] * np.sign(to_eye @ axes[:, 2]),
+        )
 
     def cost(a: list[int], b: list[int]) -> float | None:
         across = (np.isin(patches.borders, a) & np.isin(patches.borders[::-1], b)).any(0)
@@ -66,12 +91,16 @@ def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]
                 agreed += least * (mine / mine.sum()) @ (theirs / theirs.sum())
         agreement = agreed / seen if seen > 0 else 1 - module.UNSEEN
         links, disagreement, concavity = patches.sums[across].sum(0)
-        means = [np.average(patches.colours[nodes], axis=0, weights=patches.areas[nodes]) for nodes in (a, b)]
+        (area, colour, middle, own, _), (_, other, base, spreads, out) = sorted(
+            (plane(a), plane(b)), key=itemgetter(0)
+        )
         between = module.SEEN * (1 - agreement)
         between += (module.SEEN * disagreement + module.BENT * concavity) / links
-        between += module.COLOUR * np.linalg.norm(means[0] - means[1])
-        smaller = min(patches.areas[a].sum(), patches.areas[b].sum()) / patches.areas.sum()
-        return between * (smaller / module.PLAIN) ** module.SMALL
+        between += module.COLOUR * np.linalg.norm(colour - other)
+        height, half = (middle - base) @ out, np.sqrt((own**2).sum()) / 2
+        if height > 0 and half < spreads[1]:
+            between += module.STAND * height / (height + spreads[2]) * (1 - half / spreads[1])
+        return between * (area / patches.moments[:, 3, 3].sum() / module.PLAIN) ** module.SMALL
 
     while True:
         pairs = [(cost(nodes[a], nodes[b]), a, b) for a in nodes for b in nodes if a < b]
@@ -79,7 +108,7 @@ def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]
         if not pairs:
             return children, costs
         least, a, b = min(pairs)
-        nodes[len(patches.areas) + len(children)] = nodes.pop(a) + nodes.pop(b)
+        nodes[len(patches.moments) + len(children)] = nodes.pop(a) + nodes.pop(b)
         children.append((a, b))
         costs.append(least)
 
@@ -91,6 +120,18 @@ def test_merging_is_average_linkage(seed):
     want, want_costs = merged_plainly(patches)
     assert children.tolist() == [list(pair) for pair in want]
     np.testing.assert_allclose(costs, want_costs, rtol=1e-5)  # masses are summed in float32
+
+
+def test_halves_of_a_thing_merge_before_the_plane_they_stand_on():
+    """A table, and two halves above it, each as near to the other as to the table; no mask shows them."""
+    rng, pairs = np.random.default_rng(0), np.array([[0, 0, 1], [1, 2, 2]], np.int32)
+    points = np.stack([rng.uniform(-1, 1, (50, 3)) * size for size in ([1, 1, 0.01], 0.1, 0.1)])
+    points[1:, :, 2] += 0.1
+    moments = moments_of(points, np.array([4.0, 0.1, 0.1]), np.full((3, 3), 1 / 3))
+    nothing = sparse.csr_matrix((3, 1), dtype=np.float32), np.zeros(1, np.int32)
+    for side, first in ((1, [1, 2]), (-1, [0, 1])):  # seen from below they hang behind it
+        eyes = np.array([[0, 0, 3.0 * side]])
+        assert merge(Patches(*nothing, moments, eyes, pairs, np.ones((3, 3))))[0][0].tolist() == first
 
 
 def test_link_disagreement_is_the_weighted_share_of_views():
