@@ -66,12 +66,6 @@ def test_later_masks_cover_earlier_ones_and_hidden_masks_have_no_row() -> None:
     assert (maps[2] == -1).all()
 
 
-def assert_nested(levels: np.ndarray) -> None:
-    for fine, coarse in pairwise(levels):
-        pairs = np.unique(np.stack([fine.ravel(), coarse.ravel()]), axis=1)
-        assert pairs.shape[1] == len(np.unique(fine))  # a fine region lies in exactly one coarse region
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_partitions_are_nested_and_cover_everything(seed: int) -> None:
     image = np.random.default_rng(seed).integers(0, 256, (12, 17, 3), dtype=np.uint8)
@@ -81,7 +75,8 @@ def test_partitions_are_nested_and_cover_everything(seed: int) -> None:
     counts = [labels.max() + 1 for labels in levels]
     assert counts[0] > counts[1] > counts[2] > 1
     assert [len(np.unique(labels)) for labels in levels] == counts
-    assert_nested(levels)
+    for fine, coarse in pairwise(levels.reshape(3, -1)):  # a fine region lies in exactly one coarse region
+        assert np.unique(np.stack([fine, coarse]), axis=1).shape[1] == fine.max() + 1
     np.testing.assert_array_equal(levels, nested_partitions(image))
 
 
@@ -415,15 +410,14 @@ def test_a_layer_of_crops_agrees_with_crops_one_after_another(family: str, tmp_p
     assert load_mask_source(config, "cpu").key != load_mask_source(replace(config, crop_layers=0), "cpu").key
 
 
-def decoder_setting(folder: Path, **settings: float) -> None:
-    change_json(folder / "config.json", lambda stated: stated["mask_decoder_config"].update(settings))
-
-
 def test_sam_decoder_norms_have_the_published_epsilon(tmp_path: Path) -> None:
     tiny_sam(tmp_path)
     answers = []
     for epsilon in (1e-6, 0.5):
-        decoder_setting(tmp_path, layer_norm_eps=epsilon)
+        own = {"layer_norm_eps": epsilon}
+        change_json(
+            tmp_path / "config.json", lambda stated, own=own: stated["mask_decoder_config"].update(own)
+        )
         with torch.inference_mode():
             encoded = load_segmenter(str(tmp_path), "cpu").encode(photograph())
             answers.append(encoded.masks_at(sam.grid_points(2, (48, 80))))

@@ -266,17 +266,15 @@ def rooms(seed: int) -> tuple[Gaussians, LanguageField]:
     return sheet(), field_of(things, np.concatenate([small, large]).astype(np.float32))
 
 
-def least_between_neighbours(colours: Array) -> float:
-    return float(np.linalg.norm(np.diff(colours[:THINGS], axis=0), axis=1).min())
-
-
 def test_neighbours_differ_more_than_by_the_axes_of_everything():
     for seed in range(5):
         gaussians, field = rooms(seed)
         found = contrasting_colours(field, field.tree, build_surface(gaussians))
         assert found.shape == (THINGS + 2, 3)
         assert 0 <= found.min() < found.max() <= 1
-        assert least_between_neighbours(found) > 1.5 * least_between_neighbours(field.codec.palette)
+        steps = (np.diff(colours[:THINGS], axis=0) for colours in (found, field.codec.palette))
+        found_least, usual_least = (np.linalg.norm(own, axis=1).min() for own in steps)
+        assert found_least > 1.5 * usual_least
 
 
 def test_scenes_without_neighbours_have_no_colours():

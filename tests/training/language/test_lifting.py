@@ -69,17 +69,6 @@ def test_a_mask_weight_is_the_weight_inside_the_mask(gaussians, backend):
     assert not got.any()  # nothing at any other level
 
 
-def test_blocks_are_the_rows_of_the_whole(gaussians):
-    views = make_views()
-    mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, views)
-    groups = ungrouped(views)
-    whole = mask_weights.block(0, groups).toarray()
-    again = replace(mask_weights, block_size=7)
-    assert again.blocks == [(0, 7), (7, 14), (14, 21), (21, 25)]
-    parts = [again.block(number, groups).toarray() for number in range(4)]
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
-
-
 def test_masks_of_one_group_are_one_column(gaussians):
     views = make_views()
     mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, views)
@@ -127,12 +116,6 @@ def view(of_row, level: int = WHOLE, weights: Array | None = None) -> Array:
     return pairs
 
 
-def joined(*parts: Array) -> Array:
-    """Return what several maps say of one view, by rising row."""
-    pairs = np.concatenate(parts)
-    return pairs[np.argsort(pairs["row"], kind="stable")]
-
-
 def counts_of(views: Sequence[Array]) -> list[int]:
     return [int(pairs["mask"].max()) + 1 if len(pairs) else 0 for pairs in views]
 
@@ -156,9 +139,9 @@ def random_views(seed: int, count: int = 240, views: int = 8) -> list[Array]:
         parts = np.where(rng.uniform(size=count) < 0.5, 6 + rng.integers(3, size=count), UNSEEN)
         weights = rng.uniform(0.1, 9, size=(3, count)).astype(np.float32)
         rest[rest == said] = UNSEEN  # a row and a mask are a pair once
-        made.append(
-            joined(view(said, weights=weights[0]), view(rest, weights=weights[1]), view(parts, 1, weights[2]))
-        )
+        whole = view(said, weights=weights[0]), view(rest, weights=weights[1])
+        pairs = np.concatenate([*whole, view(parts, 1, weights[2])])
+        made.append(pairs[np.argsort(pairs["row"], kind="stable")])
     return made
 
 
@@ -194,6 +177,9 @@ def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
 def test_gaussians_belong_to_the_instance_they_paint_most(seed, level):
     views = random_views(seed)
     counts, things = counts_of(views), found(views, 240, level=level)
+    np.testing.assert_array_equal(
+        find_instances(MaskWeights(views, 240, 37), counts, level), things
+    )  # blocks
     numbers = np.array(plain_masks_of_things(views, level))
     weights = np.zeros((240, numbers.max() + 1))
     for first, pairs in zip(np.cumsum([0, *counts]), views, strict=False):
@@ -262,13 +248,6 @@ def test_masks_outside_the_sample_show_no_instance():
     assert found([view(of_row)], 200, sample=missed[-1])[7] == NO_NODE
 
 
-def test_blocks_do_not_change_instances():
-    views = random_views(5)
-    whole = found(views, 240)
-    blocks = MaskWeights(views, 240, block_size=37)
-    np.testing.assert_array_equal(find_instances(blocks, counts_of(views)), whole)
-
-
 # Votes: masks of just one node, in photograph after photograph.
 
 
@@ -328,8 +307,9 @@ def test_mean_lift_weights_vectors_by_blending_weights(gaussians, lifting):
 def test_lifting_a_sample_equals_its_rows_of_the_whole(lifting):
     mask_weights, groups = lifting
     whole, weight = lift_weights(mask_weights.block(0, groups), groups.vectors, robust=True)
-    rows = np.array([0, 3, 7, 8, 22])
+    rows = np.array([0, 3, 7, 8, 22, 24])
     again = replace(mask_weights, block_size=8)
+    assert again.blocks == [(0, 8), (8, 16), (16, 24), (24, 25)]
     some, confidence = lift_sample(again, groups, rows, robust=True)
     np.testing.assert_allclose(some, whole[:, rows], atol=1e-6)
     np.testing.assert_allclose(confidence, weight[:, rows], rtol=1e-6)

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from itertools import combinations, pairwise
-from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -44,9 +43,8 @@ def random_patches(seed: int, count: int = 24, views: int = 4) -> Patches:
         np.arange(count), (first, second), rng.uniform(size=2 * count), rng.uniform(size=2 * count)
     )
     labelling = np.arange(masks, dtype=np.int32) // 5
-    points = rng.normal(size=(count, 1, 3)) + rng.uniform(-1, 1, (count, 5, 3)) * rng.uniform(
-        0, 1, (count, 1, 3)
-    )
+    spread, middles = rng.uniform(0, 1, (count, 1, 3)), rng.normal(size=(count, 1, 3))
+    points = middles + spread * rng.uniform(-1, 1, (count, 5, 3))
     moments = moments_of(points, rng.uniform(0.1, 3, count), rng.dirichlet(np.ones(3), count))
     eyes = rng.normal(size=(views, 3)) * 4
     return Patches(sparse.csr_matrix(masses.astype(np.float32)), labelling, moments, eyes, *borders)
@@ -70,13 +68,7 @@ def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]
         middle = total[:3, 3] / total[3, 3]
         axes, squares, _ = np.linalg.svd(total[:3, :3] / total[3, 3] - np.outer(middle, middle))
         to_eye = min(patches.eyes - middle, key=np.linalg.norm)
-        return (
-            total[3, 3],
-            total[4:, 3] / total[3, 3],
-            middle,
-            np.sqrt(squares),
-            axes[:, 2] * np.sign(to_eye @ axes[:, 2]),
-        )
+        return total, middle, np.sqrt(squares), axes[:, 2] * np.sign(to_eye @ axes[:, 2])
 
     def cost(a: list[int], b: list[int]) -> float | None:
         across = (np.isin(patches.borders, a) & np.isin(patches.borders[::-1], b)).any(0)
@@ -91,16 +83,14 @@ def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]
                 agreed += least * (mine / mine.sum()) @ (theirs / theirs.sum())
         agreement = agreed / seen if seen > 0 else 1 - module.UNSEEN
         links, disagreement, concavity = patches.sums[across].sum(0)
-        (area, colour, middle, own, _), (_, other, base, spreads, out) = sorted(
-            (plane(a), plane(b)), key=itemgetter(0)
-        )
+        (x, middle, own, _), (y, base, wide, out) = sorted(map(plane, (a, b)), key=lambda one: one[0][3, 3])
         between = module.SEEN * (1 - agreement)
         between += (module.SEEN * disagreement + module.BENT * concavity) / links
-        between += module.COLOUR * np.linalg.norm(colour - other)
+        between += module.COLOUR * np.linalg.norm(x[4:, 3] / x[3, 3] - y[4:, 3] / y[3, 3])
         height, half = (middle - base) @ out, np.sqrt((own**2).sum()) / 2
-        if height > 0 and half < spreads[1]:
-            between += module.STAND * height / (height + spreads[2]) * (1 - half / spreads[1])
-        return between * (area / patches.moments[:, 3, 3].sum() / module.PLAIN) ** module.SMALL
+        if height > 0 and half < wide[1]:
+            between += module.STAND * height / (height + wide[2]) * (1 - half / wide[1])
+        return between * (x[3, 3] / patches.moments[:, 3, 3].sum() / module.PLAIN) ** module.SMALL
 
     while True:
         pairs = [(cost(nodes[a], nodes[b]), a, b) for a in nodes for b in nodes if a < b]
@@ -129,9 +119,12 @@ def test_halves_of_a_thing_merge_before_the_plane_they_stand_on():
     points[1:, :, 2] += 0.1
     moments = moments_of(points, np.array([4.0, 0.1, 0.1]), np.full((3, 3), 1 / 3))
     nothing = sparse.csr_matrix((3, 1), dtype=np.float32), np.zeros(1, np.int32)
-    for side, first in ((1, [1, 2]), (-1, [0, 1])):  # seen from below they hang behind it
-        eyes = np.array([[0, 0, 3.0 * side]])
-        assert merge(Patches(*nothing, moments, eyes, pairs, np.ones((3, 3))))[0][0].tolist() == first
+    eyes = np.array([[0, 0, 3.0]])
+    above, below = (
+        merge(Patches(*nothing, moments, side * eyes, pairs, np.ones((3, 3)))) for side in (1, -1)
+    )
+    assert above[0][0].tolist() == [1, 2]
+    assert above[1][1] > below[1][1] + 0.3
 
 
 def test_link_disagreement_is_the_weighted_share_of_views():
@@ -171,9 +164,9 @@ def test_concavity_is_high_in_corners_and_low_on_ridges():
     assert ((inside >= 0) & (inside <= 1)).all()
 
 
-def blob_views(wrong: float) -> tuple:
-    """A scene of blobs, the blob of each Gaussian, and views with a mask a blob; a share of all pixels has a
-    random mask."""
+@pytest.mark.parametrize("wrong", [0.0, 0.15])
+def test_tree_finds_instances_despite_wrong_masks(wrong):
+    """A scene of blobs, and views with a mask a blob; a share of all pixels has a random mask."""
     scene, rng, views = blob_scene(), np.random.default_rng(0), []
     blob = np.arange(len(scene.gaussians)) // PER_BLOB
     for camera in cameras():
@@ -183,12 +176,6 @@ def blob_views(wrong: float) -> tuple:
         labels = np.where((rng.uniform(size=labels.shape) < wrong) & (labels >= 0), noise, labels)
         maps = np.stack([np.full_like(labels, -1), np.full_like(labels, -1), labels]).astype(np.int32)
         views.append((camera, ImageFeatures(maps, np.zeros((int(blob.max()) + 1, 0), np.float32))))
-    return scene, blob, views
-
-
-@pytest.mark.parametrize("wrong", [0.0, 0.15])
-def test_tree_finds_instances_despite_wrong_masks(wrong):
-    scene, blob, views = blob_views(wrong)
     mask_weights = find_mask_weights(CpuRasterizer(), scene.gaussians, views)
     surface = build_surface(scene.gaussians)
     eyes = np.stack([camera.position for camera, _ in views])
