@@ -17,6 +17,7 @@ from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Progress, WorkCancelledError
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene, look_at
+from langsplat_core.training.radiance import differentiable
 from langsplat_core.training.radiance.differentiable import CpuRenderer, evaluate_views, renderer_for
 from langsplat_core.training.radiance.state import PARAMETERS, initial_gaussians, start
 from langsplat_core.training.radiance.stereo import STAGE as DEPTHS
@@ -195,6 +196,15 @@ def test_training_ignores_transients(tmp_path: Path) -> None:
     off = train_radiance(passed, replace(config, transients="off"), views)
     with_it, without = (evaluate_views(one, capture(), [1], "cpu")[0].psnr for one in (off, trained))
     assert without > with_it + 3
+
+
+@pytest.mark.parametrize("steps", [128, 512])
+def test_runs_look_for_transients_as_often_however_long(steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    looks, look = [], differentiable.rendered_depths
+    monkeypatch.setattr(differentiable, "rendered_depths", lambda *given: looks.append(1) or look(*given))
+    config = RadianceConfig(steps=steps, backend="cpu", sh_degree=0, max_gaussians=200, transients="on")
+    train_radiance(capture(), replace(config, few_views=0), [0, 1])
+    assert len(looks) == pytest.approx(64 * 2 * 0.8 + 4 * 2, abs=4)
 
 
 @pytest.mark.long
