@@ -1,7 +1,7 @@
 """Captures: photographs with known cameras, as every loader returns them.
 
-Beside them what follows from both: which views are held out, the length of a unit, and points where the
-cameras look.
+The module also chooses the views that are held out, estimates the length of a unit, and draws random points
+in view of the cameras.
 """
 
 import hashlib
@@ -36,7 +36,7 @@ from langsplat_core.io.hostile import PictureError
 from langsplat_core.progress import Progress
 from langsplat_core.scene import NO_ORIGIN, Camera, moved_pose, origin_of
 
-DECIMALS = 9  # of the cameras' extent: what a digest tells apart, far above rounding and far below a pixel
+DECIMALS = 9  # to which digests round, in camera extents: far above float rounding, far below a pixel
 
 log = logging.getLogger("langsplat")
 
@@ -49,14 +49,14 @@ class Capture:
     images: tuple[Array, ...]  # (H, W, 3) uint8 each, display (sRGB) values
     points: Array  # (M, 3) float64 structure-from-motion points; M may be 0
     colours: Array  # (M, 3) uint8
-    metres_per_unit: float | None = None  # > 0, how long a unit of its world is; None: unknown
+    metres_per_unit: float | None = None  # > 0, length of a world unit; None: unknown
     photos: tuple[Photo, ...] = ()  # the files, in the same order; none for images made otherwise
-    drawn: bool = False  # by `assets.making`, where encoders are calibrated
+    drawn: bool = False  # images drawn by `assets.making`, on which encoders are calibrated
     masks: tuple[Array | None, ...] = ()  # (H, W) bool each, pixels that count; None: all; (): no masks
-    cut_out: bool = False  # pixels that do not count are empty, rather than not known
+    cut_out: bool = False  # pixels that do not count show empty background, not something unknown
     matches: Matches | None = None  # of all photographs, where cameras came from structure from motion
     origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) what cameras and points are relative to
-    taken: str = ""  # the span of its photographs' dates and places, in words; as EXIF data say
+    taken: str = ""  # the span of the photographs' dates and places by EXIF data, in words
 
     def __post_init__(self) -> None:
         lists = {"photographs": self.images, "files": self.photos, "masks": self.masks}
@@ -88,7 +88,7 @@ class Capture:
 
         That is these in their order, their cameras, and the points. Structure from motion run again may place
         the same photographs in another world, so names alone do not identify a capture. Poses and points
-        count to `DECIMALS`, so that a work folder is taken up on another processor too, whose products of
+        count to `DECIMALS`, so that a work folder also resumes on another processor, whose products of
         matrices differ in their last digits.
         """
         digest, length = hashlib.blake2b(digest_size=16), near_power(self.extent())
@@ -114,9 +114,9 @@ class Capture:
         return self._of(views)
 
     def read_at(self, indices: Sequence[int], longer_side: int) -> "Capture":
-        """Return photographs, bit for bit as a dataset that is read at that size has them.
+        """Return photographs, bit for bit as a dataset has them that is read at this size.
 
-        The points are those of all. Without files they are `shrunk`. InputError for a file that can no longer
+        The points stay those of all. Without files, images are `shrunk`. InputError if a file can no longer
         be read.
         """
         if not self.photos or longer_side >= max(max(self.images[index].shape) for index in indices):
@@ -135,7 +135,7 @@ class Capture:
             return self._of(list(pool.map(view, indices)))
 
     def _of(self, views: Sequence[View]) -> "Capture":
-        """Return a capture of other views of the same scene, which are no longer those of the files."""
+        """Return the capture with other `views` of the same scene, detached from the files."""
         cameras, images, masks = zip(*views, strict=True) if views else ((), (), ())
         masks = masks if self.masks else ()
         return replace(self, cameras=cameras, images=images, masks=masks, photos=(), matches=None)
@@ -147,7 +147,7 @@ class Capture:
 
 
 def centred(capture: Capture) -> Capture:
-    """Return the capture about the origin that its cameras and points need."""
+    """Return the capture relative to the origin that `origin_of` finds for its cameras and points."""
     eyes = np.array([camera.position for camera in capture.cameras])
     origin = origin_of(np.concatenate([eyes, capture.points]))
     if not origin.any():
@@ -167,8 +167,8 @@ def centred(capture: Capture) -> Capture:
 def shrunk_view(camera: Camera, image: Array, mask: Array | None, size: tuple[int, int]) -> View:
     """Return a view at a smaller (width, height), shrunk as photographs are when they are read.
 
-    Area averages differ from that by a PSNR of 31 to 42 dB, which the scores of good renders would feel. A
-    pixel counts where all it is made of count.
+    Area averages differ from that by a PSNR of 31 to 42 dB, which would change the scores of good renders. A
+    pixel counts if all pixels that it is made of count.
     """
     shrunk = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS))
     if mask is not None:
@@ -183,7 +183,7 @@ def _rounded(values: Array) -> Array:
 
 
 def report_lost_points(good: Array, source: str) -> None:
-    """Say how many points of `source` had to be left out; good: (M,) bool, those that were not."""
+    """Report how many points of `source` are left out; good: (M,) bool, the points that are kept."""
     if lost := len(good) - good.sum():
         share = f"{lost} of {len(good)} points of {source}"
         report_loss("%s are damaged or badly located: left out; was it written whole?", share)
@@ -201,11 +201,11 @@ def _is_cut_out(alpha: Array | None) -> bool:
     return bool(empty.mean() > 0.5 or edge.mean() > 0.5)
 
 
-IN_MEMORY = 512_000_000  # bytes of images that are held there; further ones lie in files
+IN_MEMORY = 512_000_000  # bytes of images that are held in memory; further images are held in files
 
 
 def in_file(image: Array) -> Array:
-    """Return the same image in a file without a name in `TMPDIR`, which ends with the process."""
+    """Return the image mapped from an unnamed file in `TMPDIR`, which ends with the process."""
     try:
         with tempfile.TemporaryFile(prefix="langsplat-") as file:
             # Written, not mapped and filled: on a full disk that would kill the process without a word.
@@ -221,7 +221,7 @@ def develop(
 ) -> Capture:
     """Return the capture of `photos` by `config`, with (M, 3) points and (M, 3) uint8 colours, by name.
 
-    Unreadable photographs are reported; InputError without any other.
+    Unreadable photographs are reported; InputError if none can be read.
     """
     if not photos:
         raise InputError("the dataset lists no photographs")
@@ -279,14 +279,14 @@ def _report(told: Sequence[tuple[str, str]], masks: Sequence[Array | None]) -> N
 
 
 def _cut_out(masks: Sequence[Array | None], alphas: Sequence[Array | None], config: DatasetConfig) -> bool:
-    """Return True where what is transparent is an empty background, and say how transparency is taken."""
+    """Return True if transparent pixels are empty background, and report how transparency is taken."""
     seen = sum(alpha is not None for alpha in alphas)
     if not seen:
         return False
     cut_out = config.alpha == "background" or (
         config.alpha == "auto" and 2 * sum(map(_is_cut_out, alphas)) > len(alphas)
     )
-    cut_out = cut_out and all(mask is None for mask in masks)  # which say what does not count
+    cut_out = cut_out and all(mask is None for mask in masks)  # masks say what does not count
     said = "an empty background" if cut_out else "no part of the thing, and does not count"
     say = report_loss if config.alpha == "auto" else log.info
     message = "what is transparent in %d of %d photographs is %s; else: --alpha %s"
@@ -311,12 +311,12 @@ def split_views(capture: Capture, config: DatasetConfig) -> tuple[list[int], lis
 
 
 def surrounded_views(cameras: Sequence[Camera], every: int) -> list[int]:
-    """Return indices of one view in `every`, in ascending order, of which each lies among training views.
+    """Return ascending indices of one view in `every`, each surrounded by training views.
 
-    Those at the ends of a walk show what no other photograph does, and tell nothing of the training. One
-    after the other that view is taken which lies best in the middle of its nearest training views, by place
-    and direction, measured by how far those are away. Its own nearest ones are then left to training, so that
-    the views come from all over the capture. None of fewer than `FEWEST_VIEWS`.
+    Views at the ends of a walk show what no other photograph does, and do not measure the training. Views are
+    taken one by one: each time the one closest to the middle of its nearest training views, in position and
+    direction, relative to their distance. Its own nearest views are then left to training, so that held-out
+    views come from all over the capture. Fewer than `FEWEST_VIEWS` cameras give none.
     """
     count = len(cameras)
     if every < 2 or count < FEWEST_VIEWS:
@@ -337,7 +337,7 @@ def surrounded_views(cameras: Sequence[Camera], every: int) -> list[int]:
 
 
 def _stands(cameras: Sequence[Camera]) -> Array:
-    """Return (M, 6) place and direction of cameras in typical steps, rounded: processors differ."""
+    """Return (M, 6) positions and directions of cameras in typical steps, rounded: processors differ."""
     places = np.array([camera.position for camera in cameras])
     directions = np.array([camera.rotation[2] for camera in cameras])
     gaps = np.linalg.norm(places[:, None] - places[None], axis=2)
@@ -356,18 +356,17 @@ def _lean(stands: Array, apart: Array, training: Array, index: int) -> float:
 
 # The length of a unit of a capture's world, by the places (GPS) that its photographs name.
 #
-# A phone's places are metres off, so they do not move the cameras. But distances between far ones say how
-# long a unit is, where the photographs lie further apart than their places err; which their own spread
-# tells.
+# A phone's places are metres off, so they do not move the cameras. But distances between far photographs tell
+# the length of a unit, if they exceed the error of the places, which the spread of the ratios shows.
 
-FEWEST_PLACES = 5  # photographs that name one
+FEWEST_PLACES = 5  # photographs with a place
 EQUATOR, FLATTENED = 6_378_137.0, 6.694_379_990_14e-3  # of WGS 84: radius in metres, squared eccentricity
 
 
 def with_taken(capture: Capture) -> Capture:
-    """Return the capture with what its photographs say of their dates and places, and a scale by these.
+    """Return the capture with the dates and places of its photographs, and a scale from the places.
 
-    The scale is that of the dataset where it has one; none where the places are unsure.
+    A scale of the dataset itself is kept; there is none where the places are too uncertain.
     """
     facts = [exif_facts(photo.path) for photo in capture.photos]
     dates = sorted(each.taken for each in facts if each.taken)
@@ -393,7 +392,7 @@ def with_taken(capture: Capture) -> Capture:
 def metres_per_unit(eyes: Array, places: Array) -> float | None:
     """Return the median ratio of distances between places to those between cameras.
 
-    It is that over pairs which are at least half as far apart as the farthest ones. eyes: (K, 3) camera
+    It is taken over pairs that are at least half as far apart as the farthest ones. eyes: (K, 3) camera
     positions; places: (K, 2) latitudes and longitudes, degrees. None where the middle half of the ratios
     spans more than a fifth of the median. Heights are left out, as most cameras know them badly: for a climb
     as steep as a stair that is an eighth too little.
@@ -416,9 +415,9 @@ def on_ground(places: Array) -> Array:
     return np.stack([along, EQUATOR * (1 - FLATTENED) / bend**1.5 * (latitude - latitude[0])], 1)
 
 
-# Points where the cameras look, for want of better ones.
+# Random points in view of the cameras, where there are no better ones.
 
-TELLING_POINTS = 50  # from this many known points on, depths follow theirs
+TELLING_POINTS = 50  # known points from which on random depths follow theirs
 
 
 def look_distance(cameras: Sequence[Camera]) -> float:

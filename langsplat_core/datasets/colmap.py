@@ -52,7 +52,7 @@ LENSES: Mapping[str, tuple[int, Any, str]] = MappingProxyType({
     "FISHEYE": (15, FisheyeDistortion, "fx fy cx cy"),
 })  # fmt: skip
 
-CLOUDS = ("points3D.ply", "points3d.ply", "points.ply")  # of tools that write no points of COLMAP's
+CLOUDS = ("points3D.ply", "points3d.ply", "points.ply")  # of tools that do not write COLMAP's points
 
 # Records of the binary files, each of which begins with their number. An image goes on with its name, a zero
 # byte, and the number of its observations of 24 bytes; a point with `track` observations of 8 bytes.
@@ -124,7 +124,7 @@ def _points(folder: Path, suffix: str) -> Array:
 
 
 def _content(path: Path, quiet: bool = False) -> Any:
-    """Return what the reader of a file's name makes of it, and say what it passed over."""
+    """Return the content of a file, read by the reader for its name, and report what was ignored."""
     data, told = path.read_bytes(), list[str]()
     try:
         if path.suffix == ".bin":
@@ -144,7 +144,7 @@ def _content(path: Path, quiet: bool = False) -> Any:
 
 
 def lens_of(name: str, width: int, height: int, parameters: Array) -> PhotoIntrinsics:
-    """Return the lens of a camera of a model; ValueError where none has such numbers, or it is not read."""
+    """Return the lens of a model's camera; ValueError for an unknown kind or impossible parameters."""
     if name not in LENSES:
         raise ValueError(
             f"{printable_line(name, 40)} is no camera that is read here; undistort the photographs with "
@@ -173,7 +173,7 @@ def _image(name: str, camera_id: int, pose: Array) -> ModelImage:
 def _records(
     data: bytes, kind: Any, rest: Callable[[Any, int], int], tell: Tell
 ) -> Iterator[tuple[Any, bytes]]:
-    """Yield every record with the bytes behind it; rest: how many, by the record and where it ends."""
+    """Yield every record with the bytes behind it; rest: their number, from the record and its end."""
     end = 8
     for _ in range(*struct.unpack_from("<Q", data)):
         record = np.frombuffer(data, kind, 1, end)[0]
@@ -258,7 +258,7 @@ def _text_images(text: str, tell: Tell) -> list[ModelImage]:
 
 
 def _lists_2d_points(line: str) -> bool:
-    """Return True for x, y and a whole number again and again, or nothing; an image ends with its name."""
+    """Return True for triples of x, y and a whole number, or nothing; lines of images end with a name."""
     fields = line.split()
     try:
         return len(fields) % 3 == 0 and all(int(number) >= -1 for number in (*fields[2:3], *fields[-1:]))
@@ -298,7 +298,7 @@ def find_model(folder: Path) -> Path | None:
     """Return the folder of the COLMAP model of a dataset, if it has one.
 
     Photographs that COLMAP cannot place together end in several models, of which the first is not always the
-    largest: that with most photographs is taken, of equal ones the first, and a warning says which.
+    largest. The model with most photographs is taken, the first of equal ones, and a warning names it.
     """
     sparse = folder / "sparse"
     inside = sorted(sparse.iterdir(), key=lambda f: (len(f.name), f.name)) if sparse.is_dir() else []

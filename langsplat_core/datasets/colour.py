@@ -1,8 +1,8 @@
 """Colours of photographs and videos as sRGB, from profiles and from the numbers of ITU-T H.273.
 
-Profiles (ICC) are littlecms' work, through Pillow. PNG's gAMA and cICP, HEIC without a profile and videos
-name a transfer function, how light becomes numbers, and the primaries, which the channels stand for. Those of
-HDR, HLG and PQ, are taken to the diffuse white of BT.2408; what is brighter becomes white.
+ICC profiles are applied by littlecms, through Pillow. PNG's gAMA and cICP, HEIC without a profile and videos
+name a transfer function, from light to numbers, and the primaries of the channels. The HDR functions HLG and
+PQ are scaled to the diffuse white of BT.2408; brighter colours become white.
 """
 
 import io
@@ -30,13 +30,13 @@ PRIMARIES = dict.fromkeys((1, UNSPECIFIED, 4, 5, 6, 7), SRGB) | {
     11: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.314, 0.351),  # DCI-P3
     12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *D65),  # Display P3
 }
-CHUNKS = 64  # of a PNG before its pixels
+CHUNKS = 64  # of a PNG, at most, that are searched before its pixels
 
 
 def as_srgb(image: Image.Image, coded: tuple[float, Any] | None, tell: Tell) -> Image.Image:
     """Return the colours of an image as RGB for a display, without transparency.
 
-    coded: as `coded_as` says; tell: is told what cannot be done.
+    coded: from `coded_as`; tell: is told what cannot be done.
     """
     profile, exif = image.info.get("icc_profile"), image.getexif()
     if profile and coded is None:
@@ -56,7 +56,7 @@ def as_srgb(image: Image.Image, coded: tuple[float, Any] | None, tell: Tell) -> 
 
 @lru_cache(maxsize=8)
 def _transform(profile: bytes, mode: str) -> Any:
-    """Return what turns an image of a profile into sRGB; None where nothing would change."""
+    """Return the transform of images from a profile to sRGB; None if it would change nothing."""
     source, target = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
     intent, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.BLACKPOINTCOMPENSATION
     transform = ImageCms.buildTransform(source, target, mode, "RGB", intent, flags)
@@ -82,7 +82,7 @@ def coded_as(stored: Image.Image) -> tuple[float, Any] | None:
 
 
 def _cicp(stored: Any) -> tuple[int, int] | None:
-    """Return what the chunk cICP of an opened PNG says, which Pillow passes over."""
+    """Return transfer function and primaries of an opened PNG's chunk cICP, which Pillow ignores."""
     file = stored.fp
     if file is None:
         return None

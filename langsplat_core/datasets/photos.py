@@ -104,7 +104,7 @@ def say_unread(folder: Path, photos: Sequence[Path]) -> None:
 
 
 def finder(folder: Path) -> Callable[[str], Path]:
-    r"""Return the function from the name of a file, as another file in `folder` has it, to its path.
+    r"""Return a function from the name of a file, as written in another file of `folder`, to its path.
 
     Folders stand before "/" or "\\"; accents may be composed or not (NFC, NFD), in the name and on disk.
     """
@@ -139,7 +139,7 @@ def mask_beside(photo: Path) -> Path | None:
 
 
 def stray_masks(photos: Sequence[Photo]) -> list[str]:
-    """Return the names of images in folders "masks" that are of no photograph."""
+    """Return the names of images in folders "masks" that belong to no photograph."""
     folders = {photo.path.parent for photo in photos}
     beside = {folder / "masks" for folder in folders}
     beside |= {folder.parent / "masks" for folder in folders if folder.name in ("images", "photos")}
@@ -169,11 +169,11 @@ _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of the unit
 
 
 def optics(path: Path) -> Image.Exif:
-    """Return EXIF data that tell the focal length alone.
+    """Return only those EXIF data that tell the focal length.
 
     Other tags, orientation first of all, would be wrong for a copy of the photograph. Where a camera gives
-    pixels per inch of its sensor instead of the length on film, that is worked out: COLMAP compares those
-    with the size of the image, which is another for a copy.
+    pixels per inch of its sensor, the length on film is computed from them: COLMAP would compare them with
+    the size of the image, which is another for a copy.
     """
     kept = Image.Exif()
     try:
@@ -211,7 +211,7 @@ class ExifFacts:
 
 
 def exif_facts(path: Path) -> ExifFacts:
-    """Return what a photograph's EXIF data say of how it was taken; nothing of what cannot be read."""
+    """Return when, where and by what a photograph was taken; fields stay empty without readable EXIF data."""
     exif, inner, places = Image.Exif(), dict[int, Any](), dict[int, Any]()
     with suppress(hostile.PictureError), hostile.opened(path) as image:
         if image.format != "PNG" or "exif" in image.info:  # behind a PNG's pixels it is read by decoding them
@@ -237,8 +237,8 @@ def exif_facts(path: Path) -> ExifFacts:
 def read_photo(path: Path, upright: bool, tell: Tell = lambda _: None) -> Image.Image:
     """Return an RGB image of sRGB colours, or RGBA where a pixel is transparent; 16 bits become 8.
 
-    With `upright` it is turned as its EXIF data ask; unreadable EXIF data count as none. What is larger than
-    other images may be is reduced as it is read. tell: is told what was guessed. Raises PictureError.
+    With `upright` it is turned as its EXIF data ask; unreadable EXIF data count as none. Images above
+    `MOST_PIXELS` are reduced as they are read. tell: is told what was guessed. Raises PictureError.
     """
     with hostile.opened(path, most=hostile.MOST_PIXELS_REDUCED) as stored:
         image: Image.Image = stored
@@ -265,7 +265,7 @@ def read_photo(path: Path, upright: bool, tell: Tell = lambda _: None) -> Image.
 
 
 def _of_8_bits(image: Image.Image, path: Path, tell: Tell) -> Image.Image:
-    """Return a grey image of 16 bits as one of 8; of 12 bits where no pixel has more."""
+    """Return a grey image of 16 bits as one of 8; it counts as 12 bits if no pixel has more."""
     values = np.asarray(image)
     if image.mode == "F" or not 0 <= values.min(initial=0) <= values.max(initial=0) <= 65535:
         raise hostile.PictureError(path, "more than 16 bits per channel")
@@ -315,7 +315,7 @@ def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
 
 
 def _read_mask(path: Path, size: tuple[int, int]) -> Image.Image:
-    """Return the mask of a photograph of `size` pixels, as large. InputError for one of another shape."""
+    """Return the mask of a photograph of `size` pixels, resized to it; InputError if its shape differs."""
     mask = over_black(read_photo(path, upright=False))
     if abs(mask.width * size[1] / (mask.height * size[0]) - 1) > ASPECT_TOLERANCE:
         raise InputError(
@@ -327,13 +327,13 @@ def _read_mask(path: Path, size: tuple[int, int]) -> Image.Image:
 
 # A pinhole, its (H, W, 3) uint8 image, and its (H, W) bool pixels that count (None: all).
 View = tuple[Camera, Array, Array | None]
-OPAQUE, SOLID = 250, 5  # of 255: from where a pixel is the thing alone, and from where it is a part of it
+OPAQUE, SOLID = 250, 5  # alpha, of 255, from which a pixel is opaque, and from which it shows anything
 
 
 def counted(mask: Array | None, alpha: Array | None, cut_out: bool) -> Array | None:
     """Return the (H, W) bool pixels that count by a mask and by transparency; None: all.
 
-    cut_out: pixels count that show anything of the thing; else those that show nothing but it.
+    cut_out: pixels count that are at least partly opaque; else only opaque ones.
     """
     if alpha is None:
         return mask
@@ -345,7 +345,7 @@ Layers = tuple[Camera, Array, Array | None, Array | None]  # a view, and its (H,
 
 
 def developer(max_side: int) -> Callable[..., Layers]:
-    """Return the function that makes the layers, at most `max_side` px long, of photographs; PictureError.
+    """Return a function from a photograph to its layers, at most `max_side` px long; it raises PictureError.
 
     Its second argument, a `Tell`, is told what was guessed.
     """

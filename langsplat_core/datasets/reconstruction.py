@@ -148,7 +148,7 @@ def _repeatable() -> "pycolmap.IncrementalPipelineOptions":
 def store_model(model: Model, folder: Path) -> None:
     """Write the model as ``sparse``, which exists only when it is whole, and drop what led to it.
 
-    pycolmap says nothing where the disk takes only a part, so that what was written is read. OSError then.
+    pycolmap does not report a full disk, so the written model is read back; OSError if it is incomplete.
     """
     unfinished = folder / "sparse.part"
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -175,10 +175,10 @@ def store_model(model: Model, folder: Path) -> None:
 # ahead does not have; the others begin with less, or place all photographs at once.
 
 ENOUGH = 0.9  # share of the photographs; with fewer located the next method is tried
-ASTRAY, ASTRAY_GUESS = 2.0, 4.0  # times the focal length of EXIF data, and a normal lens's without them
+ASTRAY, ASTRAY_GUESS = 2.0, 4.0  # largest factor off the focal length of EXIF data, or of a normal lens
 TIE = 0.05  # of the reprojection error: methods that end at the same cameras differ by 1 to 2 %
-FEWEST_POINTS = 30  # that hold a camera; the incremental mapper demands as many, the global one none
-FIRM_POINTS = 100  # that hold a camera which needs no further look
+FEWEST_POINTS = 30  # that a located camera sees; the incremental mapper demands as many, the global one none
+FIRM_POINTS = 100  # that a firmly located camera sees
 # For first pairs of a walk straight ahead: degrees between rays, share of motion that is forward, matches.
 _CLOSE_PAIRS = {"init_min_tri_angle": 4.0, "init_max_forward_motion": 1.0, "init_min_num_inliers": 50}
 # For long walks: each photograph shares little with those before it, and what it shares lies far ahead.
@@ -226,7 +226,7 @@ def _placed(places: Iterator[int], count: int, progress: Progress) -> None:
 
 
 def is_astray(model: Model, folder: Path) -> bool:
-    """Return True where a focal length ended far from what EXIF data say, or without them from any lens.
+    """Return True if a focal length is far from that of EXIF data or, without them, of a normal lens.
 
     On a walk as on rails another focal length explains the photographs as well, in a world of another depth.
     """
@@ -242,8 +242,8 @@ def is_astray(model: Model, folder: Path) -> bool:
 def best_model(best: Model | None, models: Iterable[Model]) -> Model | None:
     """Return the best of `best` and `models`.
 
-    That is one that locates more than those before it, or as many with a reprojection error that is less by
-    more than `TIE`. Cameras that see fewer than `FEWEST_POINTS` are taken out: where they stand is a guess.
+    A model is better if it locates more photographs, or as many with a reprojection error that is less by
+    more than `TIE`. Cameras that see fewer than `FEWEST_POINTS` are taken out: their position is a guess.
     """
     most, least = (0, 0.0) if best is None else _worth(best)
     for model in models:
@@ -275,8 +275,8 @@ def _incremental(
 ) -> Collection[Model]:
     """Place one photograph after the other, onto a first pair.
 
-    limits: of COLMAP's mapper; focal: lengths that EXIF data say of all photographs stay as they are, or
-    those which no EXIF data say stay a normal lens's. What lies far ahead looks much the same from any
+    limits: of COLMAP's mapper; focal: "of EXIF" keeps focal lengths that EXIF data give for all photographs,
+    "guessed" keeps a normal lens's where they do not. What lies far ahead looks much the same from any
     distance through another lens.
     """
     with opened(folder) as database:
@@ -318,7 +318,7 @@ MAPPERS: tuple[Callable[[Path, Path, Callable[[], None]], Collection[Model]], ..
 
 
 def keep_matches(folder: Path) -> None:
-    """Write what `read_matches` reads: the database does not outlive the model."""
+    """Write the graph of matches for `read_matches`: the database is deleted once there is a model."""
     with opened(folder) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         features = {name: database.num_keypoints_for_image(number) for number, name in names.items()}

@@ -1,6 +1,6 @@
 """Cameras of a plain folder of photographs, and points for cameras that came without any.
 
-Both by structure from motion in a process of its own (`reconstruction`), kept in ``work/sfm-*``.
+Both are found by structure from motion in a process of its own (`reconstruction`), kept in ``work/sfm-*``.
 """
 
 import hashlib
@@ -27,10 +27,10 @@ from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
 SIDE = 1600  # px, longer side of the images that features are sought in
-SMALL = 1000  # px, likewise at first; what is smaller yet is doubled where that does not do
-TRIED = "small.tried"  # in a workspace: a file that says that the small images did, or did not do
+SMALL = 1000  # px, the same in a first attempt; images up to this size are doubled in the second
+TRIED = "small.tried"  # file in a workspace that marks the attempt with small images as done
 MIN_PHOTOS = 3
-FEWEST = 0.5  # share of the photographs: a scene of fewer is not of what was photographed
+FEWEST = 0.5  # least share of the photographs that must be located
 
 log = logging.getLogger("langsplat")
 
@@ -94,7 +94,7 @@ def numbered(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 def _content(path: Path) -> str:
-    """Return a digest of a file, empty if it may not be read: what was copied or touched is the same."""
+    """Return a digest of a file's content, the same for copies; empty if it may not be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -108,7 +108,7 @@ def _listed(lost: dict[str, list[str]], limit: int) -> str:
 
 
 def _locate(workspace: Path, files: dict[str, Path], progress: Progress) -> None:
-    """Write the model of the photographs `files`; in the process of its own.
+    """Locate the photographs `files` and write their model; runs in the process of its own.
 
     Small images, which take a quarter of the time, are enough where they locate every photograph firmly.
     """
@@ -183,7 +183,7 @@ def _small_copies(
 
 
 def _write_mask(images: Path, name: str, mask: Image.Image) -> None:
-    """Write an image's mask for COLMAP. Where some have one, those without are white, or it finds nothing."""
+    """Write an image's mask for COLMAP; images without one need a white mask, or get no features."""
     path = images.with_name(workspaces.MASKS) / f"{name}.png"
     path.parent.mkdir(exist_ok=True)
     with atomic_path(path) as temporary:

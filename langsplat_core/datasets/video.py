@@ -19,7 +19,7 @@ from langsplat_core.progress import Progress, silent
 
 # The content chooses the demuxer: of text it may be one that asks the network, or reads other files.
 ALLOWED = {"format_whitelist": "mov,matroska,avi,mpegts", "protocol_whitelist": "file"}
-FEWEST = 3  # images, of which cameras can be found
+FEWEST = 3  # images that finding cameras needs
 
 
 @optional_imports()
@@ -123,7 +123,7 @@ def _save(frame: Any, aspect: float, folder: Path, tell: Tell) -> None:
     from av.video.reformatter import Colorspace, Interpolation
 
     deep = frame.color_trc in (HLG, PQ)  # whose dark shades need more than 8 bits
-    # HD without a word is BT.709, smaller images BT.601, as players take them.
+    # HD without a stated colour space is BT.709, smaller images BT.601, as players take them.
     hd = frame.colorspace == UNSPECIFIED and max(frame.width / 16, frame.height / 9) >= 80
     shown = frame.reformat(
         width=round(frame.width * max(aspect, 1)),

@@ -41,7 +41,7 @@ class CameraGroup:
     names: tuple[str, ...]  # file names in the workspace's images folder
     model: str  # COLMAP's camera model
     params: str = ""  # its parameters, comma-separated; empty: guessed from EXIF data or the size
-    doubled: bool = False  # in size before features are sought, as SIFT proposes
+    doubled: bool = False  # doubled in size before features are sought, as SIFT proposes
 
 
 def open_workspace(work: Path, inputs: object) -> Path:
@@ -56,7 +56,7 @@ def open_workspace(work: Path, inputs: object) -> Path:
 def run_apart(function: Callable[..., Any], *arguments: Any, workspace: Path, progress: Progress) -> Any:
     """Return ``function(*arguments, progress)``, run in a process of its own, which pycolmap may end.
 
-    Raises RuntimeError then, and OSError for whatever fails where the disk is about full.
+    Raises RuntimeError if pycolmap ends it, and OSError for any failure while the disk is nearly full.
     """
     try:
         return apart.run(function, *arguments, progress=progress, environment=ONE_THREAD)
@@ -105,7 +105,7 @@ class Matches:
 
     @cached_property
     def groups(self) -> list[list[int]]:
-        """Rows in groups: the located ones, then what matches join among the others, larger ones first."""
+        """Groups of rows: the located ones, then the connected components of the others, largest first."""
         count = len(self.names)
         joins = [(a, b) for a, b, n in self.pairs if n >= FEWEST_MATCHES and not self.located & {a, b}]
         rows, columns = np.array(joins, int).reshape(-1, 2).T
@@ -167,7 +167,7 @@ class Matches:
 
     @cached_property
     def gap(self) -> tuple[int, int] | None:
-        """Rows of two photographs, of which one is in the first group, between which more would join others.
+        """Rows of two photographs, one in the first group, between which more would join another group.
 
         That is the pair that shares most, or the neighbours in name order where none shares enough.
         Photographs without features have no part in it.

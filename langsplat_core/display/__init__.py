@@ -1,1 +1,1 @@
-"""Displays: how rasterized channels become an image, in NumPy and in GLSL."""
+"""Displays: how rasterized channels become an image, on the CPU and in GLSL."""

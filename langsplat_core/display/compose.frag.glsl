@@ -1,6 +1,6 @@
 // From channels to an image; composing.py beside it does the same on the CPU and a test compares the two.
-// Channels are premultiplied by alpha, row 0 is the top row. What is written in capitals, with SHOWN, all drawings as
-// one expression, is defined from displays.py.
+// Channels are premultiplied by alpha, row 0 is the top row. Names in capitals are defined from displays.py;
+// SHOWN is all drawings as one expression.
 
 uniform sampler2D colours;      // rgb, alpha
 uniform sampler2D extra;        // latent colours, alpha; one query per channel (0: none), alpha; or
@@ -11,7 +11,7 @@ uniform sampler2D colour_maps;  // MAP_NODES x maps
 uniform int colour_map;         // row of the one in use
 uniform vec3 query_colours[MAX_QUERIES];
 
-uniform int display;            // number of its drawing
+uniform int display;            // number of the display's drawing
 uniform vec2 ranges[MAX_QUERIES];  // per component of the further channel, the values drawn as 0 and as 1
 uniform bool own_colours;       // heat in the colour of each query instead of the colour map
 uniform float heat_opacity;
@@ -54,13 +54,13 @@ vec3 mapped(float t, bool lab) {
     return lab ? mix(oklab(first), oklab(second), position - float(low)) : mix(first, second, position - float(low));
 }
 
-// 1 for each component of a layer whose mean is at least so much.
+// 1 for each component of a layer whose mean is at least `least`.
 vec3 inside(sampler2D layer, ivec2 pixel, float least) {
     vec4 sums = texelFetch(layer, clamp(pixel, ivec2(0), textureSize(layer, 0) - 1), 0);
     return step(least * sums.a, sums.rgb) * float(sums.a > alpha_gate);
 }
 
-// A pixel inside near one that is not.
+// True for a pixel inside that has a pixel outside nearby.
 bool on_edge(sampler2D layer, vec2 place, float least) {
     ivec2 pixel = ivec2(place * vec2(textureSize(layer, 0)));
     vec3 around = inside(layer, pixel + ivec2(0, EDGE_PX), least) * inside(layer, pixel - ivec2(0, EDGE_PX), least) *
@@ -69,7 +69,7 @@ bool on_edge(sampler2D layer, vec2 place, float least) {
     return max(edges.r, max(edges.g, edges.b)) > 0.0;
 }
 
-// The query that a pixel shows: of those with at least so much one after another, in stripes, else the largest.
+// The query that a pixel shows: those with at least `least` alternate in stripes; else that of the largest value.
 int query_of(vec3 values, vec2 place, float least) {
     ivec2 pixel = ivec2(place * vec2(textureSize(extra, 0)));
     int count = 0;

@@ -1,4 +1,4 @@
-"""Images of channels, composed on the CPU: a compiled kernel in float32, one pass over the pixels.
+"""Composition of images from channels on the CPU: a compiled kernel in float32, one pass over the pixels.
 
 `compose.frag.glsl` does the same on a graphics device; software OpenGL would take longer for it than the
 rasterizer does.
@@ -33,13 +33,13 @@ class Style(NamedTuple):
     backdrop: Array  # (3,)
     limits: Array  # (MAX_QUERIES, 2) values drawn as 0 and as 1
     tints: Array  # (MAX_QUERIES, 3)
-    table: Array  # (NODES, 3) the colour map, for heat in OKLab, as are the tints then
+    table: Array  # (NODES, 3) the colour map; for heat, table and tints are in OKLab
 
 
 def compose(channels: Channels, picture: PictureConfig, ranges: displays.Ranges = ()) -> Array:
     """Return (H, W, 3) uint8 image; with `picture.transparent` (H, W, 4), its colours not premultiplied.
 
-    Where a display's further channel is absent it shows the plain colours. `ranges`: see `full_ranges`.
+    A display whose further channel is absent shows the plain colours. `ranges`: see `full_ranges`.
     """
     image = compose_upwards(channels, picture, ranges)[::-1]
     return np.ascontiguousarray(image if picture.transparent else image[..., :3])
@@ -67,7 +67,7 @@ def compose_upwards(channels: Channels, picture: PictureConfig, ranges: displays
     height, width = channels.alpha.shape
     image = np.empty((height, width, 4), np.uint8)
     shared_workers().run(_rows, height, image, planes, style)
-    # In passes of their own: they ask for other pixels, and would keep the one above from its speed.
+    # Separate passes: they read neighbouring pixels, which would slow the pass above down.
     if hot:
         mark = np.float32(displays.HEAT_EDGE), style.gate, np.ones(3, np.float32), np.float32(0)
         shared_workers().run(_mark, height, image, planes[2], planes[1], mark)
@@ -112,7 +112,7 @@ def _shade(shown: Array, base: Array) -> None:
 def _query_of(mean: Array, y: int, x: int, least: Any) -> int:
     """Return the query that a pixel shows.
 
-    Of those with at least so much one after another, in stripes; else the one with the most.
+    Queries with at least `least` alternate in stripes; else it is the query of largest magnitude.
     """
     count = found = 0
     for j in range(len(mean)):
@@ -209,7 +209,7 @@ def _inside(layer: Array, alphas: Array, y: int, x: int, slot: int, least: Any, 
 
 @helper
 def _on_edge(layer: Array, alphas: Array, y: int, x: int, least: Any, gate: Any) -> bool:
-    """Return True for a pixel where some component is at least so much, near one where it is not."""
+    """Return True for a pixel where some component is at least `least`, near one where it is not."""
     for slot in range(layer.shape[2]):
         if not _inside(layer, alphas, y, x, slot, least, gate):
             continue
@@ -229,7 +229,7 @@ def _on_edge(layer: Array, alphas: Array, y: int, x: int, least: Any, gate: Any)
 def _mark(
     first: int, last: int, image: Array, layer: Array, alphas: Array, mark: tuple[Any, Any, Array, Any]
 ) -> None:
-    """Tint in rows [first, last) what a layer (H, W, C) has at least so much of, and outline it."""
+    """Tint and outline, in rows [first, last), the pixels where a layer (H, W, C) is at least mark[0]."""
     least, gate, colour, opacity = mark
     height, width = alphas.shape
     for y in range(first, last):

@@ -110,21 +110,21 @@ class Subject:
     count: int  # Gaussians
     language: LanguageField | None = None
     answers: Answers = ()
-    level: int | None = None  # index into scene.LEVELS; None: the own level of each answer
+    level: int | None = None  # index into scene.LEVELS; None: each answer's own level
     heat: HeatOf = "smooth"
 
 
 def painted(answers: Answers) -> list[int]:
-    """Slots that paint anything: an answer "not here" does not."""
+    """Return the slots that are drawn: those of answers other than "not here"."""
     return [slot for slot, answer in enumerate(answers) if answer is not None and STRENGTH[answer.verdict]]
 
 
 def heats(subject: Subject) -> Array | None:
     """Return (N, Q) float32 heat per Gaussian and slot; None where no slot paints anything.
 
-    One number, as every channel costs time, says where an answer is and how hot: from `HEAT_BASE` to 1, over
-    the answer's own range, for its members, and 0 for all others. "everywhere", and of a level that is asked
-    for, it is minus the relevancy of every Gaussian: below 0 nothing ends in a line.
+    Heat says in one number, as every channel costs time, where an answer is and how hot: from `HEAT_BASE` to
+    1, over the answer's own range, for its members, and 0 for all others. For "everywhere", and for a chosen
+    level, it is minus the relevancy of every Gaussian: negative values are not outlined.
     """
 
     def heat(one: Answer) -> Array:
@@ -157,7 +157,7 @@ def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | 
 def heat_ranges(
     answers: Answers, scale: tuple[float, float] | None = None, everywhere: bool = False
 ) -> Ranges:
-    """Values of `heats` at heat 0 and 1 of each slot, by `scale` in relevancies or its own."""
+    """Return the values of `heats` at heat 0 and 1 of each slot, by `scale`, in relevancies, or its own."""
 
     def ends(answer: Answer) -> tuple[float, float]:
         (low, high), own = answer.heat_range, scale or answer.heat_range
@@ -197,9 +197,9 @@ def latents(subject: Subject) -> Array | None:
 def latent_colours(field: LanguageField) -> Array:
     """Return (3, N, 3) float32 colours in [0, 1] of latents at each level; grey where nothing was seen.
 
-    Made once for each field.
+    The colours are cached for each field.
 
-    A codeword has its own. Latents of 3 numbers are colours by themselves, others have their first three
+    Codewords have their own. Latents of 3 numbers are colours themselves, others have their first three
     principal axes over all levels together (one basis for the scene, so that colours agree between views
     and levels); each axis is stretched between its 2 % and 98 % quantiles.
     """
@@ -210,8 +210,8 @@ def latent_colours(field: LanguageField) -> Array:
     return _LATENT[field]
 
 
-GOLDEN = 0.6180339887  # steps of so much around the circle of hues keep neighbours in number apart
-UNLIKE = 0.35, 0.6, 0.85  # brightnesses that nodes of one hue are told apart by
+GOLDEN = 0.6180339887  # step of hue, in turns, between consecutive nodes: it keeps their colours apart
+UNLIKE = 0.35, 0.6, 0.85  # brightnesses, which tell nodes of one hue apart
 
 
 def nodes(subject: Subject) -> Array | None:
@@ -236,7 +236,7 @@ STRIPE_PX = 6  # width of the stripes where several answers are, pixels
 SEGMENT_OPACITY = 0.6
 SELECTED = (1.0, 0.15, 0.85)  # unlike the colours of queries and of heat, and rare in photographs
 SELECTED_OPACITY = 0.5  # the rest is what is shown, so that shapes and heat stay readable
-LEAST_ALPHA = 1 / 255  # that colours are divided by; what is less is not seen in an image of bytes
+LEAST_ALPHA = 1 / 255  # least alpha that colours are divided by; less is invisible in an image of bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +272,7 @@ _GLSL = {
 
 
 def gated_mean(total: Array, alpha: Array, gate: float) -> Array:
-    """Weighted sums (H, W, Q) / alpha where alpha exceeds `gate`, else 0: nothing there means nothing."""
+    """Return (H, W, Q) means, weighted sums / alpha, where alpha exceeds `gate`, else 0."""
     return np.asarray(total / np.where(alpha > gate, alpha, np.float32(np.inf))[..., None])
 
 
@@ -317,13 +317,13 @@ DISPLAYS: Mapping[Display, DisplayRow] = MappingProxyType({row.name: row for row
 
 
 def drawing_of(display: Display, has_channel: bool) -> Drawing:
-    """Drawing of a display; plain colours where it needs a further channel that is not there."""
+    """Return the drawing of a display: plain colours if the further channel that it needs is missing."""
     row = DISPLAYS[display]
     return row.drawing if has_channel or row.channel is None else Drawing.COLOURS
 
 
 def shader_defines() -> dict[str, int | float | str]:
-    """Constants that the shader shares with this module, and all drawings as one expression."""
+    """Return constants that the shader shares with this module, and all drawings as one expression."""
     shown = "".join(f"display == {drawing.value} ? ({glsl}) : " for drawing, glsl in _GLSL.items())
     return {
         "HEAT_FADE": HEAT_FADE,

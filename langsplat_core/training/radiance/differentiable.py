@@ -120,12 +120,12 @@ class CudaRenderer:
 
 
 def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor], camera: Camera) -> Array:
-    """Return the (GRID, GRID) mean depths of what a camera sees of the `values`, NaN where little is."""
+    """Return (GRID, GRID) mean depths of Gaussians `values` in a view, world units; NaN if alpha <= 0.5."""
     small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
     means = values["means"].detach().double()
     *forward, offset = camera.world_to_camera[2].tolist()
     z = (means @ means.new_tensor(forward) + offset).clamp(min=0).float()
-    length = near_power(max(float(z.median()), 1e-30))  # of a unit in which colours keep depths' digits
+    length = near_power(max(float(z.median()), 1e-30))  # unit of depth in which colours keep its digits
     grey = ((z / length - 0.5) / C0)[:, None, None].repeat(1, 1, 3)
     with torch.no_grad():
         rendered = renderer.render({**values, "sh_dc": grey}, small, 0)
@@ -163,8 +163,8 @@ def evaluate_views(
 ) -> list[ViewScore]:
     """Draw the views at `indices` and score them against the photographs; colours are clamped to [0, 1].
 
-    small: the same views read at 320 px, which images are compared with too, shrunk. A photograph that is
-    shrunk twice differs from one that was read at that size, by as much as good images do. near: the near
+    small: the same views read at 320 px, with which shrunk images are compared too: a photograph that is
+    shrunk twice differs from one that was read at that size by as much as good images do. near: the near
     plane, world units; None: that of what the cameras see.
     """
     renderer = renderer_for(backend, replace(INRIA, near=near or near_plane(gaussians, capture.cameras)))
@@ -195,7 +195,7 @@ def evaluate_views(
 
 
 def _psnr_exposed(image: Tensor, target: Tensor, counted: Tensor) -> float | None:
-    """PSNR of an image whose halves' exposures fit one another's best; None where a half is masked."""
+    """Return the PSNR with each half's exposure fitted on the other half; None where a half is masked."""
     left = counted & (torch.arange(image.shape[1], device=counted.device) < image.shape[1] // 2)
     right = counted & ~left
     if not (left.any() and right.any()):
@@ -208,7 +208,7 @@ def _psnr_exposed(image: Tensor, target: Tensor, counted: Tensor) -> float | Non
 
 
 def _psnr_small(camera: Camera, image: Tensor, small: Capture, number: int) -> float | None:
-    """PSNR of an image shrunk to the size of a photograph; None where nothing of that counts."""
+    """Return the PSNR of an image shrunk to a small photograph's size; None if no pixel of that counts."""
     photograph, mask = small.images[number], small.mask(number)
     shown = (255 * image).round().byte().cpu().numpy()
     _, shrunk, _ = shrunk_view(camera, shown, None, (photograph.shape[1], photograph.shape[0]))

@@ -1,4 +1,4 @@
-"""Images against photographs: losses in torch and as compiled CPU kernels, exposures, and transients.
+"""Comparison of images with photographs: losses (torch and compiled kernels), exposures, transients.
 
 The losses are L1 and structural similarity (Wang et al. 2004). Images are (H, W, C) float32 with values about
 [0, 1]. The SSIM window is the usual Gaussian of 11x11 pixels with sigma 1.5; outside the image it sees zeros,
@@ -141,7 +141,7 @@ def _gather_gradient(
 
 
 def _loss_and_gradient(image: Array, target: Array, lambda_dssim: float) -> tuple[float, Array]:
-    """Loss of (H, W, C) contiguous float32 images, and its (H, W, C) gradient by `image`."""
+    """Return the loss of (H, W, C) contiguous float32 images, and its (H, W, C) gradient by `image`."""
     height, width, channels = image.shape
     n = width * channels
     x, y = image.reshape(height, n), target.reshape(height, n)
@@ -238,7 +238,7 @@ def fit_exposure(pairs: Sequence[tuple[Tensor, Tensor]], ridge: float = 0.1) -> 
     """Return the (4, 3) affine change of colours that best takes images to their targets (least squares).
 
     (r, g, b, 1) @ change are the new colours. pairs: (..., 3) images and targets, at least one pair. ridge:
-    a share of the mean square of colours, by which the change is pulled to none.
+    weight, over the mean square of colours, that pulls the change towards the identity.
     """
     device = pairs[0][0].device
     moments = torch.zeros((4, 4), dtype=torch.float64, device=device)
@@ -288,7 +288,7 @@ SAME_SURFACE = 0.1  # of the depth, within which two views see the same surface
 
 @dataclass
 class Transients:
-    """Observations of V training views when they were last rendered. The first rows of arrays are views."""
+    """Observations of V training views when they were last rendered; the first axis of arrays is the view."""
 
     differences: Array  # (V, GRID, GRID, 3) float32 mean colours, render less photograph; NaN: not known
     depths: Array  # (V, GRID, GRID) float32 world units along the camera's z; NaN where nothing is rendered
@@ -340,8 +340,8 @@ def colour_difference(rendered: Array, photographed: Array) -> Array:
 def count_agreeing(index: int, cameras: Sequence[Camera], depths: Array, alike: Array) -> Array:
     """Return (2, GRID, GRID) numbers of other views for each patch of view `index`.
 
-    Of those that see the surface where view `index` renders it, and find it `alike` (V, GRID, GRID), and of
-    all that see it.
+    First of those that see the surface where view `index` renders it and find it `alike` (V, GRID, GRID),
+    then of all that see it.
     """
     grids = [camera.resized(GRID, GRID) for camera in cameras]  # a pixel for each patch
     points = grids[index].unproject(grids[index].pixel_centres(), depths[index]).reshape(-1, 3)
@@ -359,10 +359,10 @@ def count_agreeing(index: int, cameras: Sequence[Camera], depths: Array, alike: 
 
 
 def connected_patches(contradicts: Array, sizes: Array, sure: float) -> Array:
-    """Return the (GRID, GRID) bool patches that `contradicts` in connected pieces, and those around them.
+    """Return (GRID, GRID) bool: connected pieces of the patches `contradicts`, and the patches around.
 
-    Pieces have four patches at least, one of them of a size above `sure`. Of more than `MOST` of all patches
-    those remain that differ most.
+    Pieces have four patches at least, one of them with a size above `sure`. If they are more than `MOST` of
+    all patches, those that differ most remain.
     """
     pieces, _ = label(contradicts)
     numbers, counts = np.unique(pieces[contradicts], return_counts=True)

@@ -95,15 +95,15 @@ class TrainingState:
     values: dict[str, Tensor]  # raw parameters, see `parameters_of`
     first: dict[str, Tensor]  # Adam's first moments, shaped like the values
     second: dict[str, Tensor]  # Adam's second moments
-    finished: dict[str, Tensor]  # values of the members of an ensemble that were trained before
+    finished: dict[str, Tensor]  # values of the ensemble's members that are trained already
     grad_sum: Tensor  # (N,) norms of the gradients by the projected means, NDC, summed over `seen` views
-    seen: Tensor  # (N,) float32: in how many steps since the last round the Gaussian was visible
+    seen: Tensor  # (N,) float32 number of steps since the last densification that showed the Gaussian
     exposures: Tensor  # (V, 4, 3) affine changes of colours, of the training views, or none
-    transients: Transients  # of the training views; of none where nothing may move
+    transients: Transients  # of the training views; of none when off
     rng: np.random.Generator
     updates: dict[str, int]  # how often Adam has updated each parameter
     step: int = 0  # steps done
-    member: int = 0  # how many those are
+    member: int = 0  # number of trainings before this one
     queue: list[int] = field(default_factory=list)  # views still to come in this pass over the photographs
 
     def __len__(self) -> int:
@@ -143,14 +143,14 @@ def members(state: TrainingState) -> dict[str, Tensor]:
 
 
 def merged(state: TrainingState) -> Gaussians:
-    """Return the Gaussians of all members, of opacities divided by their number."""
+    """Return the Gaussians of all members, their opacities divided by the number of members."""
     values = members(state)
     values["opacity_logits"] = torch.logit(values["opacity_logits"].sigmoid() / (state.member + 1), 1e-6)
     return replace(state, values=values).gaussians()
 
 
 def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | None = None) -> None:
-    """Keep the Gaussians `keep` with moments, append `added` with zero ones, begin statistics afresh."""
+    """Keep rows `keep` with their moments, append `added` with zero moments, and reset the statistics."""
     for name in PARAMETERS:
         old = state.values[name].detach()
         new = old.new_empty((0, *old.shape[1:])) if added is None else added[name]
@@ -198,7 +198,7 @@ FEWEST_GAUSSIANS = 64  # pruning never leaves fewer; the most opaque ones stay
 
 
 def accumulate(state: TrainingState, means_px_grad: Tensor, visible: Tensor, size: tuple[int, int]) -> None:
-    """Add a step: (N, 2) gradients per pixel of means, (N,) bool `visible`, image size (width, height)."""
+    """Add a step's statistics: (N, 2) gradients by means, 1/px, (N,) bool `visible`, image `size`, px."""
     to_ndc = means_px_grad.new_tensor([0.5 * size[0], 0.5 * size[1]])
     x, y = (torch.nan_to_num(means_px_grad, 0.0, 0.0, 0.0) * to_ndc).unbind(1)
     state.grad_sum += torch.hypot(x, y) * visible
@@ -233,7 +233,7 @@ def densify(state: TrainingState, config: RadianceConfig, extent: float, prune_l
 
 
 def _children(values: dict[str, Tensor], splits: Tensor, state: TrainingState) -> dict[str, Tensor]:
-    """Two children per split Gaussian: means drawn from the parent itself, scales divided by 1.6."""
+    """Return two children per split Gaussian: means drawn from the parent, scales divided by 1.6."""
     parents = {name: value[splits].repeat_interleave(2, dim=0) for name, value in values.items()}
     draws = state.rng.standard_normal((len(parents["means"]), 3), dtype="float32")
     offsets = torch.from_numpy(draws).to(state.device) * parents["log_scales"].exp()

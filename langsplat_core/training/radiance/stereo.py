@@ -2,7 +2,7 @@
 
 Structure from motion finds some hundred points in nine photographs. Training then overfits what lies between
 them: each photograph gets Gaussians of its own, anywhere along its rays. Depths are the remedy: Gaussians
-begin at the surfaces, and none stay before one.
+begin at the surfaces, and those in free space before a surface are removed.
 
 A view is compared with each neighbour as that would look if the scene were a plane parallel to the view. Of
 all planes, uniform in inverse depth, a pixel takes the one at which windows correlate best. A depth is kept
@@ -24,14 +24,14 @@ from langsplat_core.scene import Camera
 STAGE = "finding depths"
 PLANES = 96
 RADIUS = 3  # px, of the windows that are compared
-BEST = 2  # scores of neighbours that count: others may see something before a pixel
-NEAR_QUANTILE = 0.02  # of depths, which passes for the nearest
-BEFORE = 0.05  # of the depth, from which on something lies before a surface
-ALIKE = 0.03  # of the depth, up to which another pixel shares it
-LEAST_ALIKE = 0.4  # of the pixels of a window, that share a depth which frees space
-AROUND = 1 / 16  # of the image's longer side: how far from a pixel a depth tells of its surface ...
-NEARER = 0.15  # ... which is nearer than all those by this share of them at most
-NEARER_THAN_ALL = 0.5  # the same where there are none around, against the nearest of the image
+BEST = 2  # neighbours whose scores count, the best ones: others may see something before a pixel
+NEAR_QUANTILE = 0.02  # quantile of depths that counts as the nearest
+BEFORE = 0.05  # share of a depth by which something nearer lies before the surface
+ALIKE = 0.03  # share of a depth by which another pixel's may differ to be shared
+LEAST_ALIKE = 0.4  # least share of a window's pixels that share a depth which frees space
+AROUND = 1 / 16  # radius, over the image's longer side, in which known depths bound that of a pixel
+NEARER = 0.15  # share by which the pixel's surface is nearer, at most, than all of these
+NEARER_THAN_ALL = 0.5  # the same against the nearest depth of the image, where none is around
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class DepthMap:
 
 
 def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = silent) -> list[DepthMap]:
-    """Find depths that another photograph confirms, at 320 px, but masked ones and without neighbours."""
+    """Return depths at 320 px of unmasked pixels that another photograph confirms; views need neighbours."""
     small = capture.shrunk(indices, 320)
     masks = [np.True_ if (mask := small.mask(index)) is None else mask for index in range(len(small))]
     # Windows reach into what is masked: it is the same in all photographs.
@@ -145,7 +145,7 @@ def plane_scores(camera: Camera, grey: Array, others: Sequence[tuple[Camera, Arr
 
 
 def window_moments(grey: Array) -> Array:
-    """Return the (3, H, W) float32 means, variances and 1 / pixels of windows, the image's part of them."""
+    """Return the (3, H, W) float32 means, variances and 1 / pixel counts of windows, cut at the border."""
     size = 2 * RADIUS + 1
     parts = np.ones(grey.shape), grey.astype(np.float64), grey.astype(np.float64) ** 2
     share, mean, squares = (uniform_filter(part, size, mode="constant") for part in parts)
@@ -210,8 +210,8 @@ def _sum_along(grey: Array, warped: Array, padded: Array, along: Array, row: int
 def _warp_row(other: Array, p: Array, d: Array, places: Array, ways: Array, warped: Array) -> None:
     """Fill `warped` with a row of the other image, bilinear; -1 outside of it.
 
-    p, d: (3,) float32 homogeneous pixel that the row's first one falls on, and its step; places, ways: room
-    for (W,) int32 pixels and for the (2, W) ways to the next ones, found without a branch.
+    p, d: (3,) float32 homogeneous pixel that the row's first one falls on, and its step; places, ways:
+    buffers for (W,) int32 pixels and for the (2, W) ways to the next ones, found without a branch.
     """
     width, flat = other.shape[1], other.reshape(-1)
     none, half, one = np.float32(0), np.float32(0.5), np.float32(1)
@@ -237,7 +237,7 @@ def _warp_row(other: Array, p: Array, d: Array, places: Array, ways: Array, warp
 
 @helper
 def _keep_best(own: Array, along: Array, row: int, warped: Array, best: Array, second: Array) -> None:
-    """Zero-mean normalised cross-correlation of a row's windows; what is flat correlates with nothing."""
+    """Keep the two best zero-mean normalised cross-correlations of a row's windows; flat ones score 0."""
     flat, none = np.float32(1e-5), np.float32(0)  # added to variances, of grey values in [0, 1]
     for x in range(best.shape[0]):
         total, squares, products = along[0, row, x], along[1, row, x], along[2, row, x]
@@ -288,7 +288,7 @@ def _confirmed(one: DepthMap, others: Sequence[DepthMap]) -> Array:
 def shared_depths(depth: Array) -> Array:
     """Return the (H, W) depths, NaN where too few pixels around share one.
 
-    What two views agree on by chance is alone, and would free a window of space behind the surface.
+    A depth that two views share by chance stands alone, and would free a window of space behind the surface.
     """
     alike = np.empty(depth.shape, np.int32)
     shared_workers().run(_count_alike, len(depth), depth, alike)
@@ -310,8 +310,8 @@ def _count_alike(first: int, last: int, depth: Array, alike: Array) -> None:
 def free_depths(camera: Camera, depth: Array, known: Array) -> Array:
     """Return the (H, W) depths up to which space is free.
 
-    By the surfaces of the (H, W) `depth`, NaN where it is not known, and by the (N, 3) `known` points. What
-    no other photograph confirms is mostly flat: it is not much nearer than the surfaces around it.
+    They follow from the (H, W) `depth` of surfaces, NaN where unknown, and from the (N, 3) `known` points. A
+    surface that no other photograph confirms is mostly flat: not much nearer than the surfaces around it.
     """
     told = np.where(np.isfinite(depth), depth, np.inf)
     _, pixels, depths = _in_view(camera, known)
@@ -326,7 +326,7 @@ def free_depths(camera: Camera, depth: Array, known: Array) -> Array:
 
 
 def in_free_space(points: Array, maps: Sequence[DepthMap]) -> Array:
-    """Return (N,) bool: the points that lie in the free space of more views than at their surfaces."""
+    """Return (N,) bool: points that lie in free space in more views than they lie at a surface in."""
     balance = np.zeros(len(points), int)
     for one in maps:
         there, pixels, depths = _in_view(one.camera, points)
@@ -336,7 +336,7 @@ def in_free_space(points: Array, maps: Sequence[DepthMap]) -> Array:
 
 
 def _in_view(camera: Camera, points: Array) -> tuple[Array, tuple[Array, Array], Array]:
-    """Numbers of the (N, 3) points that lie in the image, their (rows, columns) and their depths."""
+    """Return the numbers of the (N, 3) points in the image, their (rows, columns) and their depths."""
     pixels, depths = camera.project(points)
     there = np.flatnonzero(camera.in_image(pixels, depths))
     columns, rows = pixels[there].astype(int).T

@@ -44,12 +44,12 @@ class Schedule:
     """
 
     steps: int  # in all
-    joint_from: int  # after this step none are removed, and an ensemble's members are trained together
+    joint_from: int  # after this step free space is not cleared, and an ensemble's members train together
     densify_from: int  # densification rounds come after this step ...
     densify_until: int  # ... and before this one
     densify_every: int
     reset_every: int  # opacity resets, before `densify_until` only; 0: none
-    transients_from: int  # from this step on they do not count: a fifth of the run has to show what is
+    transients_from: int  # from this step on transients do not count: a fifth of the run has to find them
     sh_degree: int
     sh_degree_every: int
     coarse_until: int  # up to this step images have half their size
@@ -62,7 +62,7 @@ class Schedule:
         return self.densify_from < step < self.densify_until and step % self.densify_every == 0
 
     def work(self, step: int) -> float:
-        """Return the share of the work up to a step: one on a whole image takes as long as two on halves."""
+        """Return the share of the work up to a step; a step on a whole image counts as two on a half."""
         done, whole = (count + max(count - self.coarse_until, 0) for count in (step, self.steps))
         return done / whole
 
@@ -97,7 +97,7 @@ def schedule_for(config: RadianceConfig, extent: float) -> Schedule:
         # Positions and opacities say nothing before, but a short run spends no more than a quarter on that.
         densify_from=scaled(config.densify_from, min(150, steps // 4)),
         densify_until=scaled(config.densify_until),
-        # So many steps that gradients are means, and so few that there are some rounds.
+        # Enough steps that gradients are means, and few enough that there are some rounds.
         densify_every=scaled(config.densify_every, max(20, min(50, steps // 24))),
         # An opacity needs 600 steps to come back from 0.01.
         reset_every=config.opacity_reset_every and scaled(config.opacity_reset_every, 600),
@@ -128,9 +128,9 @@ def train_radiance(
     progress: Progress = silent,
     held_out: Sequence[int] = (),
 ) -> Gaussians:
-    """Fit Gaussians to the photographs at `train_indices`; return those that can be seen.
+    """Fit Gaussians to the photographs at `train_indices`; return the visible ones.
 
-    `progress` hears the mean PSNR of up to `JUDGED` of those at `held_out`. With a `checkpoint` path the run
+    `progress` gets the mean PSNR of up to `JUDGED` views at `held_out`. With a `checkpoint` path the run
     continues from that file if it exists, and writes it every `config.checkpoint_every` steps, at the end,
     and when it is interrupted (Ctrl-C, or an error of `progress`). Raises InputError when a setting is out of
     its range, there is nothing to train on or the checkpoint belongs to another run, BackendError when the
@@ -142,8 +142,8 @@ def train_radiance(
     made_from = training.fingerprint(capture, config, train_indices) if checkpoint else ""
     depths: list[DepthMap] = []
     if len(train_indices) <= config.few_views:
-        # After a reset, what stands close before each of few cameras comes back first. A decay of opacities
-        # takes what no photograph needs instead.
+        # After a reset, Gaussians close before each of few cameras come back first. A decay of opacities
+        # removes what no photograph needs instead.
         config = replace(config, opacity_reset_every=0, opacity_decay=max(config.opacity_decay, 0.01))
         depths = find_depths(capture, train_indices, progress)
     members = config.ensemble if config.ensemble > 1 else 0
@@ -163,7 +163,7 @@ def train_radiance(
         state = training.start(first, config.seed, renderer.device)
         state.transients = losses.no_transients(0 if config.transients == "off" else len(views))
 
-    recent: list[float] = []  # since the last mean
+    recent: list[float] = []  # losses since the last mean
     metrics: dict[str, float] = {}
     signals: list[int] = []  # held back while a step runs: half a step is no state to resume from
     with one_torch_thread(), handled(lambda number, _: signals.append(number)):
@@ -171,7 +171,7 @@ def train_radiance(
             while state.step < config.steps or state.member < config.ensemble:
                 state = run.current(state, capture, train_indices)
                 recent.append(run.step(state))
-                # Every photograph has another loss: what is told is the mean over each 200th of the run.
+                # Photographs differ in their loss: progress gets the mean over each 200th of the run.
                 if state.step * 200 // config.steps > (state.step - 1) * 200 // config.steps:
                     metrics, recent = metrics | {"loss": float(np.mean(recent))}, []
                 metrics = metrics | run.held_out(state, capture)
@@ -189,7 +189,7 @@ def train_radiance(
 
 
 class _Views:
-    """Photographs and cameras of training views, whole and halved, on a GPU copied, else as they are.
+    """Photographs and cameras of training views, whole and halved; on a GPU, copied to its memory.
 
     Halved images are drawn with the whole ones' focal lengths, so that both fit the same Gaussians.
     """
@@ -234,16 +234,16 @@ class _Run:
     judged: Sequence[int]  # views of the capture, held out
     renderer: differentiable.DifferentiableRenderer
     extent: float  # world units
-    depths: Sequence[DepthMap]  # of surfaces that Gaussians do not stay before; none for many views
+    depths: Sequence[DepthMap]  # before whose surfaces Gaussians are removed; none for many views
 
     def work(self, state: TrainingState) -> float:
-        """Return the share of the work that is done; a step on all members counts as one on one of them."""
+        """Return the share of the work that is done; a joint step on all members counts as a step on one."""
         members, before = self.config.ensemble, self.schedule.work(self.schedule.joint_from)
         done = state.member + self.schedule.work(state.step)
         return (done - before * (state.member == members)) / (members + 1 - before) if members else done
 
     def current(self, state: TrainingState, capture: Capture, indices: Sequence[int]) -> TrainingState:
-        """Return the state, or that before the next training's first step if this one's are done."""
+        """Return `state` or, if its training is finished, the initial state of the next training."""
         if state.step < self.config.steps:
             return state
         member = state.member + 1
@@ -259,7 +259,7 @@ class _Run:
         return after
 
     def step(self, state: TrainingState) -> float:
-        """Update the Gaussians by one photograph; return the loss before."""
+        """Update the Gaussians by one photograph; return the loss before the update."""
         config, schedule, step = self.config, self.schedule, state.step + 1
         if not state.queue:
             state.queue = [int(index) for index in state.rng.permutation(len(self.views))]
@@ -274,10 +274,10 @@ class _Run:
         if len(state.exposures):
             image = losses.with_exposure(image, state.exposures[index])
         self.observe_transients(state, index, image, target, mask)
-        # Where a view shows nothing black Gaussians would look as empty as none.
+        # In empty background, black Gaussians would look like none: alpha counts there.
         loss = rendered.alpha.masked_fill(mask, 0).mean() if self.views.cut_out and mask is not None else 0.0
         mask = self.counted(state, index, None if self.views.cut_out else mask, camera)
-        if mask is not None:  # what is masked differs from nothing, and nothing flows back from it
+        if mask is not None:  # masked pixels are their own target, without a gradient
             image = torch.where(mask[..., None], image, image.detach())
             target = torch.where(mask[..., None], target, image.detach())
         loss = loss + losses.radiance_loss(image, target, config.lambda_dssim)
@@ -290,7 +290,7 @@ class _Run:
         training.adam_step(state, schedule.learning_rates(step))
         if schedule.densifies(step):
             training.densify(state, config, self.extent, prune_large=0 < schedule.reset_every < step)
-        clears = schedule.densify_from < step <= schedule.joint_from  # the last steps mend that
+        clears = schedule.densify_from < step <= schedule.joint_from  # the last steps fill the gaps
         if self.depths and clears and step % schedule.densify_every == 0:
             means = state.values["means"].detach().cpu().numpy()
             keep = np.flatnonzero(~in_free_space(means, self.depths))
@@ -332,8 +332,8 @@ class _Run:
         judged = state.step == self.schedule.transients_from and self.config.transients == "auto"
         if judged and state.transients.explained() < 0.24:
             state.transients = losses.no_transients(0)
-        every = max(self.config.steps // (64 * len(self.views)), 1)  # passes: long runs look less often
-        # Of older observations a sixteenth would be left: each new one counts as much as all before.
+        every = max(self.config.steps // (64 * len(self.views)), 1)  # in passes: long runs look less often
+        # Each observation counts as much as all before: a sixteenth of older ones would be left.
         since = self.schedule.transients_from - 4 * every * len(self.views)
         looks = state.step >= since and state.step // len(self.views) % every == 0
         if len(state.transients.moving) and looks:
@@ -357,7 +357,7 @@ class _Run:
 def _first_gaussians(
     capture: Capture, indices: Sequence[int], depths: Sequence[DepthMap], config: RadianceConfig
 ) -> Gaussians:
-    """Return what a training begins with: at the capture's points, and at depths while splitting has room."""
+    """Return the initial Gaussians: at the capture's points and at a sample of the points of depth maps."""
     found = [(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)), *(one.points() for one in depths)]
     points, colours = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     chosen = np.random.default_rng(config.seed).permutation(len(points))
@@ -377,7 +377,7 @@ MEMBERS = 2  # ... but of another training, merged with it: an ensemble (Lakshmi
 
 
 def supported(config: RadianceConfig, views: int) -> RadianceConfig:
-    """Return the settings of a training on so many views: as asked for, or what few of them support."""
+    """Return the settings of a training on so many views: `config`, or what few views support."""
     if views > config.capped_views or config.steps < GOOD["steps"]:
         return config
     most = {**GOOD, "steps": max(VISITS * views, QUICK["steps"])}
