@@ -1,6 +1,6 @@
 """The image of the scene as textures, drawn again only when its render request has changed.
 
-Needs a GL context but no window. It is in one of three phases:
+The canvas needs a GL context but no window. It is in one of three phases:
 
 - "moving": the camera moved a moment ago. On a slow machine the image has fewer pixels, and of a large scene
   merged Gaussians.
@@ -30,7 +30,7 @@ from langsplat_viewer.rendering.renderer import Layers, Renderer
 from langsplat_viewer.rendering.request import UNCLIPPED, RenderRequest, why_nothing, why_undrawable
 from langsplat_viewer.state import FrameStats, ViewerState
 
-REST_SECONDS = 0.07  # without a move, after which the camera rests
+REST_SECONDS = 0.07  # without a move, after which the camera counts as resting
 MOVING_BUDGET = 25.0  # milliseconds of an image: with the panels, some thirty a second
 THUMBNAIL = (480, 300)  # pixels
 KEPT_SIZES = 3  # of images: the full one and two coarse ones
@@ -70,7 +70,7 @@ class Canvas:
         self.phase: Literal["moving", "settling", "still"] = "still"
         self._pose: tuple[object, object] = (None, None)  # the view, and what a gizmo does
         self._moved = -1e9  # when that last changed, seconds
-        self._wanted: tuple[RenderRequest, Detail] | None = None  # what was drawn last, if only in vain
+        self._wanted: tuple[RenderRequest, Detail] | None = None  # what was drawn last, or failed to be
         self._drawn: RenderRequest | None = None  # the same at its level of detail
         self._unsure = False  # whether the image shows anything is not known yet
         # One for each pane; RGBA8, first row at the bottom, as GL has it.
@@ -101,13 +101,13 @@ class Canvas:
         self.phase = "moving" if moving else "still" if is_full else "settling"
         if self.phase == "still":
             self._background.drop()
-            if self._unsure and self._drawn is not None:  # asked once: it reads the image back
+            if self._unsure and self._drawn is not None:  # tested once: the test reads the image back
                 self._unsure = False
                 state.nothing = _why_nothing(self._drawn) if self._renderer.shows_nothing() else ""
         return self.phase != "still"
 
     def _follow(self, state: ViewerState, request: RenderRequest) -> None:
-        """Draw the image of a camera that moves, at the level of detail that keeps up with it."""
+        """Draw the image of a moving camera, at the finest level of detail within the budget."""
         if not state.preferences.coarse_while_moving:
             if self._wanted != (request, FULL):
                 self._draw(state, request)
@@ -173,7 +173,7 @@ class Canvas:
         before = self._drawn
         if before is not None and before.scene.source is not request.scene.source:
             self._merger.drop()  # of another scene
-        self._wanted, self._drawn = (request, detail), drawn  # also where it fails: it is not tried again
+        self._wanted, self._drawn = (request, detail), drawn  # also if it fails: then it is not tried again
         size = drawn.camera.width, drawn.camera.height
         textures = self._targets(*size, len(drawn.panes))
         began = self._clock()
@@ -201,7 +201,7 @@ class Canvas:
             self._kept[key] = texture
         return tuple(self._kept[key] for key in found)
 
-    # What others see of it.
+    # Reading the image.
 
     def point_at(self, u: float, v: float) -> Array | None:
         """Return the (3,) world point of the surface at a place in the image, fractions from the top left."""
@@ -244,7 +244,7 @@ class Canvas:
         return self._background.worker.is_running or self._merger.worker.is_running
 
     def wake_with(self, wake: Callable[[], None]) -> None:
-        """Have `wake` called on another thread when `update` should be."""
+        """Have `wake` called on another thread when `update` should be called."""
         self._background.worker.wake = wake
 
     def close(self) -> None:
@@ -314,7 +314,7 @@ M = TypeVar("M")
 
 
 class Latest(Generic[M]):
-    """Makes what was wanted last on a thread of its own, and drops the results of what was wanted before."""
+    """Computes the latest request on a thread of its own, and drops the results of earlier ones."""
 
     def __init__(self) -> None:
         self.worker = Worker()
@@ -324,18 +324,18 @@ class Latest(Generic[M]):
 
     @property
     def waits(self) -> bool:
-        """True while something is wanted that has not been dropped."""
+        """True while a request is under way that has not been dropped."""
         return self._key is not None
 
     def want(self, key: object, make: Callable[[Progress], M]) -> None:
-        """Begin to `make` what has that key, unless it is under way or there."""
+        """Begin to `make` the result of a key, unless it is under way or made."""
         if key != self._key:
             self.drop()
             self._key = key
             self.worker.submit("", make, partial(setattr, self, "_made"), partial(setattr, self, "_problem"))
 
     def made(self, key: object) -> M | None:
-        """Return what has that key, if it is ready. Raises BackendError, once, where it failed."""
+        """Return the result of a key, if it is ready. Raises BackendError, once, where it failed."""
         self.worker.poll()
         problem, self._problem = self._problem, ""
         if problem:

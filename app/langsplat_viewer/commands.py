@@ -24,7 +24,7 @@ from langsplat_viewer.viewer import Viewer
 
 @dataclass(frozen=True)
 class Button:
-    """One way to look at the scene."""
+    """A button for a display, or for one level of it."""
 
     label: str  # of its button, with imgui's suffix where another has the same
     display: Display
@@ -38,7 +38,7 @@ class Button:
 
 
 def buttons_of(row: DisplayRow) -> tuple[Button, ...]:
-    """One for the display, but for each level one where it shows latents."""
+    """Return a display's buttons: one, or one for each level where it has levels."""
     if not row.by_level:
         return (Button(row.label, row.name),)
     return tuple(
@@ -75,7 +75,7 @@ class Command:
 
 
 def is_shown(state: ViewerState, button: Button) -> bool:
-    """Return whether the scene is looked at in this way."""
+    """Return whether the scene is shown in a button's display and level."""
     session = state.session
     return session.picture.display == button.display and button.latent_level in (None, session.latent_level)
 
@@ -370,7 +370,7 @@ def matching(text: str, recent: Sequence[str] = ()) -> list[Command]:
     words, commands = text.lower().split(), (*COMMANDS, *opened)
 
     def missed(command: Command) -> int:
-        """Return how many words are none of its own; one more than there are where one is unknown."""
+        """Return how many words are only among its synonyms; one more than there are if one is unknown."""
         own = command.does.lower()
         known = f"{own} {SYNONYMS.get(command.does, '')}"
         is_unknown = any(word not in known for word in words)

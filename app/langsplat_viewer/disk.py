@@ -1,4 +1,4 @@
-"""What lies around a scene on the disk: paths, files that change, a training's checkpoints."""
+"""Files around a scene: completion of paths, files that change, a training's checkpoints."""
 
 import os
 import shutil
@@ -50,12 +50,12 @@ def stamps(files: tuple[Path, ...]) -> Stamps:
 
 
 class Watch:
-    """Looks after the files of one scene."""
+    """Watches the files of one scene for changes."""
 
     def __init__(self, wake: Callable[[], None] = lambda: None) -> None:
-        """`wake` is called on another thread when `changed` has become another."""
+        """`wake` is called on another thread when `changed` has changed."""
         self.wake = wake
-        self.changed = False  # the files are others than those read, and have been still for a while
+        self.changed = False  # the files differ from those read, and have not changed for a while
         self._read: Stamps = ()  # as they were when they were read
         self._last: Stamps = ()  # as they were at the last look
         self._lock = threading.Lock()
@@ -116,7 +116,7 @@ def newest(out: Path) -> Stamps:
 
 
 def is_preview(path: Path | None) -> bool:
-    """Return True for what `write_preview` writes."""
+    """Return True for files that `write_preview` writes."""
     return path is not None and path.name == PREVIEW
 
 

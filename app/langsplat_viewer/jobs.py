@@ -21,9 +21,9 @@ _ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
 
 
 def share_one_heap() -> None:
-    """Have threads that begin after this take memory from one heap, where the C library allows it.
+    """Have threads that begin after this allocate from one heap, where the C library allows it.
 
-    With one each, all of them keep what they have freed.
+    With a heap each, all of them keep the memory that they have freed.
     """
     _in_c_library("mallopt", _ARENA_MAX, 1)
 
@@ -162,7 +162,7 @@ class Worker:
 
     @property
     def current(self) -> tuple[str, float] | None:
-        """Label and fraction of the present job, for the status line; None when idle or only winding up."""
+        """Label and fraction of the present job, for the status line; None when idle or being cancelled."""
         for job in self._jobs:
             if not job.stopped.is_set():
                 return job.reached.text or job.label, job.reached.fraction

@@ -42,7 +42,7 @@ class Marks:
         return ~self.deleted
 
     def same(self, other: "Marks") -> bool:
-        """Return whether the same are marked in both."""
+        """Return whether both mark the same Gaussians."""
         pairs = ((getattr(self, part.name), getattr(other, part.name)) for part in fields(Marks))
         return all(a is b or np.array_equal(a, b) for a, b in pairs)
 
@@ -77,7 +77,7 @@ class Stroke:
     centre: tuple[float, float, float] | None = None  # of a sphere or box: on the surface, world units
 
 
-# What a drag with a tool encloses: the Gaussians in it, and its outline. Plain maths, no window.
+# The area of a drag with a tool: the Gaussians in it, and its outline. Plain maths, no window.
 #
 # Places are fractions of the image, (0, 0) its top left corner.
 
@@ -98,7 +98,7 @@ class Drawn:
 
     @property
     def pixels(self) -> Array:
-        """(K, 2) where the mouse was."""
+        """(K, 2) positions of the mouse, pixels."""
         return np.array(self.stroke.path, np.float64) * (self.camera.width, self.camera.height)
 
     @property
@@ -142,7 +142,7 @@ def caught(drawn: Drawn, means: Array, depths: Array | None = None) -> Array:
 
 
 def outlines(drawn: Drawn) -> list[Array]:
-    """Lines (K, 2) that show what is being enclosed; of a brush the way it took."""
+    """Return the lines (K, 2) around the enclosed area; of a brush, its way."""
     first, last = drawn.stroke.path[0], drawn.stroke.path[-1]
     match drawn.tool:
         case "rectangle":
@@ -161,7 +161,7 @@ def outlines(drawn: Drawn) -> list[Array]:
 
 
 def _projected(drawn: Drawn, lines: Sequence[Array] | Array) -> list[Array]:
-    """Lines around a body of radius 1, as they are in the image; none that reaches behind the camera."""
+    """Return lines around a body of radius 1 in the image, without those that reach behind the camera."""
     camera, found = drawn.camera, []
     for line in lines:
         pixels, depths = camera.project(drawn.centre + drawn.radius * line)

@@ -40,7 +40,7 @@ MAX_SIDE = 16_384  # pixels; beyond it drivers refuse textures
 Seconds = Annotated[float, Range(0.1, 36_000.0)]
 PicturesPerSecond = Annotated[float, Range(0.1, 240.0)]
 Span = Annotated[float, Range(*SPAN_LIMITS)]
-HEADLESS = Needs("headless")  # of pictures without a window, in which it is chosen otherwise
+HEADLESS = Needs("headless")  # of pictures without a window; the window has other ways to choose
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def chosen_camera(choice: str, scene: Scene | None = None) -> Camera | None:
 
 
 def check_display(scene: Scene, display: Display, queries: tuple[str, ...]) -> None:
-    """InputError for a display or query that this scene cannot answer."""
+    """Raise InputError for a display or query that this scene cannot answer."""
     if scene.language is None and (queries or DISPLAYS[display].needs_field):
         raise InputError(f"{scene.path}: {no_field(scene)}")
     if display == "tree" and scene.language is not None and scene.language.tree is None:
@@ -188,7 +188,7 @@ def latent_level(level: LevelChoice) -> int:
 
 
 def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
-    """Have all that draws on the CPU compiled before the window first draws with it, and say so."""
+    """Compile the CPU's kernels before the window first draws with them, and report it."""
     if backend == "cpu":
         say_compiling(progress)
         few = Scene(scene.gaussians.take(np.arange(min(len(scene.gaussians), WARMING))))

@@ -48,7 +48,7 @@ NONSENSE = InputError, LookupError, TypeError, ValueError, AttributeError, Arith
 
 
 def plain(value: object) -> Any:
-    """Return a part of a session as JSON has it. What is None or infinite is left out: it is the default."""
+    """Return a part of a session as JSON. None and infinite values are left out: they are defaults."""
 
     def stated(value: Any) -> Any:
         if isinstance(value, dict):
@@ -66,7 +66,7 @@ def _encoded(value: object) -> object:
 
 
 def _converted(value: Any, kind: Any, count: int = 0) -> Any:
-    """Return JSON as a `kind`; `count` Gaussians are what its masks are of. ValueError where it is none."""
+    """Return JSON as a `kind`, whose masks are of `count` Gaussians; ValueError where it is none."""
 
     def decoded(kind: Any, value: Any) -> object:
         if kind is Bits:
@@ -216,7 +216,7 @@ class Project(msgspec.Struct, omit_defaults=True):
 
 
 def digest_of(path: Path) -> str:
-    """Return what tells the contents of files apart; "" where there is none."""
+    """Return a digest of a file's content; "" where there is no file."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
 
 

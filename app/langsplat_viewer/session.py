@@ -182,7 +182,7 @@ class Bookmark:
 
 @dataclass(frozen=True)
 class Session:
-    """State of a scene that its user set: what is undone, kept with the scene and saved in projects."""
+    """State of a scene that the user set: it is undone, kept with the scene and saved in projects."""
 
     # how it is shown
     picture: PictureConfig = field(default_factory=PictureConfig)
@@ -204,7 +204,7 @@ class Session:
     things: Things = field(default_factory=Things)
     notes: Annotated[tuple[Note, ...], Meta(max_length=MOST_NOTES)] = ()
 
-    # where one stood
+    # views
     keyframes: Annotated[tuple[Keyframe, ...], Meta(max_length=10_000)] = ()  # of the camera path, by time
     bookmarks: Annotated[tuple[Bookmark, ...], Meta(max_length=MOST_BOOKMARKS)] = ()
     ruler: Ruler = field(default_factory=Ruler)
@@ -306,7 +306,7 @@ MARKINGS = {"deleted": ("delete", "restore"), "hidden": ("hide", "show"), "selec
 
 
 def change_between(before: Session, after: Session) -> str:
-    """Return what leads from one session to the next, in words."""
+    """Return the change from one session to the next, in words."""
     for name, verbs in MARKINGS.items():
         old, new = (getattr(session.marks, name) for session in (before, after))
         if old != new:
@@ -323,7 +323,7 @@ def change_between(before: Session, after: Session) -> str:
     return next(changed, "change")
 
 
-OF_PROJECT = ("things", "notes", "bookmarks", "keyframes")  # what is lost unless a project has it
+OF_PROJECT = ("things", "notes", "bookmarks", "keyframes")  # fields that are lost unless a project holds them
 OF_WINDOW = ("picture", "latent_level", "split", "splats", "overlays", "level", "adds")  # not of a scene
 
 

@@ -66,7 +66,7 @@ class QueryAnswer:
     problem: str = ""  # why it has no result, one line
     meant: str = ""  # the phrase with its unknown words replaced by known ones, where there are such
     pending: bool = False
-    has_evidence: bool = False  # training kept what it stands on
+    has_evidence: bool = False  # training kept its evidence
     like: QueryResult | None = None  # of a name that finds what was given it: all that is like that
     _cuts: dict[float, QueryResult] = field(default_factory=dict)  # the last one that was wanted
 
@@ -251,7 +251,7 @@ class SceneState:
     _edited: EditedScene | None = None  # of the last request
 
     def visit(self) -> "SceneState":
-        """Return what is kept of a scene that is left, to be found again: no large arrays."""
+        """Return the state that is kept of a scene that is left, without large arrays."""
         files = ("saved", "project", "project_digest", "count", "origin")
         names = ("session", *files, "path", "view", "opening_camera", "camera_index")
         return SceneState(**{name: getattr(self, name) for name in names})
@@ -290,7 +290,7 @@ class ViewerState(SceneState):
     writing: Future[Any] | None = None  # what was last written, or is being written
     may_close: bool = False  # the window closes at the next frame
     pins_notes: bool = False  # a click on the scene pins one
-    pointing: bool = False  # it is said what lies under the cursor
+    pointing: bool = False  # a tooltip names the point under the cursor
 
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
@@ -319,14 +319,14 @@ class ViewerState(SceneState):
     preferences: Preferences = field(default_factory=Preferences)
 
     def begin(self, fresh: SceneState) -> None:
-        """Show another scene: all that belongs to the one before is gone."""
+        """Replace the scene's part of the state by `fresh`."""
         for part in fields(SceneState):
             setattr(self, part.name, getattr(fresh, part.name))
 
     def say(
         self, text: str, is_error: bool = False, file: Path | None = None, undoes: Session | None = None
     ) -> None:
-        """Add one line to the messages area; in place of the last one where that says the same."""
+        """Add one line to the messages area, replacing the last one if that says the same."""
         message = Message(" ".join(text.split()), is_error, file, undoes)
         kept = self.messages[:-1] if self.messages[-1:] == [message] else self.messages
         self.messages = [*kept[1 - MAX_MESSAGES :], message]

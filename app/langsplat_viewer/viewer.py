@@ -1,4 +1,4 @@
-"""The viewer without its window: state, history, what it needs from elsewhere, a training's process."""
+"""The viewer without its window: state, history, services, and processes of commands."""
 
 import os
 import signal
@@ -182,7 +182,7 @@ class History:
 
 @dataclass(eq=False)
 class Viewer:
-    """The viewer's state together with what acts on it."""
+    """The viewer's state with its worker threads, services and history."""
 
     services: Services
     state: ViewerState = field(default_factory=ViewerState)
@@ -251,7 +251,7 @@ class Viewer:
             self.run(label, lambda progress: work(engine, progress), here(done), report)
 
     def unsaved(self) -> list[SceneState]:
-        """Return the scenes, the one shown first, of which no project has all that was noted in them."""
+        """Return the scenes, the one shown first, with notes that no project holds."""
         here = None if self.state.path is None else self.state.path.absolute()
         left = (visit for path, visit in self.visits.items() if path != here)
         return [state for state in (self.state, *left) if state.has_unsaved_notes]
@@ -319,7 +319,7 @@ class Viewer:
         return path
 
     def take_results(self) -> None:
-        """Hand over what other threads have finished, which arrives nowhere else. Call once per frame."""
+        """Deliver the results of other threads; only this does. Call once per frame."""
         self.worker.poll()
         self.recorder.poll()
 

@@ -1,4 +1,4 @@
-"""The window. This alone and the panels use hello_imgui and glfw; the rest is in actions."""
+"""The window. Only this module and the panels use hello_imgui and glfw; the rest is in actions."""
 
 import math
 import os
@@ -64,7 +64,7 @@ def probe_gl() -> tuple[int, int]:
 
 
 def _fitting_scale(window_height: float) -> float:
-    """Size of letters for the first screen and the window, by their heights in window units."""
+    """Return the text size for the first screen and the window, by their heights in window units."""
     monitor = glfw.get_primary_monitor()
     mode = glfw.get_video_mode(monitor) if monitor else None
     height = mode.size.height / max(glfw.get_monitor_content_scale(monitor)[1], 1.0) if mode else 0.0
@@ -190,7 +190,7 @@ class Window:
         self.files = dialogs.FileDialogs(glfw.post_empty_event)
 
     def params(self) -> hello_imgui.RunnerParams:
-        """Everything hello_imgui wants to know. Raises BackendError where no window can be opened."""
+        """Return hello_imgui's parameters. Raises BackendError where no window can be opened."""
         major, minor = probe_gl()
         params = hello_imgui.RunnerParams()
         window = params.app_window_params
@@ -275,7 +275,7 @@ class Window:
         queries.ask(viewer, "; ".join(self._options.query))
 
     def _first_view(self, viewer: Viewer) -> None:
-        """Do what else the command line asks for, once its scene is open."""
+        """Apply what else the command line sets, such as camera and queries, once its scene is open."""
         state, options = viewer.state, self._options
         assert state.scene is not None
         try:
@@ -336,7 +336,7 @@ class Window:
                 print("asked in the window; Ctrl + C again ends at once", file=sys.stderr)
 
     def _set_idling(self) -> None:
-        """Say how soon the next frame is wanted: at once only while something moves or has just changed."""
+        """Set how soon the next frame is drawn: at once only while something moves or has just changed."""
         viewer, state = self.viewer, self.viewer.state
         idling = hello_imgui.get_runner_params().fps_idling
         news = (viewer.worker.delivered, viewer.recorder.delivered)

@@ -32,7 +32,7 @@ from langsplat_viewer.viewer import Viewer
 
 
 def mark(viewer: Viewer, marks: Marks) -> None:
-    """Take other marks, unless they mark the same."""
+    """Set the marks, as a step that can be undone, unless they mark the same."""
     if not marks.same(viewer.state.marks):
         viewer.remember()
         gone = int(marks.deleted.sum() - viewer.state.marks.deleted.sum())
@@ -42,23 +42,23 @@ def mark(viewer: Viewer, marks: Marks) -> None:
 
 
 def put_marks(viewer: Viewer, marks: Marks) -> None:
-    """Take other marks without a step of its own to undo."""
+    """Set the marks without a step of its own to undo."""
     state = viewer.state
     viewer.put(marks=state.session.marks.of(marks, state.marks))
     state.marks = marks
 
 
 def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
-    """Combine the selection with `found` (N,) bool; `mode` in place of the one that is set."""
+    """Combine the selection with `found` (N,) bool, by `mode` or, None, the mode that is set."""
     state = viewer.state
     mark(viewer, marks.combined(state.marks, found, mode or state.tools.mode))
 
 
-has_scene = methodcaller("has_scene", "select in it")  # whether there is one; it says so where there is none
+has_scene = methodcaller("has_scene", "select in it")  # whether a scene is open; reports where none is
 
 
 def has_selection(viewer: Viewer) -> bool:
-    """Return whether something is selected; say so where nothing is."""
+    """Return whether something is selected; report where nothing is."""
     some = has_scene(viewer) and bool(viewer.state.marks.selected.any())
     if not some and viewer.state.scene is not None:
         viewer.state.say("nothing is selected: choose a tool, or an answer of the search")
@@ -72,7 +72,7 @@ Action = Callable[[Viewer], None]
 
 
 def _verb(change: Callable[[Marks], Marks], needs: Callable[[Viewer], bool] = has_selection) -> Action:
-    """Return the action that changes the marks, where there is what it `needs`."""
+    """Return the action that applies `change` to the marks if `needs` holds."""
 
     def act(viewer: Viewer) -> None:
         if needs(viewer):
@@ -96,13 +96,13 @@ delete_selected = _verb(lambda marks: Marks(_nothing(marks), marks.hidden, marks
 
 
 def reach(viewer: Viewer) -> float:
-    """Return how far growing and shrinking go at a time, world units."""
+    """Return the distance that a selection grows or shrinks by at a time, world units."""
     extent = viewer.state.extent
     return viewer.state.tools.reach * (0.0 if extent is None else extent.radius)
 
 
 def _found(label: str, found: Callable[[QueryEngine, Array, float], Array], mode: Mode) -> Action:
-    """Return the action that takes what `found` makes of the selection, on the worker, within reach."""
+    """Return the action that selects what `found` returns for the selection and reach, on the worker."""
 
     def act(viewer: Viewer) -> None:
         if has_selection(viewer):
@@ -127,7 +127,7 @@ Target = int | Array  # a node of the tree, or a (3,) point on the surface, worl
 
 
 def of_thing(act: Callable[[Viewer, Array], None]) -> Callable[[Viewer, Target], None]:
-    """Return the action that has the worker find (N,) bool of a thing, and then does `act` with it."""
+    """Return the action that has the worker find a thing's members, (N,) bool, and passes them to `act`."""
 
     def begin(viewer: Viewer, target: Target) -> None:
         level = viewer.state.session.level
@@ -149,14 +149,14 @@ def of_thing(act: Callable[[Viewer, Array], None]) -> Callable[[Viewer, Target],
 
 
 def ask_for_name(viewer: Viewer) -> None:
-    """Have the box for a name of what is selected take the keyboard."""
+    """Give the keyboard to the box for a name of the selection."""
     if has_selection(viewer):
         open_panel(viewer, "Selection")
         viewer.state.focus_name = viewer.state.awaits_keyboard = True
 
 
 def name_selection(viewer: Viewer, name: str) -> None:
-    """Teach a name by what is selected."""
+    """Teach a name by the selection."""
     if has_selection(viewer):
         teach(viewer, name, viewer.state.marks.selected)
 
@@ -183,7 +183,7 @@ def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None =
 
 # Tools of the mouse: a stroke begins, goes on and ends; (u, v) are fractions of the scene's area.
 
-STEP = 0.002  # of the image: places nearer to each other are one
+STEP = 0.002  # of the image: nearer places of a stroke are one
 LONGEST = 4000  # places of a stroke that are kept
 
 
@@ -235,7 +235,7 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
     depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
     means, clip = state.scene.gaussians.means, state.session.clip
     found = marks.caught(drawn, means, depths)
-    if clip != UNCLIPPED and on_screen:  # what is not drawn lies under no outline
+    if clip != UNCLIPPED and on_screen:  # Gaussians that are not drawn lie under no outline
         found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])
     take(viewer, found, mode)
 
@@ -272,7 +272,7 @@ def pivot(viewer: Viewer) -> Array | None:
     if state.scene is None or state.extent is None:
         return None
     selected, kept = state.marks.selected, state.pivot
-    if kept is None or kept[0] is not state.scene or kept[1] is not selected:  # asked in every frame
+    if kept is None or kept[0] is not state.scene or kept[1] is not selected:  # cached: asked in every frame
         chosen = selected & state.scene.gaussians.valid()
         middle = state.extent.centre
         if chosen.any():
@@ -286,14 +286,14 @@ def _move_of(viewer: Viewer, to: Similarity) -> Move:
 
 
 def preview(viewer: Viewer, to: Similarity) -> None:
-    """Show what `transform` would do, until it does. Raises InputError where that leads too far."""
+    """Show the result of `transform` before it is applied. Raises InputError where it leads too far."""
     if viewer.state.scene is not None:
         move = _move_of(viewer, to)
         viewer.state.moving = move, move.applied(viewer.state.scene)
 
 
 def transform(viewer: Viewer, to: Similarity) -> None:
-    """Transform the selection; without one the whole scene with its cameras. Says why where that fails."""
+    """Transform the selection or, without one, the scene with its cameras. Reports why where that fails."""
     viewer.state.moving = None
     if not viewer.has_scene("transform it") or to.is_identity:
         return
@@ -312,7 +312,7 @@ def transform(viewer: Viewer, to: Similarity) -> None:
 
 
 def place(viewer: Viewer, moves: Sequence[Move]) -> None:
-    """Make the scene that is shown anew by a session's transforms; InputError, and all as it was, else."""
+    """Rebuild the shown scene from a session's transforms; InputError, and no change, where that fails."""
     state = viewer.state
     if state.scene is None:
         return
@@ -393,7 +393,7 @@ Step = Literal["undo", "redo"]
 
 
 def undo(viewer: Viewer, step: Step = "undo") -> None:
-    """Go back to the session before the last step; "redo": take back the last undo."""
+    """Restore the session before the last step; "redo": revert the last undo."""
     history, now, named = viewer.history, viewer.state.session, named_step(viewer, step)
     there, back = (history.past, history.future)[:: 1 if step == "undo" else -1]
     if not there:
@@ -417,10 +417,10 @@ def named_step(viewer: Viewer, step: Step) -> str:
 
 
 def adopt(viewer: Viewer, session: Session) -> None:
-    """Take another session of the scene that is shown.
+    """Replace the session of the scene that is shown.
 
-    What follows from it is brought in line: masks, the transformed scene, answers. Raises InputError, and
-    leaves all as it was, where a transform leads too far.
+    Masks, the transformed scene and answers are updated to it. Raises InputError, and changes nothing, where
+    a transform leads too far.
     """
     state, before = viewer.state, viewer.state.session
     if moved := session.moves != before.moves:

@@ -37,13 +37,13 @@ from langsplat_viewer.viewer import History, Training, Viewer
 
 @dataclass(frozen=True, eq=False)
 class _Opened:
-    """A scene with all that the window's thread should not have to compute."""
+    """A scene that was read, with everything that is too slow to compute on the window's thread."""
 
     scene: Scene
     unusable: dict[str, int]  # reason -> Gaussians that are therefore not drawn
     extent: Extent
     read: Stamps  # its files as they were before they were read
-    warnings: tuple[str, ...]  # what the report of its training says against it
+    warnings: tuple[str, ...]  # quality warnings in the report of its training
 
 
 def open_scene(
@@ -89,7 +89,7 @@ def open_scene(
 
 
 def cancel(viewer: Viewer) -> None:
-    """Drop what the worker does and is to do."""
+    """Cancel the running and the queued work of the worker."""
     state = viewer.state
     viewer.worker.cancel()
     state.opening = None
@@ -156,7 +156,7 @@ def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
 
 
 def _prepare_search(viewer: Viewer) -> None:
-    """Have the worker do what the first search needs, while the user looks round."""
+    """Have the worker prepare the first search while the user looks round."""
     engine = viewer.engine
     assert engine is not None
     if not is_compiled(surface.merge_patches):
@@ -166,15 +166,15 @@ def _prepare_search(viewer: Viewer) -> None:
         viewer.run("loading the text encoder", engine.load_encoder)
 
 
-# Visits: a scene that was shown before is found again as it was left.
+# Visits: a scene that was shown before is restored as it was left.
 
 
 def return_to(viewer: Viewer, visit: SceneState) -> None:
-    """Find the scene that was just opened again as it was left; what was asked is asked anew."""
+    """Restore the scene that was just opened as it was left; its queries are asked anew."""
     state = viewer.state
     if state.scene is None:
         return
-    offset, opening = visit.origin - state.origin, visit.opening_camera  # a file that was changed has another
+    offset, opening = visit.origin - state.origin, visit.opening_camera  # a changed file may have another
     state.view = state.view if visit.view is None else visit.view.moved(offset)
     state.opening_camera = None if opening is None else opening.moved(offset)
     if visit.camera_index is not None and visit.camera_index < len(state.scene.cameras):
@@ -187,7 +187,7 @@ def return_to(viewer: Viewer, visit: SceneState) -> None:
 
 
 def take_session(viewer: Viewer, session: Session) -> None:
-    """Adopt a session of an earlier time, as far as the scene that is shown has what it speaks of."""
+    """Adopt an earlier session, without what the scene that is shown no longer has."""
     if viewer.engine is None or not viewer.state.has_field:
         session = replace(_without_field(session), things=Things())
     else:
@@ -196,7 +196,7 @@ def take_session(viewer: Viewer, session: Session) -> None:
 
 
 def reload(viewer: Viewer) -> None:
-    """Read the scene's files again and stay where one is; where that fails the scene is kept."""
+    """Read the scene's files again and keep the view; where that fails the scene is kept."""
     state = viewer.state
     path, shown = state.path, state.scene
     if path is None or shown is None:
@@ -208,13 +208,13 @@ def reload(viewer: Viewer) -> None:
 
     def check(scene: Scene) -> None:
         new = [reason for reason in scene.unread if reason not in known]
-        if new:  # half written, or not written yet
+        if new:  # files that are half written, or not written yet
             raise InputError(f"not read again, the scene stays as it was: {new[0]}")
 
     open_scene(viewer, path, lambda viewer: return_to(viewer, viewer.visits[path.absolute()]), check)
 
 
-# The list of scenes. One is in memory at a time; of the others the visit is kept.
+# The list of scenes. One is in memory at a time; of the others only the visit is kept.
 
 MOST = 100  # scenes that are listed
 
@@ -226,7 +226,7 @@ def add_scenes(viewer: Viewer, paths: Sequence[Path]) -> None:
 
 
 def switch_scene(viewer: Viewer, path: Path) -> None:
-    """Show one of the list, as it was left if it was shown before."""
+    """Show a scene of the list, as it was left if it was shown before."""
     state = viewer.state
     if state.path is not None and path == state.path.absolute() and state.opening is None:
         return
@@ -239,7 +239,7 @@ def switch_scene(viewer: Viewer, path: Path) -> None:
 
 
 def step_scene(viewer: Viewer, by: int) -> None:
-    """Show the next (1) or previous (-1) scene of the list, beyond its ends from the other one."""
+    """Show the next (1) or previous (-1) scene of the list, which wraps round."""
     scenes, path = viewer.state.scenes, viewer.state.path
     if len(scenes) < 2:
         viewer.say_error("no other scene is listed: drop several, or open another")
@@ -249,7 +249,7 @@ def step_scene(viewer: Viewer, by: int) -> None:
 
 
 def unlist_scene(viewer: Viewer, path: Path) -> None:
-    """Take a scene off the list, and forget its visit unless that is not saved; the one shown stays."""
+    """Take a scene off the list, and drop its visit if nothing in it is unsaved; the one shown stays."""
     viewer.state.scenes = tuple(other for other in viewer.state.scenes if other != path)
     if path in viewer.visits and not viewer.visits[path].has_unsaved_notes:
         del viewer.visits[path]
@@ -272,7 +272,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     """Open what was dropped onto the window.
 
     Of scenes the first is opened and all are listed; then paths are taken. Companions belong to their scene.
-    A folder of photographs is offered for training. What is none of these is said.
+    A folder of photographs is offered for training. Other files are reported.
     """
     is_folder = len(paths) == 1 and isdir(paths[0]) and format_of(paths[0]) is None
     if is_folder and count_photographs(paths[0]):
@@ -306,7 +306,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
 
 
 def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lambda viewer: None) -> None:
-    """Open the scene of a project, and have in it what the project holds; `then` runs once it is there."""
+    """Open the scene of a project with the project's session; `then` runs once it is on screen."""
     try:
         digest, project = digest_of(path), read_project(path)
         if not Path(project.scene).exists():
@@ -358,7 +358,7 @@ WARNING = "warning: "  # before each warning that `langsplat train` ends with
 
 
 def choose_photographs(viewer: Viewer, folder: Path) -> None:
-    """Take a folder of photographs, and a name beside it for the scene."""
+    """Fill the form with a folder of photographs, and a name beside it for the scene."""
     form = viewer.state.training_form
     out = form.out or str(folder.with_name(f"{folder.name or 'scene'}.ply"))
     viewer.state.training_form = replace(form, dataset=str(folder), out=out)
@@ -406,7 +406,7 @@ def start_training(viewer: Viewer) -> None:
 
 
 def look_at_training(viewer: Viewer) -> None:
-    """Open the Gaussians of a training as they were last written, and from then on the next ones."""
+    """Open the Gaussians that a training wrote last, and from then on each newer checkpoint."""
     training = viewer.training
     if training is None:
         return
@@ -429,7 +429,7 @@ def look_at_training(viewer: Viewer) -> None:
 def watch_training(viewer: Viewer) -> None:
     """Show a training under way, and its scene when it is finished, or why there is none; once per frame.
 
-    Gaussians on their way are shown where they were looked at before, or nothing else is open.
+    Its Gaussians are shown meanwhile if they were shown before, or if nothing else is open.
     """
     training, state = viewer.training, viewer.state
     if training is None:
@@ -444,7 +444,7 @@ def watch_training(viewer: Viewer) -> None:
     viewer.training = None
     if training.exit_code == 0:
         told = [line for line in training.progress.said if not line.startswith(WARNING)]
-        for line in told[-3:]:  # what speaks against the scene is said with it, from its report
+        for line in told[-3:]:  # quality warnings come with the scene, from its report
             state.say(line)
         open_scene(viewer, training.out)
     elif training.interrupted:
@@ -458,7 +458,7 @@ def watch_training(viewer: Viewer) -> None:
 
 
 def open_beside(viewer: Viewer, path: Path) -> None:
-    """Show another scene right of a line, seen and asked as this one is."""
+    """Show another scene right of a line, with the same view and queries as this one."""
     beside = Viewer(viewer.services)
     beside.worker.wake, beside.state.backend = viewer.worker.wake, viewer.state.backend
     if viewer.beside is not None:
@@ -497,7 +497,7 @@ def follow_beside(viewer: Viewer) -> None:
 def _mirrored(state: ViewerState, other: ViewerState) -> Session:
     """Return the first scene's session for the second one: what is asked and how it is shown, without edits.
 
-    It asks what the first has answered; what is not here gets no colour there.
+    It asks the queries that the first has answered; those "not here" get no colour in it.
     """
 
     def hidden(query: Query) -> bool:

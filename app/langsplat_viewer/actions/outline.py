@@ -1,4 +1,4 @@
-"""The outline: the scene's tree in words, and what can be done with a thing of it or one that is clicked."""
+"""The outline: the scene's tree in words, and actions on a thing that is listed or clicked."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -20,8 +20,8 @@ from langsplat_viewer.actions.viewpoint import focus_on
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
-SURE = 0.7  # probability of a name below which it is a question
-BACKGROUND = {"wall", "floor", "ground", "ceiling", "skirting", "rug", "carpet"}  # the last in the outline
+SURE = 0.7  # probability below which a name is shown as a question
+BACKGROUND = {"wall", "floor", "ground", "ceiling", "skirting", "rug", "carpet"}  # listed last in the outline
 
 
 def wanted(viewer: Viewer) -> OutlineView | None:
@@ -75,7 +75,7 @@ def name_of(viewer: Viewer, row: Outline) -> str:
 
 
 def sure_of(viewer: Viewer, row: Outline) -> tuple[bool, str]:
-    """Return whether a row's name is to be relied on, and what is said of that behind it."""
+    """Return whether a row's name is reliable, and the text behind it that says so."""
     if row.word is None or row.node in viewer.state.session.things.names:
         return row.node in viewer.state.session.things.names, ""
     is_sure = viewer.has_percentages and row.word.probability >= SURE
@@ -84,7 +84,7 @@ def sure_of(viewer: Viewer, row: Outline) -> tuple[bool, str]:
 
 
 def filtered(viewer: Viewer, rows: Iterable[Outline], text: str) -> Iterator[Outline]:
-    """Rows whose name, or that of something in them, holds every word of `text`; with those parts alone."""
+    """Yield the rows with every word of `text` in their name or in that of a part, with those parts alone."""
     words = text.lower().split()
     for row in rows:
         parts = tuple(filtered(viewer, row.parts, text))
@@ -108,7 +108,7 @@ def hidden_nodes(viewer: Viewer) -> Array:
 
 
 def colour_of(viewer: Viewer, node: int) -> tuple[float, float, float] | None:
-    """Mean colour of a node's Gaussians where what is shown has one for each: the latents, or the tree."""
+    """Return a node's mean colour in the display if that colours things: the latents, or the tree."""
     state = viewer.state
     display, view = state.session.picture.display, state.outline
     if display not in ("latent", "tree") or view is None or view.tree is None or state.scene is None:
@@ -125,7 +125,7 @@ def colour_of(viewer: Viewer, node: int) -> tuple[float, float, float] | None:
 
 
 def in_view(viewer: Viewer) -> list[Outline]:
-    """Rows of named wholes whose middle is in the image, those that look largest first."""
+    """Return the rows of named wholes whose middle is in the image, those that look largest first."""
     state = viewer.state
     if state.outline is None or state.view is None:
         return []
@@ -141,7 +141,7 @@ def in_view(viewer: Viewer) -> list[Outline]:
     return [rows[place] for place in order]
 
 
-# What can be done with a thing.
+# Actions on a thing.
 
 
 def _hidden(viewer: Viewer, hidden: Array) -> None:
@@ -166,14 +166,14 @@ def find_alike(viewer: Viewer, members: Array) -> None:
     select_alike(viewer)
 
 
-# Selected in place of what is selected; hidden, where what else is selected stays so; shown again.
+# Select it, replacing the selection; hide it, keeping the rest of the selection; show it again.
 select = of_thing(lambda viewer, members: take(viewer, members, "replace"))
 hide = of_thing(lambda viewer, members: _hidden(viewer, viewer.state.marks.hidden | members))
 show = of_thing(lambda viewer, members: _hidden(viewer, viewer.state.marks.hidden & ~members))
 
 
 def give_name(viewer: Viewer, target: Target, name: str) -> None:
-    """Name a thing, and teach the name, so that it is found by it."""
+    """Name a thing, and teach the name, so that searching for the name finds the thing."""
     name, node = tidy(name), target if isinstance(target, int) else None
     if name:
         of_thing(lambda viewer, members: teach(viewer, name, members, node))(viewer, target)

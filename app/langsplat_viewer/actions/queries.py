@@ -58,7 +58,7 @@ def ask_together(viewer: Viewer, phrases: Sequence[str]) -> None:
 
 
 def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = (), *, alike: bool = False) -> None:
-    """Have the worker answer a query of the list; only what may be there takes a colour.
+    """Have the worker answer a query of the list; it takes a colour unless the answer is "not here".
 
     shown_with: the phrases that were asked together, it too; without, what is shown stays. alike: a name
     finds all that is like what it was given to. Its instances come later: the surface that they are told
@@ -78,7 +78,7 @@ def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = (), *, alike
         return _answer_of(composed, members, path is not None and is_kept(path, engine.scene))
 
     def done(found: QueryAnswer) -> None:
-        if phrase not in state.answers:  # it was taken off meanwhile
+        if phrase not in state.answers:  # the query was taken off meanwhile
             return
         state.answers[phrase] = found
         if shown_with:
@@ -97,7 +97,7 @@ def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = (), *, alike
 
 
 def _answer_of(composed: ComposedResult, members: Array | None, has_evidence: bool) -> QueryAnswer:
-    """Return the answer with what is shown of it; members: (N,) bool of what was given it as a name."""
+    """Return the answer with all that is shown of it; members: (N,) bool that were given it as a name."""
     # A copy has its arrays: they are made here, and not by the thread that draws.
     found = like = replace(composed.answer)
     if members is not None:
@@ -114,7 +114,7 @@ def _answer_of(composed: ComposedResult, members: Array | None, has_evidence: bo
 
 
 def _alone(like: QueryResult, members: Array) -> QueryResult:
-    """Return the answer to a name that is the thing which was given it, and not all that is like it."""
+    """Return the answer to a name restricted to the thing that was given the name."""
     place, box = place_of(like.points[members])
     judgement = Verdict(True, like.judgement.reached, max(like.judgement.margin, 0.0))
     return replace(like, members=members, place=place, box=box, judgement=judgement)
@@ -131,23 +131,23 @@ def _tell_apart(viewer: Viewer, engine: QueryEngine, phrase: str, result: QueryR
 
 
 def ask_listed(viewer: Viewer, anew: bool = True) -> None:
-    """Answer the queries of the list: all of them `anew`, or those that were not asked yet."""
+    """Answer the queries of the list: all of them if `anew`, else those that were not asked yet."""
     for query in viewer.state.session.queries:
         if anew or query.phrase not in viewer.state.answers:
             answer(viewer, query.phrase)
 
 
 def forget_unlisted(viewer: Viewer) -> None:
-    """Drop the answers to queries that are in the list no more: they have numbers for every Gaussian."""
+    """Drop the answers to queries that left the list: they hold numbers for every Gaussian."""
     state = viewer.state
     listed = {query.phrase for query in state.session.queries}
     state.answers = {phrase: known for phrase, known in state.answers.items() if phrase in listed}
 
 
 def focus_search(viewer: Viewer) -> None:
-    """Have the search box take the keyboard; say so where there is nothing to search.
+    """Give the keyboard to the search box; report where there is nothing to search.
 
-    The letters that follow are no commands then, until a click or Esc.
+    In that case letters are no commands until a click or Esc.
     """
     state, can_search = viewer.state, viewer.searchable() is not None
     if state.scene is not None:
@@ -156,13 +156,13 @@ def focus_search(viewer: Viewer) -> None:
     state.letters_muted = not can_search
 
 
-# Names that are taught.
+# Taught names.
 
 
 def teach(viewer: Viewer, name: str, members: Array, node: int | None = None) -> None:
-    """Have the worker teach a name by the language of (N,) bool, and search for it: it finds just these.
+    """Have the worker teach a name by the features of `members` (N,) bool, and search for it.
 
-    What is saved from now on keeps it. `node` of the tree, where they are one.
+    It finds just these. Files that are saved from now on hold the name. node: of the tree, if they are one.
     """
 
     def taught(word: TaughtWord) -> None:
@@ -178,7 +178,7 @@ def teach(viewer: Viewer, name: str, members: Array, node: int | None = None) ->
 
 
 def teach_given(viewer: Viewer) -> None:
-    """Have the worker teach the names of the session that the scene was saved without."""
+    """Have the worker teach the session's names that the scene's file lacks."""
     given, engine = viewer.state.session.things.given, viewer.engine
 
     def work(engine: QueryEngine, progress: Progress) -> None:
@@ -201,7 +201,7 @@ def show(viewer: Viewer, phrase: str, shown: bool = True) -> None:
 
 
 def remove(viewer: Viewer, phrase: str) -> None:
-    """Take a query off the list; where it was chosen, the latest one is."""
+    """Take a query off the list; if it was chosen, the latest one becomes chosen."""
     left = viewer.state.session.without({phrase})
     viewer.change(queries=left.queries, chosen=left.chosen)
     forget_unlisted(viewer)
@@ -225,7 +225,7 @@ def set_level(viewer: Viewer, level: LevelChoice) -> None:
 
 
 def set_cut(viewer: Viewer, phrase: str, cut: float | None, *, is_new: bool = True) -> None:
-    """Give an answer a threshold in place of its own, or (None) its own again.
+    """Set the threshold of an answer, None for its own one.
 
     is_new: a step of its own to undo, and not a slider that moves on.
     """
@@ -238,7 +238,7 @@ def set_cut(viewer: Viewer, phrase: str, cut: float | None, *, is_new: bool = Tr
     state.session = state.session.with_query(phrase, cut=cut)
 
 
-# What an answer stands on.
+# Evidence of an answer.
 
 
 def explain(viewer: Viewer, query: Query) -> None:
@@ -263,7 +263,7 @@ def explain(viewer: Viewer, query: Query) -> None:
     viewer.run(f"looking for the evidence of '{query.phrase}'", work, done)
 
 
-# What is offered to a searcher: examples of the scene, completions, corrections, earlier phrases.
+# Suggestions: examples of the scene, completions, corrections, earlier phrases.
 
 
 def prepare_suggestions(viewer: Viewer) -> None:
@@ -290,7 +290,7 @@ def prepare_suggestions(viewer: Viewer) -> None:
 def offers(viewer: Viewer, typed: str) -> tuple[str, tuple[str, ...]]:
     """Return a title and the phrases to offer now.
 
-    They go on from what is typed; else they correct the last query, or are examples.
+    They complete what is typed; else they correct the last query, or are examples.
     """
     state, queries = viewer.state, viewer.state.session.queries
     if typed.strip():

@@ -1,6 +1,6 @@
-"""What is written: pictures, views and films, exports, projects; and the question before leaving.
+"""Saving: pictures, views and films, exports, projects; and the question before leaving.
 
-Everything goes to new files, or over what a dialog has asked about; a project to the file that it came from.
+Files are new, or replace one that a dialog has asked about; a project is saved to the file that it came from.
 """
 
 import os
@@ -76,7 +76,7 @@ def _record(
     work: Callable[[Progress], tuple[Path, str]],
     then: Callable[[], None] = lambda: None,
 ) -> None:
-    """Have the recorder's thread write a file; `work` returns it with what is said of it."""
+    """Have the recorder's thread write a file; `work` returns its path with the message about it."""
 
     def done(written: tuple[Path, str]) -> None:
         viewer.state.say(written[1], file=written[0])
@@ -185,26 +185,26 @@ def save_edited(viewer: Viewer, folder: Path, then: Callable[[Viewer], None] = l
 
 
 def _count_as_saved(viewer: Viewer, shown: Scene, session: Session) -> None:
-    """Note that a file has the edits of a session, if its scene is still shown."""
+    """Count the edits of a session as saved, if its scene is still shown."""
     state = viewer.state
     if state.scene is shown:
         state.saved = replace(state.saved, marks=session.marks, moves=session.moves)
 
 
 def finish_writing(viewer: Viewer) -> None:
-    """Wait until what is being written is there: the window closes, and the worker's thread ends with it."""
+    """Wait for files that are being written: the window closes, and the worker's thread ends with it."""
     if viewer.state.writing is not None:
         wait([viewer.state.writing], LONGEST_WAIT)
 
 
-# What the command line makes of a scene, the window has it make, in a process of its own.
+# Exports are made by commands of the command line, each in a process of its own.
 
 
 @dataclass(frozen=True)
 class ExportRow:
-    """Something that a command of the command line makes of a scene."""
+    """An export: a command of the command line and its options."""
 
-    words: str  # the command, with places for the scene, what is written, and --encoder
+    words: str  # the command, with placeholders for the scene, the output and --encoder
     about: str
     # Suffix, "" of a folder -> bytes in all, for each Gaussian, and for each coefficient of its colours, as
     # measured on the bundled scene. `at_most`: it may be much less. `beside`: companions are added.
@@ -259,13 +259,13 @@ EXPORTS = {
 
 
 def exports() -> tuple[str, ...]:
-    """Return the titles of what can be written here: an extension may be absent."""
+    """Return the titles of the exports that work here: an extension may be absent."""
     known = {"export", "convert", "describe", *registry.references("commands")}
     return tuple(title for title, row in EXPORTS.items() if row.words.split()[0] in known)
 
 
 def ask_export(viewer: Viewer, title: str, only_selected: bool = False) -> None:
-    """Open the dialog that exports, with something to write."""
+    """Open the dialog of the export `title`."""
     scene, row = viewer.state.scene, EXPORTS[title]
     if viewer.has_scene("export it") and scene is not None:
         shown = (flag for flag in row.options if flag != UNIT or scene.metres_per_unit is None)
@@ -274,7 +274,7 @@ def ask_export(viewer: Viewer, title: str, only_selected: bool = False) -> None:
 
 
 def exported(viewer: Viewer, form: ExportForm) -> Array:
-    """Return (N,) bool of what is written."""
+    """Return (N,) bool: the Gaussians that are written."""
     marks = viewer.state.marks
     return marks.selected if form.only_selected else marks.kept
 
@@ -343,7 +343,7 @@ def run_export(viewer: Viewer, out: Path, form: ExportForm) -> None:
 
 
 def _said(process: CommandProcess, out: Path) -> str:
-    """Return what a command says of the file that it wrote; InputError with the reason where it failed."""
+    """Return a command's message about the file it wrote; InputError with the reason where it failed."""
     said = process.progress.said
     if process.exit_code != 0:
         raise InputError((said or ["no reason given"])[-1].removeprefix("langsplat: "))
@@ -352,9 +352,9 @@ def _said(process: CommandProcess, out: Path) -> str:
 
 
 def _page(viewer: Viewer) -> Callable[[Path, Scene, Progress], str]:
-    """Return what writes a web page that opens with the current view, and has the bookmarks and notes.
+    """Return the function that writes a web page with the current view, the bookmarks and the notes.
 
-    Those the command line does not know. It returns what is said of the page.
+    The command line does not know these. The function returns the message about the page.
     """
     state, services = viewer.state, viewer.services
     assert state.view is not None
@@ -393,7 +393,7 @@ def save_as(viewer: Viewer) -> None:
 def save_project(viewer: Viewer, to: Path = Path(), of: SceneState | None = None) -> Path | None:
     """Save the project as `to`, or where that is a folder to the file that it came from or a new one there.
 
-    `of`: a scene that was left, by default the one shown. Return where it is, None where that failed.
+    `of`: a scene that was left, by default the one shown. Return the path, None where saving failed.
     """
     state = of or viewer.state
     if not viewer.has_scene("save the project") or not (state.path and state.view):
@@ -437,7 +437,7 @@ def show_in_folder(viewer: Viewer, path: Path) -> None:
 
 
 def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str, loses_more: bool = False) -> None:
-    """Do `then`: at once if nothing is lost by it, else when that was answered; `to` says what it is."""
+    """Call `then` at once if nothing is lost by it, else after the user's answer; `to`: its name in words."""
     if viewer.state.is_unsaved or loses_more:
         viewer.state.leaving = Leaving(then, to)
     else:
@@ -483,7 +483,7 @@ def end(viewer: Viewer, folder: Path = Path()) -> None:
 
 
 def go_on(viewer: Viewer) -> None:
-    """Do what waited for an answer, whatever is lost."""
+    """Do the action that waited for an answer, whatever is lost."""
     leaving, viewer.state.leaving = viewer.state.leaving, None
     if leaving is not None:
         leaving.then(viewer)
@@ -492,12 +492,12 @@ def go_on(viewer: Viewer) -> None:
 def save_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
     """Write the scene without what was deleted to a new file in `folder`, and go on once it is there."""
     leaving, viewer.state.leaving = viewer.state.leaving, None
-    if leaving is not None:  # what is noted is asked about next
+    if leaving is not None:  # notes are asked about next
         save_edited(viewer, folder, quit_viewer if leaving.then is _close else leaving.then)
 
 
 def save_project_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
-    """Save the projects of all scenes that need it and go on; where one cannot be saved one stays."""
+    """Save the projects of all scenes that need it and go on; stay where one cannot be saved."""
     edited = [viewer.state] if viewer.state.is_unsaved else []
     if all(save_project(viewer, folder, state) for state in dict.fromkeys((*edited, *viewer.unsaved()))):
         go_on(viewer)

@@ -1,4 +1,4 @@
-"""What is shown and how: displays side by side, overlays, ruler and notes; preferences and panels."""
+"""Settings of the view: displays side by side, overlays, ruler and notes; preferences and panels."""
 
 import os
 from collections.abc import Callable
@@ -35,7 +35,7 @@ def put(part: ViewerState | Recording, **values: object) -> None:
 
 
 def take(part: ViewerState, name: str) -> Any:
-    """Return a field that is wanted for one frame, and empty it."""
+    """Return and clear a field that holds for one frame."""
     value = getattr(part, name)
     setattr(part, name, type(value)())
     return value
@@ -53,7 +53,7 @@ def set_display(viewer: Viewer, display: Display, latent_level: int | None = Non
 
 
 def set_picture(viewer: Viewer, picture: PictureConfig) -> None:
-    """Take other settings of the image, as its sliders give them."""
+    """Set the settings of the image, as its sliders give them."""
     before, names = viewer.state.session.picture, (field.name for field in fields(picture))
     changed = (name for name in names if getattr(picture, name) != getattr(before, name))
     viewer.change(" ".join(changed), picture=picture)
@@ -96,7 +96,7 @@ def move_line(viewer: Viewer, at: float) -> None:
 
 
 def _can_show(viewer: Viewer, needs_field: bool) -> bool:
-    """Return whether the scene has a language field where one is needed; says so where it has none."""
+    """Return whether the scene has a language field or needs none; report a missing one."""
     scene = viewer.state.scene
     if needs_field and scene is not None and scene.language is None:
         viewer.say_error(no_field(scene))
@@ -108,13 +108,13 @@ def _can_show(viewer: Viewer, needs_field: bool) -> bool:
 
 
 def toggle_overlay(viewer: Viewer, overlay: Overlay) -> None:
-    """Lay something over the scene, or take it away."""
+    """Show or hide an overlay."""
     kept = {*viewer.state.session.overlays} ^ {overlay}
     viewer.change(overlays=tuple(name for name in OVERLAYS if name in kept))
 
 
 def toggle_measuring(viewer: Viewer) -> None:
-    """Have clicks on the scene set the points of the ruler, or no longer: what was measured goes."""
+    """Switch the ruler, whose points clicks on the scene set, on, or off and clear it."""
     viewer.put(ruler=Ruler(not viewer.state.session.ruler.measures))
 
 
@@ -126,7 +126,7 @@ def measure_at(viewer: Viewer, u: float, v: float) -> None:
 
 
 def toggle_pinning(viewer: Viewer) -> None:
-    """Have a click on the scene pin a note there, or no longer."""
+    """Switch the pinning of notes by a click on the scene on or off."""
     viewer.state.pins_notes = not viewer.state.pins_notes
     viewer.put(ruler=Ruler())
     if viewer.state.pins_notes:
@@ -172,7 +172,7 @@ def prefer(viewer: Viewer, **values: Any) -> None:
 
 
 def keep_preferences(viewer: Viewer) -> None:
-    """Have the preferences keep what outlives a window of the session's settings."""
+    """Copy the session's settings that outlive a window to the preferences."""
     session = viewer.state.session
     prefer(viewer, colour_map=session.picture.colour_map, overlays=session.overlays)
 
@@ -196,12 +196,12 @@ def resize(viewer: Viewer, width: int, height: int) -> None:
 
 
 def open_panel(viewer: Viewer, title: str) -> None:
-    """Have a panel opened, in front of those it shares its place with."""
+    """Open a panel in front of those that share its place."""
     viewer.state.show_panel, viewer.state.wanted_panel, viewer.state.show_start = True, title, False
 
 
 def turn_panel(viewer: Viewer, title: str, *, is_open: bool) -> None:
-    """Have a panel open or closed."""
+    """Open or close a panel."""
     others = tuple(other for other in viewer.state.preferences.panels or () if other != title)
     prefer(viewer, panels=(*others, title) if is_open else others)
 
@@ -215,13 +215,13 @@ toggle_panels, toggle_help, toggle_start = map(_switch, ("show_panel", "show_hel
 
 
 def toggle_palette(viewer: Viewer) -> None:
-    """Show or close the list of everything that can be done."""
+    """Show or close the command palette."""
     viewer.state.show_palette = not viewer.state.show_palette
     viewer.state.awaits_keyboard |= viewer.state.show_palette
 
 
 def escape(viewer: Viewer) -> None:
-    """Close what lies over the scene; where nothing does leave the stroke, else the tool.
+    """Close what lies over the scene; if nothing does, drop the stroke, else leave the tool.
 
     Queries that failed leave the list.
     """
@@ -256,7 +256,7 @@ def ask_for(viewer: Viewer, choice: FileChoice) -> None:
 
 
 def choose(viewer: Viewer, text: str, is_confirmed: bool = False) -> None:
-    """Do what the dialog is open for with a path, from its folder where it is relative, and close it.
+    """Call the file dialog's action with a path, relative to its folder, and close the dialog.
 
     A file that is there is only written over where the dialog of the system has it `is_confirmed`.
     """

@@ -30,7 +30,7 @@ NEAREST = 0.004  # of the scene's radius: the closest that the eye comes to its 
 
 
 def tick(viewer: Viewer, now: float) -> None:
-    """Begin a frame at `now` seconds: move a gliding camera, or one that plays a path, on."""
+    """Begin a frame at `now` seconds: advance a glide, or a path that is played."""
     viewer.clock = now
     glide = viewer.state.glide
     if glide is not None:
@@ -66,7 +66,7 @@ def open_at(viewer: Viewer, camera: Camera) -> None:
 
 
 def zoom_by(viewer: Viewer, factor: float) -> None:
-    """Multiply the distance to the centre of turning, within what the scene's size makes sensible."""
+    """Multiply the distance to the centre of turning, within limits set by the scene's size."""
     extent = viewer.state.extent
     if extent is not None:
         nearest, farthest = NEAREST * extent.radius, extent.farthest
@@ -76,8 +76,8 @@ def zoom_by(viewer: Viewer, factor: float) -> None:
 def opening_view(viewer: Viewer) -> OrbitCamera | None:
     """Return the first view of a scene, None without a scene.
 
-    It is that of the camera that was asked for, else of the first training camera, else of everything in the
-    window as it is now.
+    It is the requested camera, else the first training camera, else a view of the whole scene in the window
+    as it is now.
     """
     state = viewer.state
     if state.scene is None or state.extent is None:
@@ -88,7 +88,7 @@ def opening_view(viewer: Viewer) -> OrbitCamera | None:
 
 
 def reset_view(viewer: Viewer) -> None:
-    """Return to the opening view, in the projection of now; to one of both scenes if it has one alone."""
+    """Return to the opening view, in the current projection; to a view of both scenes if it shows one."""
     view, state = opening_view(viewer), viewer.state
     if view is None or state.scene is None or state.extent is None:
         return
@@ -116,7 +116,7 @@ def _compared(viewer: Viewer) -> Sample | None:
 
 
 def frame_scene(viewer: Viewer) -> None:
-    """Show the whole scene, and one that is compared, from the side that it is seen from now."""
+    """Show the whole scene, and one that is compared, from the current direction."""
     state, other = viewer.state, _compared(viewer)
     if state.view is not None and state.extent is not None:
         extent = state.extent if other is None else controls.joined(state.extent, other)
@@ -124,13 +124,13 @@ def frame_scene(viewer: Viewer) -> None:
 
 
 def look_from(viewer: Viewer, side: Side) -> None:
-    """Turn the view to look along one of the world's axes, at the same place from as far."""
+    """Look along one of the world's axes, at the same target from the same distance."""
     if viewer.state.view is not None:
         glide_to(viewer, controls.from_side(viewer.state.view, side))
 
 
 def toggle_orthographic(viewer: Viewer) -> None:
-    """Switch between perspective and none; a glide under way goes on."""
+    """Switch between perspective and orthographic projection; a glide under way goes on."""
     state = viewer.state
     if state.view is not None:
         orthographic, glide = not state.view.orthographic, state.glide
@@ -167,7 +167,7 @@ def step_camera(viewer: Viewer, by: int) -> None:
 
 
 def focus_result(viewer: Viewer, query: Query | None = None) -> None:
-    """Bring a query's place to the centre, as near as the thing is small.
+    """Bring a query's place to the centre, at a distance that suits the size of the thing.
 
     Without `query` the latest one shown that was found; without any the whole scene.
     """
@@ -183,9 +183,9 @@ def focus_result(viewer: Viewer, query: Query | None = None) -> None:
 
 
 def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
-    """Bring a thing at `place` (3,) in `box` (2, 3) to the centre, as near as it is small.
+    """Bring a thing at `place` (3,) in `box` (2, 3) to the centre, at a distance that suits its size.
 
-    It is no farther back than the eye or the opening view are now, which in a room would be behind its wall.
+    The eye is no farther from it than now or in the opening view: beyond that, in a room, is its wall.
     """
     view, extent, home = viewer.state.view, viewer.state.extent, opening_view(viewer)
     if view is None or extent is None or home is None:
@@ -193,7 +193,7 @@ def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
     if box is None:
         box = np.stack([place, place + 0.1 * extent.radius])
     most = max(float(np.linalg.norm(place - view.eye)), home.distance)
-    angle = np.radians(min(view.intrinsics.fov_degrees, 170.0))  # of which the box takes about half
+    angle = np.radians(min(view.intrinsics.fov_degrees, 170.0))  # the box takes about half of it
     holding = controls.SURROUNDINGS * 0.5 * float(np.linalg.norm(box[1] - box[0]) / np.sin(angle / 2))
     distance = min(max(holding, NEAREST * extent.radius), most)
     glide_to(viewer, controls.focus(view, place, distance))
@@ -218,7 +218,7 @@ def move_aside(viewer: Viewer, points: Array, left: float, right: float) -> None
 
 
 def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
-    """Turn around the surface under the cursor from now on; (u, v) are fractions of the scene's area."""
+    """Make the surface under the cursor the centre of turning; (u, v) are fractions of the scene's area."""
     view = viewer.state.view
     point = None if view is None else viewer.point_at(u, v, "turn around")
     if view is not None and point is not None:
@@ -258,7 +258,7 @@ def scrub(viewer: Viewer, seconds: float) -> None:
 
 
 def _play(viewer: Viewer) -> None:
-    """Move a played path on to the viewer's clock; at its end it stops, or begins again."""
+    """Advance a played path to the viewer's clock; at its end it stops, or begins again."""
     record = viewer.state.record
     if record.began is None:
         return
@@ -284,8 +284,8 @@ def _show(viewer: Viewer, seconds: float) -> None:
 # Keyframes of the path.
 
 THUMBNAIL, MOST_THUMBNAILS = (144, 90), 64  # pixels
-TURN_SECONDS = 8.0  # of a turn, until another duration is set
-SLOW = 250.0  # milliseconds of an image of the window: where one takes longer there are no thumbnails
+TURN_SECONDS = 8.0  # duration of a turn, until another is set
+SLOW = 250.0  # milliseconds per image of the window above which there are no thumbnails
 
 
 def add_keyframe(viewer: Viewer) -> None:
@@ -304,7 +304,7 @@ def add_keyframe(viewer: Viewer) -> None:
 
 
 def turn_around(viewer: Viewer) -> None:
-    """Have the path go once around what the view turns around, in place of the keyframes that were there."""
+    """Replace the path by one turn around the view's target."""
     if viewer.has_scene("turn around in it") and viewer.state.view is not None:
         set_path(viewer, flight.turntable(viewer.state.view, TURN_SECONDS).keyframes)
         viewer.state.record.at = 0.0
@@ -322,7 +322,7 @@ def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
 def thumbnails(viewer: Viewer) -> Array:
     """Return the first keyframes as they look in colours, (K * height, width, 3) uint8, one below the other.
 
-    One more is drawn in each frame; none where that would take long.
+    Each frame draws one more; none where images are slow.
     """
     state, record = viewer.state, viewer.state.record
     keys, (known, images) = state.session.keyframes[:MOST_THUMBNAILS], record.thumbnails
@@ -341,7 +341,7 @@ def thumbnails(viewer: Viewer) -> Array:
 
 
 def put_keyframe(viewer: Viewer, key: Keyframe, new: Keyframe | None = None) -> None:
-    """Have another in the place of a keyframe, or beside one that has its time; without one take it off."""
+    """Replace a keyframe by `new`, moved off the times of others; None: take the keyframe off."""
     kept = tuple(other for other in viewer.state.session.keyframes if other is not key)
     if new is not None:
         seconds = min(max(new.seconds, 0.0), flight.LONGEST)
@@ -359,7 +359,7 @@ def set_path_seconds(viewer: Viewer, seconds: float) -> None:
 
 
 def set_path(viewer: Viewer, keyframes: tuple[Keyframe, ...], chosen: Keyframe | None = None) -> None:
-    """Take other keyframes, one of them as chosen."""
+    """Set the keyframes, and which one is chosen."""
     viewer.change(keyframes=keyframes)
     record = viewer.state.record
     record.began, record.chosen = None, chosen
@@ -367,7 +367,7 @@ def set_path(viewer: Viewer, keyframes: tuple[Keyframe, ...], chosen: Keyframe |
 
 
 def load_path(viewer: Viewer, path: Path) -> None:
-    """Take the path of a file in place of the one that is there."""
+    """Replace the path by that of a file."""
     try:
         found = read_flight(path).moved(-viewer.state.origin)
     except LangSplatError as error:
@@ -379,13 +379,13 @@ def load_path(viewer: Viewer, path: Path) -> None:
     viewer.state.say(f"{path.name}: {len(found.keyframes)} keyframes, {found.seconds:.1f} s")
 
 
-# The cursor: what lies under it while it rests.
+# The cursor: the words for the point under it while it rests.
 
-REST_SECONDS = 0.2  # of the mouse, after which it is asked what lies there
+REST_SECONDS = 0.2  # rest of the mouse after which the point under it is queried
 
 
 def toggle_pointing(viewer: Viewer) -> None:
-    """Say what is under the cursor from now on, or no longer."""
+    """Switch the tooltip about the point under the cursor on or off."""
     state = viewer.state
     if state.pointing or viewer.searchable() is not None:
         state.pointing, state.hover = not state.pointing, None
@@ -394,7 +394,7 @@ def toggle_pointing(viewer: Viewer) -> None:
 def hover(viewer: Viewer, pixel: tuple[int, int] | None) -> None:
     """Note the pixel (column, row) that the mouse is over in this frame; None: elsewhere, or it drags.
 
-    What lies there is asked once the mouse and the camera rest.
+    The point under it is queried once the mouse and the camera rest.
     """
     state, before, (width, height) = viewer.state, viewer.state.hover, viewer.state.size
     inside = pixel is not None and 0 <= pixel[0] < width and 0 <= pixel[1] < height
@@ -428,7 +428,7 @@ def _ask(viewer: Viewer, place: Hover) -> None:
 
 
 def add_bookmark(viewer: Viewer, name: str = "") -> None:
-    """Keep the current view; in place of one of the same name. Without a name it gets a number."""
+    """Add the current view, replacing one of the same name. Without a name it gets a number."""
     state, kept = viewer.state, viewer.state.session.bookmarks
     if not viewer.has_scene("bookmark a view of it") or state.view is None:
         return

@@ -1,4 +1,4 @@
-"""The camera that the user moves, and what it needs to know about a scene. Plain maths."""
+"""The camera that the user moves, and the extent of the scene that it is fitted to. Plain maths."""
 
 import math
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from langsplat_core.scene import Camera, Gaussians, Intrinsics, Scene, look_at
 
 
 def narrowed(inner: Intrinsics, factor: float) -> Intrinsics:
-    """Return the same image by a lens that is longer by `factor`."""
+    """Return the same image size with focal lengths `factor` times as long."""
     return replace(inner, fx=inner.fx * factor, fy=inner.fy * factor)
 
 
@@ -25,7 +25,7 @@ _BISECTIONS = 12
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Gaussians that can be seen, as weighted points."""
+    """Visible Gaussians as weighted points."""
 
     points: Array  # (M, 3) float64 world units
     weights: Array  # (M,) float64 > 0: opacity times size
@@ -46,7 +46,7 @@ def sample_of(gaussians: Gaussians) -> Sample:
 
 
 def reach(sample: Sample, centre: Array) -> float:
-    """Distance from `centre` (3,) within which `SHARE` of the weight lies, world units; 0 without any."""
+    """Return the distance from `centre` (3,) within which `SHARE` of the weight lies; 0 without any."""
     return weighted_quantile(np.linalg.norm(sample.points - centre, axis=1), sample.weights, SHARE)
 
 
@@ -76,7 +76,7 @@ def framing_eye(sample: Sample, rotation: Array, inner: Intrinsics, share: float
         # Along the other axis the nearest depth leaves room on both sides: the middle of it.
         return np.array([(a - b + (right - left) * ez) / 2, (c - d + (bottom - top) * ez) / 2, ez])
 
-    low, high = (1 - share) / 4, 1 - share  # beyond each border: surely few enough; as many as allowed in all
+    low, high = (1 - share) / 4, 1 - share  # beyond each border: surely small enough; all that is allowed
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2
         e = eye(middle)
@@ -119,19 +119,19 @@ def weighted_quantile(values: Array, weights: Array, share: float) -> float:
 # An `OrbitCamera` turns around a target point. Every control is a function from one camera to the next,
 # so that a test can do and undo it.
 
-MAX_ELEVATION = math.radians(88)  # nearer to the pole a small drag would spin the image
+MAX_ELEVATION = math.radians(88)  # closer to the pole a small drag would spin the image
 DEFAULT_FOV = 50.0  # degrees, of the image's shorter side
 FOV_RANGE = (10.0, 120.0)  # degrees
-FARTHEST = 12.0  # of the distance from the middle that holds the scene: it is still a spot that can be seen
-NARROW = 1e4  # how much longer the lens is by which a scene is framed without perspective
-SURROUNDINGS = 1.8  # how much more than a thing itself a view of it shows
+FARTHEST = 12.0  # of the distance that shows the whole scene: it is still a visible spot
+NARROW = 1e4  # factor of the focal length by which a scene is framed without perspective
+SURROUNDINGS = 1.8  # size that a view of a thing shows, over the thing's
 
 
 Side = Literal["front", "back", "left", "right", "top", "bottom"]
 
 
 def symmetric_intrinsics(fov_degrees: float = DEFAULT_FOV) -> Intrinsics:
-    """Intrinsics of a square image, `fov_degrees` across, its principal point in the centre."""
+    """Return the intrinsics of a square image, `fov_degrees` across, with a centred principal point."""
     focal = 0.5 / math.tan(math.radians(fov_degrees) / 2)
     return Intrinsics(1.0, 1.0, focal, focal, 0.5, 0.5)
 
@@ -153,7 +153,7 @@ class OrbitCamera:
 
     @property
     def eye(self) -> Array:
-        """(3,) where the camera stands, world units."""
+        """(3,) position of the camera, world units."""
         return self.target - self.distance * self.rotation[2]
 
     def camera(self, width: int, height: int) -> Camera:
@@ -240,7 +240,7 @@ def fly(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCame
 def frame_of(up: Array) -> Array:
     """Return the (3, 3) rows right, up and front of a world whose up is `up` (3,) unit.
 
-    Who looks at the front looks along the world's z axis, made level, or along y where z is up.
+    The view of the front is along the world's z axis, made level, or along y where z is up.
     """
     forward = np.eye(3)[2 if abs(up[2]) < 0.9 else 1]
     forward = forward - (forward @ up) * up
@@ -313,8 +313,8 @@ class Extent:
     centre: Array  # (3,) robust middle, world units
     radius: float  # robust, world units, > 0
     up: Array  # (3,) unit
-    sample: Sample  # what a view of everything is fitted to
-    farthest: float  # how far the camera may go back from what it turns around, world units
+    sample: Sample  # points that a view of everything is fitted to
+    farthest: float  # largest distance of the camera from its target, world units
 
 
 def extent_of(scene: Scene) -> Extent:
@@ -326,7 +326,7 @@ def extent_of(scene: Scene) -> Extent:
 
 
 def joined(extent: Extent, other: Sample) -> Extent:
-    """Return an extent of which a view of everything shows another sample, too, whatever each weighs."""
+    """Return the extent of two samples together, each with the same total weight."""
     weights = np.concatenate([each.weights / each.weights.sum() for each in (extent.sample, other)])
     return replace(extent, sample=Sample(np.concatenate([extent.sample.points, other.points]), weights))
 
@@ -361,7 +361,7 @@ def frame_all(view: OrbitCamera, extent: Extent, size: tuple[int, int]) -> Orbit
         return focus(view, extent.centre, 2.6 * extent.radius)
     depth = max(depth_share(extent.sample, eye, forward, 0.5), 1e-3 * extent.radius)
     target, distance = eye + depth * forward, depth / narrow
-    if view.orthographic:  # however flat the scene looks from here, nothing of it is behind the eye
+    if view.orthographic:  # however thin the scene is along the view, none of it may be behind the eye
         distance = max(distance, -depth_share(extent.sample, target, forward, 1 - SHARE))
     return replace(view, target=target, distance=distance)
 

@@ -3,7 +3,7 @@
 A path passes through its keyframes and is smooth in between: position and orientation have continuous
 velocities (Catmull and Rom 1974; for orientations the cumulative Bezier curve of Kim, Kim and Shin 1995, "A
 general construction scheme for unit quaternion curves with simple high order derivatives"). Each stretch
-depends on its two keyframes and their neighbours only, so that a change is not felt far away. Where two
+depends on its two keyframes and their neighbours only, so that a change stays local. Where two
 keyframes are equal, the camera rests between them. Perspective or not is as in the keyframe before.
 """
 
@@ -25,11 +25,11 @@ from langsplat_viewer.camera.controls import (
     symmetric_intrinsics,
 )
 
-SAME = 1e-9  # a step as small as this, of the largest coordinate or in radians, is none
+SAME = 1e-9  # steps up to this, of the largest coordinate or in radians, count as none
 FOV_LIMITS = (0.01, 179.0)  # degrees
 SPAN_LIMITS = (1e-9, 1e9)  # world units
 LONGEST = 36_000.0  # seconds of a path
-SAME_TIME = 1e-3  # seconds: two keyframes are not nearer
+SAME_TIME = 1e-3  # least seconds between two keyframes
 TURN = 32  # steps of a turn: its path is within 1e-4 radii of a circle
 
 
@@ -108,7 +108,7 @@ class Flight:
 
 
 def turntable(view: OrbitCamera, seconds: float) -> Flight:
-    """Return the path once around what `view` turns around, evenly, as a sideways drag leads."""
+    """Return the path of one even turn around the target of `view`, in the direction of a sideways drag."""
     first = Keyframe(0.0, pose_of(view))
     turns = ((step * seconds / TURN, orbit(view, 2 * math.pi * step / TURN, 0)) for step in range(1, TURN))
     return Flight(
@@ -153,7 +153,7 @@ def frame_times(flight: Flight, fps: float) -> Array:
 
 
 def stretched(keyframes: tuple[Keyframe, ...], seconds: float) -> tuple[Keyframe, ...]:
-    """Return the path in another time, `seconds` > 0, in proportion; one of no duration stays."""
+    """Return the path with its times scaled to `seconds` > 0 in all; one of no duration stays."""
     if not keyframes or keyframes[-1].seconds <= 0:
         return keyframes
     factor = seconds / keyframes[-1].seconds

@@ -15,7 +15,7 @@ from langsplat_viewer.camera.controls import Extent, frame_of, weighted_quantile
 class PlacedText:
     """The place of a text in an image, in units of the image, y down."""
 
-    x: float  # left edge, where they are wanted
+    x: float  # left edge, as wanted
     y: float  # upper edge
     width: float
     height: float

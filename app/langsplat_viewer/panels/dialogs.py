@@ -1,4 +1,4 @@
-"""What asks over the scene: the start page, dialogs for files, a file that has changed, what is not saved."""
+"""Start page, toasts and dialogs over the scene: files, exports, changed files, unsaved work."""
 
 import os
 import shutil
@@ -35,7 +35,7 @@ MOST_WIDE, MOST_COLUMNS, TITLE = 0.95, 4, 1.8  # of the area; cards beside each 
 
 
 class StartPage:
-    """The page without a scene: what was open lately, and the ways to begin."""
+    """The page shown without a scene: recent files and ways to begin."""
 
     def __init__(self, folder: Path | None) -> None:
         """`folder`: of the preferences, with the thumbnails."""
@@ -108,7 +108,7 @@ def _card(path: Path, texture: moderngl.Texture | None, width: float) -> bool:
     return bool(clicked)
 
 
-# Toasts: what was said last, for a while.
+# Toasts: the latest messages, for some seconds.
 
 TOAST_EM, BAR_EM, MOST_TOASTS = 30.0, 20.0, 3
 
@@ -227,7 +227,7 @@ class FileDialogs:
             self._dialog = None
 
     def draw(self, viewer: Viewer) -> None:
-        """Draw the dialog that is wanted, or what says that it is a window of its own."""
+        """Draw the dialog that is wanted, or a note that it is a window of the system."""
         self._waiting.poll()
         choice = viewer.state.choice
         if choice is not self._choice:
@@ -280,7 +280,7 @@ def _path_box(viewer: Viewer, choice: FileChoice) -> None:
             drafts["##path"] = offer
 
 
-# What is exported, and how.
+# Exports.
 
 EXPORT_EM = 27.0
 
@@ -343,7 +343,7 @@ def draw_changed(viewer: Viewer, area: ui.Area) -> None:
             viewer.watch.dismiss()
 
 
-# What is not saved.
+# Unsaved work.
 
 LEAVING_EM = 32.0
 

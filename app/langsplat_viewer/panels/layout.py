@@ -1,4 +1,4 @@
-"""The layout of the window: the inspector and its sections, what is docked, what floats over the scene."""
+"""The layout of the window: the inspector with its sections, docked windows, windows over the scene."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -114,7 +114,7 @@ def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
 
 
 def draw_inspector(viewer: Viewer) -> None:
-    """Draw the sections, each below its header; the one that is wanted is scrolled to."""
+    """Draw the sections, each below its header, and scroll to the one that is wanted."""
     are_open, kept = opened(viewer.state), viewer.state.preferences.undocked
     right = imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x
     for panel in all_panels():
@@ -212,7 +212,7 @@ def draw_titles(viewer: Viewer) -> None:
                 settings.open_panel(viewer, panel.title)
 
 
-# What lies over the scene.
+# Windows over the scene.
 
 CARD_EM, CARD_SHARE, MARGIN_EM = 22.0, 0.55, 0.8  # width of the search, its least share; around it
 

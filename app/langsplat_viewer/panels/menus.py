@@ -1,4 +1,4 @@
-"""What is made from the table of commands: menus, toolbar, palette of commands and help."""
+"""Menus, toolbar, command palette and help, all from the table of commands; and the status line."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -107,7 +107,7 @@ DRAWN_BY = {"cpu": "the processor", "opengl": "OpenGL", "cuda": "CUDA", "": "not
 
 
 def draw_status(viewer: Viewer) -> None:
-    """Draw what is under way with its Cancel, the figures, and what is opened at the foot."""
+    """Draw the work under way with its Cancel, the figures, and the buttons of windows at the foot."""
     if not viewer.state.show_panel or viewer.state.show_start:
         return
     flags = imgui.WindowFlags_.no_scrollbar | imgui.WindowFlags_.no_saved_settings
@@ -142,7 +142,7 @@ def draw_status(viewer: Viewer) -> None:
 
 
 def _figures(viewer: Viewer) -> Iterator[tuple[str, str]]:
-    """Yield what is open and selected, and how the image was drawn: words and their tip."""
+    """Yield figures of the scene, the selection and the image: words and their tip."""
     state, stats = viewer.state, viewer.state.stats
     if state.scene is not None and state.path is not None:
         yield f"{state.path.name}: {len(state.scene.gaussians):,} Gaussians", str(state.path)

@@ -49,7 +49,7 @@ class Keyboard:
             queue.push_back(event)
 
     def keep(self) -> None:
-        """Put the others back, once it has begun: imgui drops what repeats the last of its queue."""
+        """Queue the other keys once the frame has begun: imgui drops what repeats the last of its queue."""
         for event in self._kept:
             imgui.get_current_context().input_events_queue.push_back(event)
         self._kept.clear()
@@ -131,7 +131,7 @@ def handle(viewer: Viewer, area: ui.Area) -> None:
 
 
 def _pixel(area: ui.Area) -> tuple[int, int] | None:
-    """Return the mouse's place in the scene's area, pixels; None where a panel has it or a button is held."""
+    """Return the mouse's pixel in the scene's area; None where a panel has it or a button is held."""
     io = imgui.get_io()
     if io.want_capture_mouse or any(imgui.is_mouse_down(button) for button in range(3)):
         return None
@@ -141,7 +141,7 @@ def _pixel(area: ui.Area) -> tuple[int, int] | None:
 
 
 def _mouse(viewer: Viewer, area: ui.Area) -> None:
-    """Turn by the left button; while a tool has it, by the middle one."""
+    """Move the camera by the mouse: the left button turns it or, while a tool has that, the middle one."""
     io = imgui.get_io()
     free = viewer.state.tools.tool is None
     turns = 0 if free else 2
@@ -171,7 +171,7 @@ def _held(button: int) -> bool:
 
 
 def _fly(viewer: Viewer) -> None:
-    """Keys that act as long as they are held."""
+    """Move the camera by the keys that act as long as they are held."""
     io, extent, key = imgui.get_io(), viewer.state.extent, imgui.Key
     assert extent is not None
 

@@ -1,4 +1,4 @@
-"""The panel "Outline", the menu of a thing that is clicked, and the legend of things in colours."""
+"""The panel "Outline", the menu of a clicked thing, and the legend of the colours of things."""
 
 from typing import Any
 

@@ -59,7 +59,7 @@ def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Textur
 
 
 def below_search(part: ui.Area) -> ui.Area:
-    """Return what of an area lies lower than the search, open or folded; all of it beside that."""
+    """Return the part of an area below the search, open or folded; all of an area beside the search."""
     for _, card in ui.floating_windows("Search", "Folded search"):
         if card.x >= part.left:
             return replace(part, top=card.y, height=max(part.top + part.height - card.y, 1.0))
@@ -67,7 +67,7 @@ def below_search(part: ui.Area) -> ui.Area:
 
 
 def parts_of(area: ui.Area, split: Split) -> list[ui.Area]:
-    """Return the parts of the area where its images are seen, from left to right."""
+    """Return the parts of the area that its images take, from left to right."""
     if not split.has_line:
         return area.columns(split.columns)
     at = split.at * area.width
@@ -107,7 +107,7 @@ def draw_grip(viewer: Viewer, area: ui.Area) -> None:
     imgui.end()
 
 
-# What an answer stands on.
+# Evidence of an answer.
 
 EVIDENCE_EM = 50.0, 34.0  # size of the window at first
 
@@ -130,10 +130,10 @@ def draw_evidence(viewer: Viewer, picture: ui.Picture) -> None:
         settings.put(viewer.state, evidence=None)
 
 
-# What is drawn over every image: training cameras, boxes of instances, ground grid, ruler and notes.
+# Overlays on every image: training cameras, boxes of instances, ground grid, ruler and notes.
 
 Colour = tuple[float, float, float, float]
-REACH = 7.0  # window units from a line at which a click means it
+REACH = 7.0  # window units around a line in which a click hits it
 STILL = 4.0  # a click that moves farther is a drag
 CAMERA, CHOSEN, HOVERED = (0.75, 0.82, 0.95, 0.3), (0.98, 0.62, 0.15, 1.0), (1.0, 1.0, 1.0, 1.0)
 AXES_EM = 5.0  # of the corner that the axes take
@@ -163,7 +163,7 @@ class Pen:
         return np.array([self.area.left, self.area.top])
 
     def segments(self, edges: Array) -> tuple[Array, Array]:
-        """Return what is seen of (M, 2, 3) edges, (K, 2, 2), and the rows that they come from."""
+        """Return the visible parts (K, 2, 2) of (M, 2, 3) edges, and the rows that they come from."""
         found, rows = overlays.clip_segments(self.camera, edges, self.least)
         return found + self.corner, rows
 
@@ -285,7 +285,7 @@ def _things(viewer: Viewer, pen: Pen) -> None:
 
 
 def _names(named: list[Named], area: ui.Area) -> None:
-    """Write texts above their corners and beside what floats there, with a line to those that made room."""
+    """Write names above their corners, clear of floating windows, with a line to those that moved."""
     line, edge, wanted = imgui.get_text_line_height(), hello_imgui.em_size(SHADE_EM), []
     for name in named:
         (x, y), size = name.corner - (area.left, area.top), imgui.calc_text_size(name.text)
@@ -384,7 +384,7 @@ def beside_search(part: ui.Area, free: ui.Area, rows: int) -> ui.Area:
 
 
 def _bars(viewer: Viewer, drawing: Drawing, of: str) -> list[Callable[[float], None]]:
-    """Return what draws a bar, so wide: one for depth, or one for each query that is painted as heat."""
+    """Return functions that draw a bar of a width: one for depth, or one for each query shown as heat."""
     state, picture, shown = viewer.state, viewer.state.session.picture, viewer.state.shown_results()
     depths, slots = state.stats.depths, painted(shown) if drawing is Drawing.HEAT else []
     if drawing is Drawing.DEPTH and depths is not None and state.scene is not None:
@@ -421,15 +421,15 @@ def say(text: str, area: ui.Area, name: str = "said over the scene", top: float 
 def bar_colours(strength: float, by: ColourMap | int) -> Array:
     """Return the (STEPS, 3) colours of a bar from its coldest to its hottest end, as the image has them.
 
-    by: the colour map, or the slot of a query among several, which has its own colour. What is half as strong
-    ends in the middle.
+    by: the colour map, or the slot of a query among several, which has its own colour. A strength of one half
+    ends in the middle of the colours.
     """
     heat = np.linspace(0, strength, STEPS)
     return (0.5 + 0.5 * heat)[:, None] * QUERY_COLOURS[by] if isinstance(by, int) else mapped(heat, by)
 
 
 def _bar(text: str, colours: Array, ends: tuple[float, float], tick: float | None, width: float) -> None:
-    """Text, bar with a tick at a value, and the values at its ends and in its middle."""
+    """Draw a text, a bar with a tick at a value, and the values at its ends and in its middle."""
     height, (low, high) = hello_imgui.em_size(BAR_HEIGHT_EM), ends
     imgui.text_unformatted(ui.elided(text, width))
     start = imgui.get_cursor_screen_pos()

@@ -1,4 +1,4 @@
-"""The panels "Scene", "Display", "Train" and "Messages": what is open and how it is shown, what goes on."""
+"""The panels "Scene", "Display", "Train" and "Messages"."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -109,7 +109,7 @@ def draw_display(viewer: Viewer) -> None:
 
 
 def _heat_scale(viewer: Viewer) -> tuple[float, float] | None:
-    """Relevancies at the ends of the colour bar: each answer's own, or the same for all."""
+    """Return the relevancies at the ends of the colour bar, as set here; None: each answer's own."""
     scale = viewer.state.session.picture.heat_scale
     changed, fixed = imgui.checkbox("Fixed heat scale", scale is not None)
     ui.tip("The same colour means the same relevancy in every answer, image and scene")
@@ -126,7 +126,7 @@ def _heat_scale(viewer: Viewer) -> tuple[float, float] | None:
 
 
 def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
-    """Draw displays that need the same beside each other, named first where one has several buttons."""
+    """Draw displays with the same needs in one row, named first where one has several buttons."""
     state = viewer.state
     buttons: dict[Button | None, str] = {one: one.label for row in rows for one in buttons_of(row)}
     if len(buttons) > len(rows):
@@ -139,7 +139,7 @@ def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
 
 
 def _compared(viewer: Viewer) -> None:
-    """Draw the choice of what is shown beside it."""
+    """Draw the choice of the display that is shown beside the main one."""
     state, split = viewer.state, viewer.state.session.split
     second = Button("", split.second, split.second_level if DISPLAYS[split.second].by_level else None)
     shown = {"off": "nothing", "levels": "three levels", "wipe": second.name}.get(split.mode, "")

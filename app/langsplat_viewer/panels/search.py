@@ -1,4 +1,4 @@
-"""What floats over the scene: the search box with its offers, the answers, and details of the chosen one."""
+"""The search over the scene: the box with its suggestions, the answers, and details of the chosen one."""
 
 from functools import lru_cache
 from typing import get_args
@@ -93,7 +93,7 @@ HISTOGRAM_EM, BINS = 3.0, 64
 
 
 def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
-    """Histogram, slider, and a button that lets the answer end by itself again."""
+    """Draw histogram, slider, and a button that restores the answer's own threshold."""
     low, high, counts = histogram(viewer.state.answer(query).result or result)
     height = hello_imgui.em_size(HISTOGRAM_EM)
     imgui.plot_histogram("##relevancies", counts, graph_size=ImVec2(-1, height))
@@ -147,7 +147,7 @@ def _answers(viewer: Viewer) -> None:
 
 
 def _line(viewer: Viewer, query: Query) -> None:
-    """Colour, phrase, verdict and a button to take it off; the phrase gets what the others leave."""
+    """Draw colour, phrase, verdict and a button that takes it off; the phrase gets the remaining width."""
     spacing, side = imgui.get_style().item_spacing.x, imgui.get_frame_height()
     result, left = viewer.state.result(query), imgui.get_cursor_pos_x()
     right = imgui.get_content_region_avail().x
@@ -197,7 +197,7 @@ def _verdict(viewer: Viewer, query: Query, width: float) -> None:
 
 
 def _details(viewer: Viewer, query: Query) -> None:
-    """Draw how a query was read or why it was not answered; of what may be here what can be done with it."""
+    """Draw how a query was understood or why it was not answered, and actions on a positive answer."""
     answer, result = viewer.state.answer(query), viewer.state.result(query)
     if answer.problem:
         ui.small_wrapped(answer.problem, "bad")
@@ -225,7 +225,7 @@ def _details(viewer: Viewer, query: Query) -> None:
 
 
 def _uncover(viewer: Viewer, answer: QueryAnswer) -> None:
-    """Move the view aside where a panel lies over what was found: once, and not under a hand; else say so."""
+    """Move the view aside if a panel covers what was found: once, and not during a drag; else say so."""
     state, area = viewer.state, ui.scene_area()
     if state.view is None or state.glide is not None or not answer.things:
         return

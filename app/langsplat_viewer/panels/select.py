@@ -133,7 +133,7 @@ def held_mode() -> Mode | None:
 
 
 def draw_stroke(viewer: Viewer, area: ui.Area) -> None:
-    """Draw the outline of what is being enclosed, and the brush."""
+    """Draw the outline of the stroke under way, and the brush."""
     tools = viewer.state.tools
     if tools.tool is None or viewer.state.scene is None:
         return
@@ -240,7 +240,7 @@ def holds_mouse(viewer: Viewer) -> bool:
 
 
 def draw_gizmo(viewer: Viewer, area: ui.Area) -> None:
-    """Draw the chosen gizmo where it was dragged to; what it moves follows, and stays on release."""
+    """Draw the chosen gizmo where it was dragged to; a drag is previewed, and applied on release."""
     state = viewer.state
     kind = state.edit_form.gizmo
     if not _is_shown(viewer) or state.view is None or state.session.split.columns > 1:
@@ -265,7 +265,7 @@ def draw_gizmo(viewer: Viewer, area: ui.Area) -> None:
 
 
 def _handles(viewer: Viewer, seen: tuple[Any, Any], kind: str, centre: Array) -> None:
-    """Arrows, rings or knobs: what is dragged is previewed, on release it is done."""
+    """Draw arrows, rings or knobs; a drag is previewed, and applied on release."""
     start, held = moving(centre).matrix, viewer.state.moving
     edited = gizmo.Matrix16(_columns(start if held is None else held[0].to.matrix @ start))
     changed = gizmo.manipulate(*seen, OPERATIONS[kind], gizmo.MODE.world, edited)
@@ -292,7 +292,7 @@ def _box_handles(viewer: Viewer, seen: tuple[Any, Any]) -> None:
 
 
 def box_of(matrix: Array) -> tuple[Point, Point]:
-    """Lowest and highest corner of the unit cube about the origin after a (4, 4) matrix without rotation."""
+    """Return the lowest and highest corner of the unit cube under a (4, 4) matrix without rotation."""
     half = np.abs(np.diag(matrix)[:3]) / 2
     low, high = (tuple(map(float, matrix[:3, 3] + sign * half)) for sign in (-1, 1))
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])
@@ -301,7 +301,7 @@ def box_of(matrix: Array) -> tuple[Point, Point]:
 def dragged(start: Array, now: Array) -> Similarity:
     """Return the similarity that leads from one (4, 4) matrix to another.
 
-    Of unlike scales the one that changed the most. Raises InputError where there is none.
+    Of different scales the one that changed most counts. Raises InputError where there is no similarity.
     """
     change = now @ np.linalg.inv(start)
     scales = np.linalg.norm(now[:3, :3], axis=0) / np.linalg.norm(start[:3, :3], axis=0)
@@ -312,7 +312,7 @@ def dragged(start: Array, now: Array) -> Similarity:
 
 
 def gl_matrices(camera: Camera, distance: float) -> tuple[Array, Array]:
-    """View and projection (4, 4) of a camera as OpenGL has them: y up, z towards the eye, depths -1 to 1."""
+    """Return a camera's (4, 4) view and projection in OpenGL's frame: y up, z to the eye, depths -1 to 1."""
     view = np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.world_to_camera
     near, far = NEAR * distance, FAR * distance
     projection = np.zeros((4, 4))

@@ -14,7 +14,7 @@ class Theme:
     """Colours as style sheets write them; what is see-through lies on ground, glass or what is raised."""
 
     ink: str  # text
-    soft: str  # text that matters less
+    soft: str  # secondary text
     ground: str  # panels
     glass: str  # what floats over the scene
     raised: str  # menus, lists, questions

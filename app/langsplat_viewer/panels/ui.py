@@ -1,4 +1,4 @@
-"""What panels share: the scene's area of the window, colours, letters, and small widgets."""
+"""Shared parts of panels: the scene's area of the window, colours, fonts, and small widgets."""
 
 import sys
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
@@ -56,7 +56,7 @@ class Area:
         return ImVec2(self.left, self.top), ImVec2(self.left + self.width, self.top + self.height)
 
     def right_of(self, taken: float) -> "Area":
-        """Return the area without so much of its left."""
+        """Return the area without its left `taken` window units."""
         return replace(self, left=self.left + taken, width=max(self.width - taken, 1.0))
 
     def columns(self, count: int) -> list["Area"]:
@@ -66,7 +66,7 @@ class Area:
 
 
 def scene_area() -> Area:
-    """Return what menus and docked panels leave free, at least one unit wide and high."""
+    """Return the area that menus and docked panels leave free, at least one unit wide and high."""
     dock = hello_imgui.get_runner_params().docking_params.dock_space_id_from_name(MAIN_DOCK)
     node = imgui.internal.dock_builder_get_central_node(dock) if dock else None
     if node is None:  # in the first frame
@@ -93,7 +93,7 @@ MOST_OVER = 0.94  # of the window that something which lies over it may take
 
 
 def coloured(text: str, colour: str = "soft") -> None:
-    """Write a text in a colour of the theme, by default that of what matters less."""
+    """Write a text in a colour of the theme, by default that of secondary text."""
     imgui.text_colored(theme.colour(colour), text)
 
 
@@ -194,7 +194,7 @@ def kept_box(viewer: Viewer, label: str, hint: str, button: str) -> str | None:
 
 @cache
 def _titled(kind: Any, panel: str) -> list[tuple[str, Any, Meta]]:
-    """Name, type and annotation of the fields of a dataclass that have their widget in a panel."""
+    """Return name, type and annotation of a dataclass's fields that have their widget in a panel."""
     found = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
         metas = hint.__metadata__ if get_origin(hint) is Annotated else ()
@@ -396,7 +396,7 @@ def leave_room(label: str, ems: float) -> None:
 
 
 def fitting(width_em: float, height_em: float) -> ImVec2:
-    """Return a size for what lies over the scene, in widths of an m, as far as the window has room for it."""
+    """Return the size of a window over the scene, given in widths of an m, within the window's room."""
     size, room = hello_imgui.em_to_vec2(width_em, height_em), imgui.get_main_viewport().work_size
     return ImVec2(min(size.x, MOST_OVER * room.x), min(size.y, MOST_OVER * room.y))
 

@@ -50,7 +50,7 @@ def _projection(viewer: Viewer, view: OrbitCamera) -> None:
 
 
 def _cuts(viewer: Viewer, radius: float) -> None:
-    """Near and far cut; at the ends of their sliders there is none."""
+    """Draw the near and the far cut; at the ends of their sliders there is none."""
     clip, (low, high) = viewer.state.session.clip, (part * radius for part in CUT_RANGE)
     text = "%.3g" if clip.near else "off"
     near = ui.slider("Near cut", max(clip.near, low), (low, high), text, logarithmic=True)

@@ -169,7 +169,7 @@ class Renderer(ABC, Generic[L]):
         self._layers = made
 
     def forget(self) -> None:
-        """Let go of what was rasterized for the last request."""
+        """Drop the layers that were rasterized for the last request."""
         self._layers = None
 
     def shows_nothing(self) -> bool:
@@ -193,7 +193,7 @@ class Renderer(ABC, Generic[L]):
     def depth_map(self, request: RenderRequest) -> Array:
         """Return the (H, W) camera z of the surface in a pane, 0 where nothing stops half the light."""
         layers = self._projected(request)
-        self._layers = replace(layers, images=())  # a device draws: its images are others now
+        self._layers = replace(layers, images=())  # a device draws: its images were overwritten
         return layers.view.median_depth()
 
     def release(self) -> None:
@@ -380,7 +380,7 @@ class GlRenderer(Renderer[moderngl.Texture]):
         self._maps.release()
 
 
-# Which one draws.
+# The choice of renderer.
 
 
 def suits_opengl(ctx: moderngl.Context) -> bool:
@@ -392,7 +392,7 @@ def suits_opengl(ctx: moderngl.Context) -> bool:
 
 
 def renderer_for(ctx: moderngl.Context | None, backend: Backend = "auto") -> Renderer[Any]:
-    """Return what draws with a backend; "auto" is "opengl" or "cpu". Raises BackendError."""
+    """Return the renderer of a backend; "auto" is "opengl" or "cpu". Raises BackendError."""
     if backend == "auto":
         backend = "opengl" if ctx is not None and suits_opengl(ctx) else "cpu"
     if backend == "opengl" and ctx is not None:

@@ -48,7 +48,7 @@ UNCLIPPED = Clip()
 
 @dataclass(frozen=True)
 class Splats:
-    """Sizes and colours of the Gaussians as drawn; answers and files have them as they are."""
+    """Changes of the Gaussians' sizes and colours in images; answers and files are not affected."""
 
     size: Annotated[float, widget("Display", "Splat size", "Draw every Gaussian smaller", 0.1, 1)] = 1.0
     sh_degree: Annotated[
@@ -270,7 +270,7 @@ def plain_request(scene: Scene, camera: Camera, picture: PictureConfig, **more: 
     return RenderRequest(edited_scene(scene), camera, camera.width, picture, **more)
 
 
-# Image formation for looking round: what training would clip is shown, an image of nothing explained.
+# Image formation of the viewer: a near plane that training would clip at moves, empty images are explained.
 
 VISIBLE_ALPHA = 1 / 255
 
@@ -302,7 +302,7 @@ def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) ->
 
 
 def with_splats(scene: Scene, splats: Splats) -> Scene:
-    """Return the scene with its Gaussians as `splats` wants them drawn; itself where that changes nothing."""
+    """Return the scene with `splats` applied to its Gaussians; the same object if that changes nothing."""
     gaussians = scene.gaussians
     if splats.size != 1:
         scales = gaussians.log_scales + np.float32(np.log(splats.size))
