@@ -90,13 +90,13 @@ def _members(group: str) -> list[str]:
 
 
 def _union(commands: Mapping[str, Any]) -> Any:
-    """Return the union of commands as subcommands of these names; tyro asks for two at least."""
+    """Return the union of commands as subcommands of these names; tyro needs at least two."""
     named = [Annotated[kind, tyro.conf.subcommand(name=name)] for name, kind in commands.items()]
     return Union[(*named, Annotated[None, tyro.conf.Suppress])]
 
 
 def check_commands(args: Sequence[str]) -> None:
-    """Raise InputError for a command that does not exist, naming those that are written like it."""
+    """Raise InputError for a command that does not exist, naming those with a similar spelling."""
     groups = registry.references("groups")
     known: Iterable[str] = (*(name for name in command_names() if " " not in name), *groups)
     for place, word in enumerate(args[:2]):

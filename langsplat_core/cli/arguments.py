@@ -24,14 +24,14 @@ class Runnable(Protocol):
 
 @dataclass(frozen=True)
 class OutputPath:
-    """Marks an argument that names what is written, so that it can be tried before the work."""
+    """Marks an argument that names an output, so that it can be checked before the work."""
 
     kind: Literal["file", "folder"]
 
 
 @dataclass(frozen=True)
 class Needs:
-    """Marks an argument that says nothing unless another field of the command, or a property, is given."""
+    """Marks an argument without effect unless another field of the command, or a property, is given."""
 
     field: str
     said: str = ""  # how that is given; "": by the option of its name

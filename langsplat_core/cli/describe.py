@@ -85,7 +85,7 @@ class Describe:
 
 
 def _plain(value: Any, engine: QueryEngine) -> Any:
-    """Words, spots and entries, ready for JSON; softmax shares are probabilities too if it is calibrated."""
+    """Return words, spots and entries for JSON; softmax shares are probabilities if it is calibrated."""
     if isinstance(value, tuple | list):
         return [_plain(item, engine) for item in value]
     if not is_dataclass(value):
@@ -137,7 +137,7 @@ def outline_lines(nodes: list[dict[str, Any]], unit: Unit) -> list[str]:
 
 
 def _outline_lines(nodes: list[dict[str, Any]], unit: Unit, depth: int) -> Iterator[str]:
-    """Nodes with their parts indented under them; a line for those of one name that have none, too."""
+    """Yield nodes with their parts indented; nodes of one name without parts share a line."""
     groups: dict[Any, list[dict[str, Any]]] = {}
     for node in nodes:
         name = None if node["word"] is None else node["word"]["phrase"]

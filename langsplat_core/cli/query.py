@@ -44,7 +44,7 @@ log = logging.getLogger("langsplat")
 class Unit:
     """The unit that lengths are printed and given in, and what places are relative to."""
 
-    metres: float | None  # per world unit; None where nobody said, which is the unit then
+    metres: float | None  # per world unit; None: unknown, and the unit is the world's
     origin: Array  # (3,) world units, of the scene
 
     @property
@@ -58,7 +58,7 @@ class Unit:
         return self.metres or 1.0
 
     def format(self, values: Array, between: str = " ") -> str:
-        """Lengths in world units as numbers of this unit, joined by `between`."""
+        """Return lengths in world units as numbers of this unit, joined by `between`."""
         return length_text(self.length * np.asarray(values), between)
 
     def place(self, place: Array) -> str:
@@ -70,7 +70,7 @@ PLACES = ("place", "centre", "box")  # keys of positions
 
 
 def in_world(content: Any, origin: Array) -> Any:
-    """Return what is ready for JSON, with its places in the world in place of relative to `origin` (3,)."""
+    """Return JSON `content` with its places, relative to `origin` (3,), moved into the world."""
     if isinstance(content, list | tuple):
         return [in_world(item, origin) for item in content]
     if not isinstance(content, dict) or not origin.any():
@@ -82,7 +82,7 @@ def in_world(content: Any, origin: Array) -> Any:
 
 
 def instance_lines(instances: Sequence[Instance], unit: Unit) -> list[str]:
-    """Aligned lines under a heading, one for each instance; none without instances."""
+    """Return aligned lines under a heading, one for each instance; none without instances."""
     if not instances:
         return []
     rows = [("", "score", "share", "Gaussians", f"centre, {unit.name}", f"size, {unit.name}")]
@@ -134,7 +134,7 @@ def chosen_instances(found: Sequence[Instance], numbers: Sequence[int]) -> Seque
 
 
 def basis_fields(engine: QueryEngine) -> dict[str, Any]:
-    """Return what the answers stand on, ready for JSON."""
+    """Return the basis of the answers, ready for JSON."""
     return {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
 
 
@@ -233,7 +233,7 @@ class QueryScene:
         return bool(self.why or self.segmenter)
 
     def _outlined(self, scene: Scene, texts: Sequence[str]) -> dict[str, tuple[Array, int]]:
-        """Return of each phrase what `compose.with_masks` takes, and the number of photographs with masks."""
+        """Return each phrase's masks for `compose.with_masks`, and the number of photographs with masks."""
         phrases = list(dict.fromkeys(texts))
         with TerminalProgress() as progress:
             photographs = kept_photographs(self.scene, scene, self.work, self.photographs, progress)
@@ -245,7 +245,7 @@ class QueryScene:
         return dict(zip(phrases, zip(shares.T, counts.tolist(), strict=True), strict=True))
 
     def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
-        """Return the phrases that can be asked, others said on stderr; raise why where none is left."""
+        """Return the phrases that can be asked; report others on stderr, raise if none is left."""
         phrases = [phrase for text in self.texts for phrase in split_phrases(text) or [text]]
         reasons: dict[str, list[str]] = {}  # why not -> these phrases
         if len(phrases) > 1:
@@ -369,7 +369,7 @@ def _engine(scene: Scene, load: LoadEncoder, encoder: str, taught: Path | None) 
 
 
 def _answer(result: QueryResult, camera: Camera | None) -> dict[str, Any]:
-    """One phrase's answer, ready for JSON; its pixel as where no camera sees it."""
+    """Return a phrase's answer, ready for JSON, with the pixel as where no camera sees it."""
     return {
         "phrase": result.phrase,
         "found": result.found,

@@ -168,7 +168,7 @@ def _ended(program: str, error: BaseException) -> int:
 
 
 class _StandardError(io.FileIO):
-    """Standard error, of which what cannot be written is lost, and the work goes on."""
+    """Standard error that drops what cannot be written, so that the work goes on."""
 
     def write(self, data: Any) -> int:
         """Write `data`, or lose it; return its number of bytes."""
@@ -178,7 +178,7 @@ class _StandardError(io.FileIO):
 
 
 def _prepare_standard_streams() -> None:
-    """Have a closed standard output fail when written to, standard error never; escape what is no text."""
+    """Make writing to a closed standard output fail, to standard error never; escape what is no text."""
     for number in (1, 2):
         try:
             os.fstat(number)
@@ -214,12 +214,12 @@ def _system_complaint(error: OSError) -> str:
 
 
 def print_json(content: Any) -> None:
-    """Print what a command found, arrays too, for programs."""
+    """Print a command's result, with its arrays, as JSON for programs."""
     print(json.dumps(content, indent=1, default=np.ndarray.tolist))
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int = 0) -> list[str]:
-    """Return lines of aligned columns: the first `left` of them begin, the others end below each other."""
+    """Return lines of aligned columns: the first `left` of them flush left, the others flush right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     signs = [f"{{:{'<' if at < left else '>'}{width}}}" for at, width in enumerate(widths)]
     return ["  ".join(["", *signs]).format(*row).rstrip() for row in rows]

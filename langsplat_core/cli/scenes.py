@@ -128,7 +128,7 @@ def _print_rows(rows: Iterable[tuple[str, str]]) -> None:
 
 
 def _machine() -> dict[str, str]:
-    """Return what this machine has."""
+    """Return the properties of this machine, by name."""
     about = f"{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"
     machine = {"langsplat": __version__, "python": about}
     machine |= {name: _version(name) for name in ("numpy", "numba", "moderngl", "imgui-bundle", *OPTIONAL)}
@@ -141,7 +141,7 @@ def _machine() -> dict[str, str]:
 
 
 def _opengl() -> str:
-    """Name of the OpenGL that draws without a window, or why there is none and what to do."""
+    """Return the name of the offscreen OpenGL driver, or why there is none and the remedy."""
     from langsplat_core.raster.opengl.rasterizer import create_egl_context
 
     try:
@@ -156,7 +156,7 @@ def _opengl() -> str:
 
 
 def _encoder() -> str:
-    """State of the bundled encoder, and what real photographs want."""
+    """Return the state of the bundled encoder, and the encoder that real photographs need."""
     try:
         encoder = encoders.load_text_encoder("demo")
         encoder.encode_texts(["red mug"])

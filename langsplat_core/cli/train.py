@@ -155,7 +155,7 @@ def with_file(args: Sequence[str]) -> list[str]:
 
 
 def _words(table: Mapping[str, Any], before: str = "") -> Iterator[str]:
-    """Yield a TOML table as words of a command line; ValueError for what cannot be told from an option."""
+    """Yield a TOML table as words of a command line; ValueError for words that look like an option."""
     for key, value in table.items():
         values = list(map(str, value)) if isinstance(value, list) else []
         if f"{before}{key}" == "config" or key[:1].isdigit() or any(text[:1] == "-" for text in values):

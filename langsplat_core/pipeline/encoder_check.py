@@ -1,8 +1,8 @@
-"""An encoder tried on the bundled room: its geometry, what its verdicts are worth, and a calibration.
+"""Test of an encoder on the bundled room: its geometry, the accuracy of its verdicts, and a calibration.
 
 The regions of the room's tree are cut out of rendered images, as training cuts masks out of photographs, and
-encoded. What each of them is called is known (`assets/demo/names.json`), so that phrases for what is there,
-and phrases for what is not, can be asked.
+encoded. Their names are known (`assets/demo/names.json`), so that phrases for what is present,
+and phrases for what is absent, can be asked.
 """
 
 import time
@@ -33,11 +33,11 @@ from langsplat_core.semantics.features import masked_crop
 from langsplat_core.semantics.relevancy import bundled_vocabulary
 from langsplat_core.training.language.merge_tree import SOLID
 
-VIEWS = 16  # of the room, from which images are taken
-IMAGES = (0, 1, 2)  # by level, of one region, from the views that show most of it
-LEAST = 150  # px that an image shows of it
-BATCH = 32  # images that are encoded between two lines of progress
-MOST = 200  # phrases of one kind that are asked
+VIEWS = 16  # views of the room from which images are cut
+IMAGES = (0, 1, 2)  # number per region, by level, from the views that show most of it
+LEAST = 150  # px of the region that an image shows, at least
+BATCH = 32  # images encoded between two reports of progress
+MOST = 200  # most phrases of one kind that are asked
 FOLDS = 5  # of cross-validation
 ASKED = {  # fields of `Calibration`
     "thing": "things (sofa)",
@@ -66,7 +66,7 @@ class Rates:
     absent: int
     found: float
     rejected: float
-    # By a calibration of the room, each phrase by what was fitted without it; None where none can be fitted.
+    # The same by a cross-validated calibration on the room; None where none can be fitted.
     calibrated: tuple[float, float] | None
 
 
@@ -88,19 +88,19 @@ class EncoderReport:
 class _Names(Struct):
     """assets/demo/names.json."""
 
-    names: dict[int, list[str]]  # whole, or part with a word of its own -> what it is called
+    names: dict[int, list[str]]  # whole, or part with a word of its own -> its names
     called: list[str]  # all words for anything there
 
 
 @dataclass(frozen=True, eq=False)
 class NamedRoom:
-    """The bundled room, and what is known of it."""
+    """The bundled room with the names of its things."""
 
     scene: Scene
     tree: Tree
     owners: Array  # (K,) the root that each node of the tree is in
-    wholes: Mapping[int, Sequence[str]]  # node -> what it is called
-    parts: Mapping[int, Sequence[str]]  # the same of those with a word of their own
+    wholes: Mapping[int, Sequence[str]]  # node -> its names
+    parts: Mapping[int, Sequence[str]]  # part with a word of its own -> its names
     called: frozenset[str]  # single words
 
     def has_not(self, phrase: str) -> bool:
@@ -128,7 +128,7 @@ def bundled_room() -> NamedRoom:
 
 
 def check_encoder(encoder: Encoder, progress: Progress = silent) -> EncoderReport:
-    """Return what an encoder makes of the bundled room; encoding takes nearly all of the time."""
+    """Return the report of an encoder on the bundled room; encoding takes nearly all of the time."""
     start, room = time.perf_counter(), bundled_room()
     nodes, crops = room_images(room, encoder.image_size, progress)
     parts = []
@@ -172,7 +172,7 @@ def check_encoder(encoder: Encoder, progress: Progress = silent) -> EncoderRepor
 
 
 def room_images(room: NamedRoom, side: int, progress: Progress = silent) -> tuple[Array, Array]:
-    """Return (M,) nodes, and (M, side, side, 3) uint8 images of them as they are cut out of renderings."""
+    """Return (M,) nodes, and (M, side, side, 3) uint8 images of them, cut out of renderings."""
     scene, tree = room.scene, room.tree
     at = [tree.at(level) for level in range(3)]
     views = [view_of(scene, camera) for camera in scene.cameras[:: -(-len(scene.cameras) // VIEWS)]]
@@ -199,7 +199,7 @@ def room_images(room: NamedRoom, side: int, progress: Progress = silent) -> tupl
 
 
 def _engine(room: NamedRoom, encoder: Encoder, nodes: Array, images: Array) -> QueryEngine:
-    """Return the room with the mean vector of each region's images; a subpart has that of its part."""
+    """Return an engine on the room: regions have the mean vector of their images, subparts their part's."""
     kinds, row = np.unique(nodes, return_inverse=True)
     vectors = unit(np.stack([np.bincount(row, column) for column in images.T], 1)).astype(np.float32)
     number = np.full(room.tree.count + 1, -1)
@@ -265,7 +265,7 @@ def _phrases(
 
 
 def _answers(engine: QueryEngine, texts: Sequence[str]) -> tuple[Array, float]:
-    """Return the (n, 3) best fits of at most `MOST` of the phrases, and the share that was found."""
+    """Return the (n, 3) best fits per level of at most `MOST` phrases, and the share that was found."""
     asked = texts[:: -(-len(texts) // MOST) or 1]
     answers = (run_phrase(engine, text).answer for text in asked)  # a megabyte each
     rows = np.array([(*one.fits, one.found) for one in answers]).reshape(-1, 4)
@@ -300,15 +300,15 @@ def report_lines(report: EncoderReport) -> str:
 
 # Platt scaling (Platt 1999) of fits, with Platt's smoothed targets.
 
-FEWEST = 10  # phrases of either kind that a calibration is fitted to
+FEWEST = 10  # least phrases of either kind that a calibration is fitted to
 REJECTED = 0.95  # of what is absent, among the phrases that a calibration is fitted to
 
 
 def fit_scaling(present: Array, absent: Array) -> PlattScaling:
-    """Fit to (P, 3) fits of phrases for what is there and (A, 3) of others, which weigh the same.
+    """Fit to (P, 3) fits of present phrases and (A, 3) of absent ones; both sets have the same weight.
 
     A fourth column, the mean fits of phrases, counts too. Raises InputError where there are fewer than ten of
-    either, or the fits do not tell them apart.
+    either, or the fits do not separate them.
     """
     if min(len(present), len(absent)) < FEWEST:
         raise InputError("a calibration needs ten phrases for what is there and ten for what is not")
@@ -337,7 +337,7 @@ def _probabilities(scaling: PlattScaling, fits: Array) -> Array:
 
 
 def _cross_validated(present: Array, absent: Array) -> tuple[float, float]:
-    """Return the shares found and rejected, each fold of phrases by what was fitted to the others."""
+    """Return the shares found and rejected, each fold of phrases judged by a fit to the others."""
     found: tuple[list[Array], list[Array]] = [], []
     for fold in range(FOLDS):
         own = [np.arange(len(fits)) % FOLDS == fold for fits in (present, absent)]

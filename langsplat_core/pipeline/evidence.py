@@ -1,9 +1,9 @@
 """Evidence of an answer: the photographs that show it, with the mask of each that overlaps most with it.
 
 The language features of a region are a mean over masks, in which a wrong one hides, and which looks as sure
-for three photographs as for thirty. So every photograph counts as one vote, for the region if it has a mask
-of just that, else against it, and the share of votes for it has a beta distribution. The fit of the phrase to
-each mask shows a wrong vote.
+for three photographs as for thirty. So every photograph is one vote: for the region if it has a mask of just
+that region, else against it. The share of votes for the region has a beta distribution. A wrong vote shows in
+the fit of the phrase to its mask.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ class Vote:
 
     view: int  # index into the scene's cameras
     photograph: str  # name of that camera
-    pixels: int  # of the photograph, that show the answer
+    pixels: int  # number of the photograph's pixels that show the answer
     mask: int  # row of the photograph's features; -1 where no mask touches the answer
     overlap: float  # intersection over union of the mask and the answer as rendered, in [0, 1]
     cosine: float | None  # of the mask's vector with the phrase; None without a mask
@@ -44,7 +44,7 @@ class Vote:
 
     @property
     def agrees(self) -> bool:
-        """True for a vote for the answer: its mask is of just that."""
+        """True for a vote for the answer: the mask is of just the answer."""
         return self.overlap >= VOTE
 
 
@@ -52,11 +52,11 @@ class Vote:
 class Evidence:
     """The photographs that show the best region of an answer."""
 
-    phrase: str  # that masks are compared with: of "handle of the mug", "handle"
+    phrase: str  # phrase that masks are compared with: for "handle of the mug", "handle"
     node: int  # of the scene's tree
     members: Array  # (N,) bool Gaussians of the answer in that node
     votes: tuple[Vote, ...]  # for the answer, the best fit first
-    others: tuple[Vote, ...]  # against it, those that show most of it first
+    others: tuple[Vote, ...]  # against the answer, those that show most of it first
 
     @property
     def share(self) -> float:
@@ -124,7 +124,7 @@ def find_evidence(
 
 
 def _best_region(engine: QueryEngine, answer: QueryResult) -> tuple[int, Array] | None:
-    """Return the node of the best region of an answer, and what of the answer is in it."""
+    """Return the node of an answer's best region, and the answer's (N,) bool members in it."""
     at = engine.tree.at(answer.level)
     inside = answer.members & (at != NO_NODE)
     if not inside.any():
@@ -136,7 +136,7 @@ def _best_region(engine: QueryEngine, answer: QueryResult) -> tuple[int, Array] 
 
 
 def _shown(scene: Scene, view: int, members: Array) -> Array:
-    """Return (H, W) bool pixels of a view that these Gaussians paint more than half of."""
+    """Return (H, W) bool pixels of a view of which the Gaussians `members` make more than half."""
     drawn = view_of(scene, scene.cameras[view])
     return np.asarray(drawn.splat(members[:, None].astype(np.float32))[0][..., 0] > SOLID)
 

@@ -51,13 +51,13 @@ from langsplat_core.training.language.merge_tree import MergeTree, draw_patches,
 
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
 Latents = tuple[Array, Array]  # (3, N, d) of the codec's type, (3, N) float32
-FITTED, JUDGED = 12_000, 2_000  # Gaussians whose lifted vectors a codec is fitted to, and judged on
+FITTED, JUDGED = 12_000, 2_000  # Gaussians whose lifted vectors a codec is fitted to, and evaluated on
 LATENT_LIFTS = frozenset({"one-pass", "gradient"})  # modes that average latents, of a codec fitted to masks
 MOST_CONFIDENCE = 65_504.0  # pixels; the largest number that float16 holds
 
 
 def views_of(cameras: Sequence[Camera], features: Sequence[ImageFeatures]) -> Views:
-    """Return cameras with what each saw, read when a view is looked at."""
+    """Return cameras with their image features, which are read when a view is accessed."""
     return OnDemand(range(len(cameras)), lambda index: (cameras[index], features[index]))
 
 
@@ -103,7 +103,7 @@ def language_field(
 def field_of(
     latents: Latents, codec: Codec, encoder: PhraseEncoder, phrases: tuple[str, ...]
 ) -> LanguageField:
-    """Return a treeless field with all that queries need of the encoder, and each of `phrases` once."""
+    """Return a field without a tree, with all that queries need of the encoder, and distinct `phrases`."""
     names = list(dict.fromkeys(phrase_key(phrase) for phrase in phrases))
     return LanguageField(
         *latents,
@@ -132,12 +132,12 @@ class _Stages:
 
     @property
     def by_weights(self) -> bool:
-        """True where vectors are lifted by mask weights, else latents are averaged themselves."""
+        """True where vectors are lifted by mask weights; False where latents are averaged."""
         return self.config.lift.mode not in LATENT_LIFTS
 
     @property
     def lift(self) -> LiftConfig:
-        """The settings that change the result: not the backend, which changes who computes."""
+        """The settings that change the result, so not the backend."""
         mode = self.config.lift.mode
         return LiftConfig(mode=mode) if mode != "gradient" else replace(self.config.lift, backend="auto")
 
@@ -153,7 +153,7 @@ class _Stages:
         return self.work / f"{stage_key(name, version, *self.inputs[1], *settings)}.npz"
 
     def kept(self, path: Path, make: Callable[[], Arrays]) -> Arrays:
-        """Return what one process makes, from mask weights that are everyone's work."""
+        """Return the arrays that one process makes, after all have computed the mask weights."""
         if self.by_weights and not path.exists():
             _ = self.mask_weights
         return self.processes.once(lambda: kept(path, make))
@@ -193,7 +193,7 @@ class _Stages:
 
     @cached_property
     def formation(self) -> RasterSettings:
-        """The image formation of the views; few are read, as their masks come with them."""
+        """The image formation of the views, from few of them, since reading a view reads its masks."""
         step = max(-(-len(self.views) // NEAR_CAMERAS), 1)
         cameras = [self.views[index][0] for index in range(0, len(self.views), step)]
         return self.config.radiance.formation(near_plane(self.gaussians, cameras))
@@ -202,7 +202,7 @@ class _Stages:
         return load_lifting_rasterizer(self.config.lift.backend)
 
     def codec(self) -> tuple[Codec, codec_fit.CodecReport]:
-        """Return the codec, fitted to lifted vectors, where that helps also to the masks' own."""
+        """Return the codec, fitted to lifted vectors and, where that helps, to those of masks too."""
 
         def make() -> Arrays:
             settings, masks = self.config.codec, np.concatenate(self.inputs[0])
@@ -220,7 +220,7 @@ class _Stages:
         return codec_from_tensors(kind, made), codec_fit.CodecReport(*figures)
 
     def lifted_samples(self) -> tuple[Array, Array]:
-        """Return (M, D) float32 vectors of Gaussians that a codec is fitted to, and of its judges."""
+        """Return (M, D) float32 vectors of Gaussians for fitting a codec, and of others to evaluate it."""
         order = np.random.default_rng(self.config.codec.seed).permutation(len(self.gaussians))
         robust, samples = self.lift.mode == "median", []
         for rows in (order[:FITTED], order[FITTED : FITTED + JUDGED]):
@@ -299,12 +299,12 @@ class _Stages:
 
 CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
 NAMED = (0.8, 1.3)  # costs between which wholes are those that have a name
-UNNAMED = 2.0  # spreads above everyday phrases that the nearest name of anything reaches
+UNNAMED = 2.0  # spreads above everyday phrases that the nearest name of any region reaches
 AREA = 0.75  # power of a node's share of the area, by which its name counts
-VIEWS = 8  # in which the encoder sees a node alone
-OUTLIERS = 0.4  # share of these looks, those least like the others, that does not count
-LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing
-AGREED = "what masks agree on"  # which is drawn, named and described: stages
+VIEWS = 8  # views in which the encoder sees a node alone
+OUTLIERS = 0.4  # share of these views, those least like the others, that does not count
+LEAST = 2.5e-4  # share of the image: smaller regions are not shown to the encoder
+AGREED = "what masks agree on"  # in the names of stages
 VERSION = 3
 
 
@@ -370,10 +370,10 @@ def _described(
     photographs: Sequence[tuple[Array, Array | None]],
     folder: Path,
 ) -> Array:
-    """Return the (P + K, D) unit vectors of what `nodes` show alone in their `best_views`; of others 0.
+    """Return (P + K, D) unit vectors of `nodes`, seen alone in their `best_views`; 0 for other nodes.
 
-    The mean of the looks that agree most with all. eyes: (V, 3) positions of cameras; drawn: files of the
-    (H, W) patches of each view.
+    A vector is the mean of those views' that agree most with all. eyes: (V, 3) positions of cameras; drawn:
+    files of the (H, W) patches of each view.
     """
     encoder, seen = stages.encoder, [open_array(path) for path in drawn]
     pixels = tree.totals(np.stack([np.bincount(one[one >= 0], minlength=tree.count) for one in seen], 1)).T
@@ -401,8 +401,8 @@ def _described(
 def best_views(pixels: Array, eyes: Array, most: int) -> Array:
     """Return (V, K) bool, up to `most` views of each of K nodes: those that show much of it, from all sides.
 
-    One after another the view with the largest root of its `pixels` (V, K) times the distance of its place,
-    of `eyes` (V, 3), to the nearest of those before; never one without pixels.
+    Views are chosen one by one: each time the one with the largest root of its `pixels` (V, K) times the
+    distance of its eye, of `eyes` (V, 3), to the nearest chosen one; never one without pixels.
     """
     chosen, apart = np.zeros(pixels.shape, bool), np.ones(pixels.shape)
     distances = np.linalg.norm(eyes[:, None] - eyes, axis=2)
@@ -417,7 +417,7 @@ def best_views(pixels: Array, eyes: Array, most: int) -> Array:
 def name_scores(tree: MergeTree, areas: Array, vectors: Array, encoder: PhraseEncoder) -> Array | None:
     """Return (P + K,) float64, how well nodes with `vectors` are named; None if the encoder cannot tell.
 
-    The nearest name of a thing, in spreads above everyday phrases, times a power of the area.
+    The score is the cosine of the nearest name, in spreads above everyday phrases, times a power of the area.
     """
     plain = (name for name in bundled_vocabulary("things") if name.replace(" ", "").isalpha())
     names = [name for name in plain if not encoder.unknown_words(name)]

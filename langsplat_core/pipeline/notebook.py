@@ -1,4 +1,4 @@
-"""Scenes in a notebook: `show`, the exported page in a frame of the cell; `draw`, a picture.
+"""Scenes in a notebook: `show` puts the exported page into a frame of the cell, `draw` makes an image.
 
 Nothing is served or fetched, and no widget is needed: the page is in the notebook's file, so that it stays
 where the notebook is read without Python. A `Scene` or an answer at the end of a cell is shown by itself.
@@ -72,7 +72,7 @@ def show(
 
 
 def draw(scene: Scene, size: tuple[int, int] = (960, 540), answer: QueryResult | None = None) -> Image.Image:
-    """Return a picture of a scene; an `answer` as heat, from the nearest camera that has it in its image."""
+    """Return an image of a scene; an `answer` as heat, from the nearest camera that has it in its image."""
     fitted = [camera.fitted(*size) for camera in scene.cameras]
     camera = fitted[0] if fitted else scene.framing_camera(size)
     if answer is None:

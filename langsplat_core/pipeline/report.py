@@ -30,7 +30,7 @@ from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
 
 REPORT, PAGE = "report.json", "report.html"
-PREVIEW = "so-far.ply"  # in the work folder: what the window shows of a training under way
+PREVIEW = "so-far.ply"  # in the work folder: Gaussians that the window shows of a training under way
 APART = 10.0  # times the median step to a neighbouring camera; captures that went well have at most 5
 
 
@@ -49,8 +49,8 @@ class TrainReport:
     mask_count: int = 0
     codec: str = ""  # its kind
     codec_size: int = 0  # codewords of a codebook, numbers per latent of other kinds
-    codec_cosine: float = 0.0  # mean, of a Gaussian's vector with what the codec makes of it
-    relevancy_error: float = 0.0  # mean absolute, of what the codec makes of it, over everyday phrases
+    codec_cosine: float = 0.0  # mean cosine of Gaussians' vectors with their decoded latents
+    relevancy_error: float = 0.0  # mean absolute error of decoded latents, over everyday phrases
     relevancy_error_p99: float = 0.0
     observed: float = 0.0  # fraction of Gaussians with language features at the whole level
     dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
@@ -72,7 +72,7 @@ def read_report(work: Path) -> TrainReport:
 
 
 def stated_figures(path: Path) -> dict[str, Any]:
-    """Return what a report of whatever origin says; nothing where there is none or it cannot be read."""
+    """Return the content of a report, which is not trusted; {} where there is none or it cannot be read."""
     try:
         stated = read_json_file(path, limit=1_000_000)
     except (InputError, FormatError):
@@ -131,7 +131,7 @@ def quality_warnings(
 
 
 def camera_groups(positions: Array) -> list[Array]:
-    """Return rows of (M, 3) positions of two or more that lie `APART` as groups, the largest first."""
+    """Return groups of two or more of (M, 3) positions that lie `APART`, as rows, the largest first."""
     from scipy.cluster.hierarchy import fcluster, linkage
 
     whole = [np.arange(len(positions))]
@@ -191,7 +191,7 @@ def write_reports(
 
 
 def _text(text: object, limit: int = 120) -> str:
-    """Return text of whatever origin as HTML."""
+    """Return untrusted text as HTML."""
     return html.escape(printable_line(text, limit))
 
 
@@ -259,7 +259,7 @@ def _uri(pixels: Array) -> str:
 
 
 def _from_above(scene: Scene, held_out: Container[str]) -> str:
-    """Draw the cameras, and what lies below their eyes, with their longest way across the page."""
+    """Draw the cameras and the scene below them from above, with their longest extent across the page."""
     up, eyes = scene.up(), np.array([camera.position for camera in scene.cameras])
     flat = (eyes - eyes.mean(0)) - np.outer((eyes - eyes.mean(0)) @ up, up)
     right = np.linalg.svd(flat)[2][0]

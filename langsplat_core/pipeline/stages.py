@@ -137,7 +137,7 @@ def sole_use(folder: Path) -> Iterator[None]:
         yield
         return
     with _locked(folder) as file:
-        with contextlib.suppress(OSError):  # a full disk is told of where something is lost by it
+        with contextlib.suppress(OSError):  # a full disk is reported where something is lost by it
             file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()}\n".encode())
         try:
@@ -167,7 +167,7 @@ def _locked(folder: Path) -> io.FileIO:
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), os.stat(folder / LOCK)):
                 return file
-        file.close()  # who held it has removed it meanwhile: this is a lock on nothing
+        file.close()  # its holder has removed the file meanwhile: this lock protects nothing
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class ProcessGroup:
 
     @property
     def is_main(self) -> bool:
-        """True for the process that does what cannot be shared, and that speaks."""
+        """True for the process that does the work that cannot be shared, and that prints."""
         return self.rank == 0
 
     def share(self, items: Sequence[T]) -> list[T]:

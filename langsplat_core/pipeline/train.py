@@ -46,9 +46,9 @@ from langsplat_core.training.radiance import trainer
 from langsplat_core.training.radiance.differentiable import evaluate_views
 
 FEWEST_VIEWS = 3
-VERSION = 9  # of what training makes
+VERSION = 9  # of the results of training
 
-Until = Literal["gaussians", "language field"]  # what a training ends with
+Until = Literal["gaussians", "language field"]  # the last stage of a training
 
 log = logging.getLogger("langsplat")
 
@@ -106,7 +106,7 @@ class _Run:
 
     @cached_property
     def seconds(self) -> dict[str, float]:
-        """Seconds that each stage took, in this process and in earlier ones that were interrupted."""
+        """Seconds that each stage took, in this process and in earlier, interrupted ones."""
         return reports.stated_figures(self.seconds_file)
 
     @contextmanager
@@ -234,7 +234,7 @@ def _language(
 
 
 def _mean(scores: Iterable[float | None]) -> float | None:
-    """Mean of the scores that could be measured; None where none could."""
+    """Return the mean of the scores that could be measured; None where none could."""
     measured = [score for score in scores if score is not None]
     return float(np.mean(measured)) if measured else None
 
@@ -256,7 +256,7 @@ def _described(
 ) -> OnDemand[ImageFeatures]:
     """Find the masks of the photographs at `train`, and their vectors where masks agree between photographs.
 
-    Others are described once they agree. Kept by mask settings, encoder and image.
+    Other masks are encoded once they agree. Results are kept by mask settings, encoder and image.
     """
     log.info("masks: %s, encoder: %s", source.name, encoder.id)
     if encoder.id == DEMO and not capture.drawn:
@@ -280,7 +280,7 @@ def trained_gaussians(
     held_out: Sequence[int] = (),
 ) -> Gaussians:
     """Return the Gaussians of the photographs at `train`, from `work` where they were trained before."""
-    # The backend changes who computes, not what, so that a run may move between machines; nor do checkpoints.
+    # Backend and checkpoints do not change the result, so that a run may move between machines.
     settings = replace(config, backend="auto", checkpoint_every=RadianceConfig.checkpoint_every)
     done = work / f"{stage_key('radiance', VERSION, settings, capture.digest(train))}.ply"
     stated = done.with_suffix(".digest")
@@ -322,8 +322,8 @@ class Trained:
     """A row of the table of captures: how the training of one ended."""
 
     name: str
-    code: int  # as an exit code: 0; 2: refused; 130: interrupted; 1: whatever else happened
-    seconds: float  # of all runs, or of this one where it failed
+    code: int  # as an exit code: 0; 2: refused; 130: interrupted; 1: any other failure
+    seconds: float  # of all runs, or of the last one if that failed
     said: tuple[str, ...]  # why it failed, and warnings
     located: str = "-"  # "14 of 16" photographs
     psnr: str = "-"  # "26.33 dB", of held-out views
@@ -346,7 +346,7 @@ def tasks_for(datasets: Sequence[Path], out: Path, config: TrainConfig, until: U
 def train_captures(
     tasks: Sequence[Task], on: str, progress: Progress = silent
 ) -> Generator[Trained, None, None]:
-    """Yield what came of each task as it ends; on: ``local:N``, N at a time here, or ``dask://HOST:PORT``.
+    """Yield the outcome of each task as it ends; on: ``local:N``, N at a time here, or ``dask://HOST:PORT``.
 
     Leaving the iteration, by Ctrl-C too, ends all that runs, on other machines as well.
     """
@@ -395,7 +395,7 @@ def _engine(on: str) -> Iterator[Executor]:
 
 
 def _train_apart(task: Task, progress: Progress = silent) -> Trained:
-    """Train in a process of its own, whose end, however it comes, ends no other."""
+    """Train in a process of its own, whose crash ends no other."""
     began = time.monotonic()
     try:
         report, losses = apart.run(_train_while_wanted, task, progress=progress)

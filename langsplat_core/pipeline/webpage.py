@@ -67,7 +67,7 @@ STILL = 1280  # pixels of the longer side of the picture in the page
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
 TOUCHING: tuple[grammar.Side, ...] = ("near", "on", "in")  # relations that follow from points
 CHUNK = 256  # Gaussians that share the range of a quantised column
-FLATTEST, OPAQUE = -46.0, 20.0  # bounds of the logarithm of a scale, whatever a file holds; of a logit
+FLATTEST, OPAQUE = -46.0, 20.0  # log scales are clipped to [-46, 46], logits to [-20, 20]
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class PageReport:
     """The content of a page that was written."""
 
     gaussians: int
-    phrases: int  # that can be completed
+    phrases: int  # number that completion offers
     free_text: bool  # the encoder is in the page, so that any of its words may be combined
     bytes: int
     why_not: str = ""  # reason why nothing can be searched, "" where it can
@@ -89,7 +89,7 @@ def write_page(path: Path, page: tuple[str, PageReport]) -> PageReport:
 
 
 def covered(scene: Scene, cameras: Sequence[Camera]) -> Array:
-    """Return (N,) float32: the most that each Gaussian paints of any camera's image, in pixels of 320."""
+    """Return (N,) float32: each Gaussian's largest summed weight in any camera's image of 320 px, pixels."""
     most = np.zeros(len(scene.gaussians), np.float32)
     for camera in (each.within(320) for each in cameras):
         painted = view_of(scene, camera).gather(np.ones((camera.height, camera.width, 1), np.float32))
@@ -110,8 +110,8 @@ def make_page(
     """Return the HTML of `scene`, searched by `engine`; InputError where nothing can be drawn.
 
     first: views ahead of the scene's cameras, the first of which the page opens with. notes: texts and the
-    (3,) points that they are pinned to, in the scene's units. phrase: what is asked at first. at_most: so
-    many Gaussians are drawn, those that cover most of a view; answers are those of all.
+    (3,) points that they are pinned to, in the scene's units. phrase: the first query. at_most: number
+    of Gaussians that are drawn, those that cover most of a view; answers are those of all.
     """
     gaussians = scene.gaussians
     rows = np.flatnonzero(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= 1 / 255))
@@ -339,7 +339,7 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
 
 
 def _touching(bodies: Sequence[Body]) -> list[tuple[int, int, int]]:
-    """Return every relation that follows from points: its number in `TOUCHING`, what stands so, to what."""
+    """Return every relation that follows from points: index into `TOUCHING`, subject and object."""
     low, high = (np.array([getattr(one, end) for one in bodies]) for end in ("low", "high"))
     found = []
     for number, one in enumerate(bodies):
