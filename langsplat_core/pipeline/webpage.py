@@ -41,13 +41,12 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import write_whole
 from langsplat_core.io.quantised import to_bytes
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query import grammar, taught
+from langsplat_core.query import grammar, relations, taught
 from langsplat_core.query.answers import place_of
 from langsplat_core.query.compose import HALF
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
-from langsplat_core.query.instances import BOXED, oriented_box
+from langsplat_core.query.instances import BOXED, INNER, oriented_box
 from langsplat_core.query.inventory import suggest
-from langsplat_core.query.relations import ASIDE, FEWEST, NEAR, SPECK, WHOLE, Body, body, stands, upright
 from langsplat_core.query.rule import LOW, RULE
 from langsplat_core.raster.opengl import WEB, shader, splat_shaders
 from langsplat_core.raster.render import render, view_of
@@ -65,7 +64,8 @@ LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "COLOURS", "PARTS", "ALSO_NOUNS
 TABLES = ("PREPOSITIONS", "SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")  # also in query/grammar.py
 STILL = 1280  # pixels of the longer side of the picture in the page
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
-TOUCHING: tuple[grammar.Side, ...] = ("near", "on", "in")  # relations that follow from points
+# Numbers of query/relations.py by which a page relates things.
+NUMBERS = ("SAMPLE", "FEWEST", "SPECK", "NEAR", "TOUCH", "FOOT", "FLAT", "HELD", "SUNK", "ASIDE")
 CHUNK = 256  # Gaussians that share the range of a quantised column
 FLATTEST, OPAQUE = -46.0, 20.0  # log scales are clipped to [-46, 46], logits to [-20, 20]
 
@@ -275,16 +275,11 @@ def language_tables(
         "bars": [asdict(bar) for bar in engine.bars or ()],
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
         "rule": asdict(RULE) | {"found": found, "half": HALF, "low": LOW},
-        "grammar": {
-            **{name.lower(): sorted(getattr(grammar, name)) for name in LISTS},
-            **{name.lower(): getattr(grammar, name) for name in TABLES},
-        },
-        "space": {
-            "kinds": TOUCHING,
-            "aside": ASIDE,
-            "specks": (FEWEST, SPECK),
-            "frame": upright(engine.scene.up()).ravel().tolist(),
-        },
+        "grammar": {name.lower(): sorted(getattr(grammar, name)) for name in LISTS}
+        | {name.lower(): getattr(grammar, name) for name in TABLES},
+        "space": {name.lower(): getattr(relations, name) for name in NUMBERS}
+        | {"half": HALF, "inner": INNER, "visible": float(regions.weights[regions.counts].min())},
+        "frame": relations.upright(engine.scene.up()).ravel().tolist(),
         "examples": suggested.examples,
         "phrases": suggested.phrases,
     }
@@ -321,8 +316,6 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
         for region, own in enumerate(each, sum(map(len, regions.nodes[:level]))):
             places[region], boxes[region] = place_of(means[own])
             corners[region] = oriented_box(means[own[:: -(-len(own) // BOXED)]] - centre).corners
-        if level == WHOLE:
-            bodies = [body(means[own] - centre, upright(scene.up())) for own in each]
     share = regions.mixtures(codes, engine.field.codec.size + 1)[:, :-1].tocoo()
     return {
         "share_of": share.row.astype(np.uint32),
@@ -333,22 +326,7 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
         "places": scene.in_world(places),
         "boxes": scene.in_world(boxes).reshape(count, 6),
         "corners": corners.astype(np.float32).reshape(count, 24),
-        "bodies": np.array([(one.low, one.high) for one in bodies], np.float32).reshape(-1, 6),
-        "pairs": np.array(_touching(bodies), np.uint32).reshape(-1, 3),
     }
-
-
-def _touching(bodies: Sequence[Body]) -> list[tuple[int, int, int]]:
-    """Return every relation that follows from points: index into `TOUCHING`, subject and object."""
-    low, high = (np.array([getattr(one, end) for one in bodies]) for end in ("low", "high"))
-    found = []
-    for number, one in enumerate(bodies):
-        apart = np.linalg.norm(np.maximum(0, np.maximum(low - one.high, one.low - high)), axis=1)
-        for other in np.flatnonzero(apart[:number] <= NEAR * one.size).tolist():
-            for a, b in ((number, other), (other, number)):
-                holds = (stands(kind, bodies[a], bodies[b], None) for kind in TOUCHING)
-                found += [(kind, a, b) for kind, there in enumerate(holds) if there]
-    return found
 
 
 def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:

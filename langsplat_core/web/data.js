@@ -60,9 +60,7 @@ const [MEAN, SCALE, QUATERNION, OPACITY, SH] = [0, 3, 6, 10, 11]; // the first c
 // The Gaussians as textures take them: `means` (M, 3), relative to the page's origin; `geometry`, three layers
 // of RGBA floats (mean and opacity, scales, unit quaternion) and `sh`, the coefficients four to a texel.
 export function unpackGaussians({ low, high, ranges }, texels) {
-  const [columns, count] = low.shape;
-  const wide = high.shape[0];
-  const chunks = ranges.shape[1];
+  const [[columns, count], [wide], [, chunks]] = [low.shape, high.shape, ranges.shape];
   const value = (column, i) => {
     const at = column * count + i;
     const range = 2 * (column * chunks + Math.floor(i / CHUNK));

@@ -72,7 +72,7 @@ export class Language {
     [this.codewords, this.dim] = tensors.codebook.shape;
     this.gaussians = tensors.codes.shape[1];
     this.regions = { counts: meta.counts, parents: this.tensors.parents, sizes: this.tensors.sizes };
-    this.space = new Space(meta, this.tensors);
+    this.space = new Space(meta);
     this.keys = new Map(meta.keys.map((key, row) => [key, row]));
     this.taught = new Map(meta.taught.map((word, row) => [phraseKey(word.name), { ...word, row }]));
     const { prepositions, articles } = meta.grammar;
@@ -147,14 +147,27 @@ export class Language {
       const unwanted = other.inside.filter((region) => other.regionFits[region] >= least);
       return other.verdict.found ? this.restricted(asked, unwanted, asked, true) : asked;
     }
-    const [things, others] = [asked, other].map((answer) => (answer ? this.wholesOf(answer) : []));
+    const [things, others] = [asked, other].map((answer) => (answer ? this.things(answer.inside) : []));
     const chosen = this.space.chosen(kind, things, others, camera, most);
-    return this.restricted(asked, chosen, other ?? asked);
+    const regions = chosen.flatMap(({ inside }) => inside);
+    return this.restricted(asked, regions, other ?? asked);
   }
 
-  // The wholes that the regions of an answer are parts of, or are.
-  wholesOf({ inside }) {
-    return [...new Set(inside.map((region) => wholeOf(this.regions, region)))];
+  // Some regions by the wholes that they are parts of, or are, the largest first: each with its Gaussians.
+  things(regions) {
+    const { places } = this;
+    const { fewest, speck, visible } = this.meta.space;
+    const groups = [...Map.groupBy(regions, (region) => wholeOf(this.regions, region)).values()];
+    const found = groups.map((inside) => {
+      const within = this.covered(inside);
+      const rows = Array.from(within.keys()).filter((row) => within[row] && places[4 * row + 3] >= visible);
+      const size = inside.reduce((sum, region) => sum + this.regions.sizes[region], 0); // of all, drawn or not
+      const points = rows.map((row) => places.subarray(4 * row, 4 * row + 3));
+      return { inside, within, rows, points, size };
+    });
+    found.sort((a, b) => b.size - a.size);
+    const least = Math.max(fewest, speck * found[0]?.size);
+    return found.filter(({ points, size }) => points.length && size >= least);
   }
 
   // The fit from which a region belongs to an answer, if it reached another `share` of the way down.
@@ -165,17 +178,9 @@ export class Language {
   // The number of wholes that an answer has parts of or is, if it reached further down: a count needs as many.
   count(answer) {
     const { level, regionFits, inside } = answer;
-    const { rule, space } = this.meta;
-    const least = this.reached(answer, rule.wide);
+    const least = this.reached(answer, this.meta.rule.wide);
     const more = regionsAt(this.regions, level).filter((region) => regionFits[region] >= least);
-    const all = [...new Set([...inside, ...more])];
-    const things = Map.groupBy(all, (region) => wholeOf(this.regions, region)).values();
-    const sizes = Array.from(things, (own) =>
-      own.reduce((sum, region) => sum + this.regions.sizes[region], 0),
-    );
-    const [fewest, share] = space.specks;
-    const solid = Math.max(fewest, share * Math.max(...sizes));
-    return sizes.filter((size) => size >= solid).length;
+    return this.things([...new Set([...inside, ...more])]).length;
   }
 
   // The answer to a part of a thing, on what answers to it; on what fits a plain name nearly as well, too.

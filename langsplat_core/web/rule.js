@@ -63,6 +63,14 @@ function bestRelevancy(rule, regions, relevancies, level) {
   return Math.max(0, relevancies[strongest(solidAt(rule, regions, level), relevancies)] ?? 0);
 }
 
+// A quantile of numbers, as NumPy's.
+export function quantile(numbers, share) {
+  const sorted = Float64Array.from(numbers).sort();
+  const at = share * (sorted.length - 1);
+  const [below, above] = [sorted[Math.floor(at)], sorted[Math.ceil(at)]];
+  return below + (at % 1) * (above - below);
+}
+
 // Bars of the best fits of everyday phrases on one thing: of each level, and of the better one of the finer two.
 // chance: fits of each region, by phrase. on: whether each region is on the thing.
 export function barsOn(rule, regions, chance, on) {
@@ -74,13 +82,9 @@ export function barsOn(rule, regions, chance, on) {
   });
   const finer = best[0].map((fit, phrase) => Math.max(fit, best[1][phrase]));
   return [...best, finer].map((fits) => {
-    const sorted = fits.toSorted((a, b) => a - b);
-    const [low, median] = [rule.low, 0.5].map((share) => {
-      const at = share * (count - 1);
-      const [below, above] = [sorted[Math.floor(at)], sorted[Math.ceil(at)]];
-      return below + (at % 1) * (above - below);
-    });
-    return Number.isFinite(sorted[0]) ? { median, spread: median - low } : { median: Infinity, spread: 1 };
+    const [low, median] = [rule.low, 0.5].map((share) => quantile(fits, share));
+    const spread = median - low; // NaN where nothing is on the thing
+    return Number.isFinite(spread) ? { median, spread } : { median: Infinity, spread: 1 };
   });
 }
 

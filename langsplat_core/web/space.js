@@ -1,23 +1,35 @@
-// How wholes stand to each other: the twin of query/relations.py. What follows from points that touch was computed
-// when the page was made (`pairs`); all else follows from the bounds of the wholes in axes of which the last is up.
+// How things stand to each other: the twin of query/relations.py, where the numbers (`space`) come from.
 
 import { add, axes, inner } from "./camera.js";
+import { quantile } from "./rule.js";
 
 // [page]
+// Distances from points to the nearest of others, of none to itself.
+const distances = (points, others) =>
+  points.map((point) => {
+    const square = ([x, y, z]) => (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2;
+    const squares = others.map((other) => (other === point ? Infinity : square(other)));
+    return Math.sqrt(Math.min(...squares));
+  });
+const gap = (one, other) => Math.min(...distances(one.points, other.points));
+const between = (low, value, high) => low <= value && value <= high;
+
 export class Space {
-  // frame: rotation of the world into those axes, by rows; aside: of the mean size, what is closer is level.
-  constructor({ counts, space }, { bodies, pairs }) {
-    Object.assign(this, space, { bodies, first: counts[0] + counts[1] });
-    const number = (i) =>
-      `${space.kinds[pairs[i]]} ${this.first + pairs[i + 1]} ${this.first + pairs[i + 2]}`;
-    this.pairs = new Set(Array.from({ length: pairs.length / 3 }, (_, pair) => number(3 * pair)));
+  // frame: rotation of the world into axes of which the last is up, by rows.
+  constructor({ space, frame }) {
+    Object.assign(this, space, { frame });
   }
 
-  body(whole) {
-    const at = 6 * (whole - this.first);
-    const [low, high] = [at, at + 3].map((from) => Array.from(this.bodies.subarray(from, from + 3)));
+  // The body of a thing's points, in those axes.
+  body(points) {
+    const rows = [0, 3, 6].map((row) => this.frame.slice(row, row + 3));
+    const step = Math.max(1, Math.ceil(points.length / this.sample));
+    const some = points.filter((_, i) => i % step === 0);
+    const own = some.map((point) => rows.map((axis) => inner(axis, point)));
+    const columns = [0, 1, 2].map((k) => own.map((point) => point[k]));
+    const [low, high] = this.inner.map((share) => columns.map((column) => quantile(column, share)));
     const sides = add(high, low, -1);
-    return { low, high, centre: add(low, sides, 0.5), size: Math.hypot(...sides) };
+    return { points: own, low, high, centre: add(low, sides, 0.5), size: Math.hypot(...sides) };
   }
 
   // A body's centre as a camera has it: right, down, ahead.
@@ -33,18 +45,46 @@ export class Space {
     return z > 0 ? x / z : NaN;
   }
 
+  on(what, anchor) {
+    anchor.spacing ??= quantile(distances(anchor.points, anchor.points), 0.5);
+    const reach = this.touch * Math.min(what.size, anchor.size) + anchor.spacing;
+    const away = distances(what.points, anchor.points);
+    const heights = what.points.filter((_, i) => away[i] < reach).map((point) => point[2]);
+    const above = what.centre[2] > anchor.low[2] && this.over(what, anchor);
+    const foot = what.low[2] + this.foot * (what.high[2] - what.low[2]);
+    const stands = above && heights.reduce((sum, z) => sum + z, 0) <= foot * heights.length;
+    const lies = heights.length >= this.flat * what.points.length;
+    return heights.length > 0 && what.size <= anchor.size && (stands || lies);
+  }
+
+  // Whether the middle of one, seen from above, lies within another.
+  over({ centre }, { low, high }) {
+    return [0, 1].every((k) => between(low[k], centre[k], high[k]));
+  }
+
+  in(what, anchor) {
+    const height = what.high[2] - what.low[2];
+    const rim = add(anchor.high, [0, 0, 0.5 * height]); // it may look out of an open vessel
+    const sunk = what.low[2] <= anchor.high[2] - this.sunk * height;
+    const inside = what.points.filter((point) => point.every((x, k) => between(anchor.low[k], x, rim[k])));
+    const held = sunk && inside.length >= this.held * what.points.length;
+    return held && what.size < anchor.size && this.over(what, anchor);
+  }
+
   above(what, anchor) {
     const over = [0, 1].every((k) => what.low[k] <= anchor.high[k] && anchor.low[k] <= what.high[k]);
     return over && what.centre[2] > anchor.high[2] && what.low[2] > anchor.centre[2];
   }
 
-  stands(kind, thing, other, camera) {
-    const [what, anchor] = [this.body(thing), this.body(other)];
+  stands(kind, what, anchor, camera) {
     const reach = (what.size + anchor.size) / 2;
     const [z, anchorZ] = [what, anchor].map((body) => this.seen(body, camera)[2]);
     const aside = (this.right(what, camera) - this.right(anchor, camera)) * anchorZ;
     const facing = Math.abs(aside) <= reach;
     const ways = {
+      on: () => this.on(what, anchor),
+      in: () => this.in(what, anchor),
+      near: () => gap(what, anchor) <= this.near * Math.min(what.size, anchor.size),
       above: () => this.above(what, anchor),
       below: () => this.above(anchor, what),
       "left of": () => -aside > this.aside * reach,
@@ -52,16 +92,16 @@ export class Space {
       behind: () => facing && z - anchorZ > this.aside * reach,
       "in front of": () => facing && anchorZ - z > this.aside * reach,
     };
-    return ways[kind]?.() ?? this.pairs.has(`${kind} ${thing} ${other}`);
+    return ways[kind]();
   }
 
-  // Those of some wholes that stand so to one of the others; of a superlative the `count` that are most so.
-  chosen(kind, things, others, camera, count) {
-    const gap = (a, b) =>
-      Math.hypot(...a.low.map((low, k) => Math.max(0, low - b.high[k], b.low[k] - a.high[k])));
+  // Those of some things that stand so to one of the others; of a superlative the `count` that are most so.
+  chosen(kind, some, anchors, camera, count) {
+    const bodies = (things) => things.map((thing) => ({ ...thing, ...this.body(thing.points) }));
+    const [things, others] = [some, anchors].map(bodies);
     const away = (body) =>
       others.length
-        ? Math.min(...others.map((other) => gap(body, this.body(other))))
+        ? Math.min(...others.map((other) => gap(body, other)))
         : Math.hypot(...this.seen(body, camera));
     const [most, sign] = {
       biggest: [({ size }) => size, 1],
@@ -74,12 +114,14 @@ export class Space {
       leftmost: [(body) => this.right(body, camera), -1],
     }[kind] ?? [null, 0];
     if (!most) {
+      const same = ({ rows }, other) =>
+        rows.filter((row) => other.within[row]).length >= this.half * rows.length;
       return things.filter((thing) =>
-        others.some((other) => other !== thing && this.stands(kind, thing, other, camera)),
+        others.some((other) => !same(thing, other) && this.stands(kind, thing, other, camera)),
       );
     }
     const value = (thing) => {
-      const measured = sign * most(this.body(thing));
+      const measured = sign * most(thing);
       return Number.isNaN(measured) ? -Infinity : measured;
     };
     return things.toSorted((a, b) => value(b) - value(a)).slice(0, count);
