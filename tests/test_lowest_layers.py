@@ -508,7 +508,7 @@ def test_options_beside_a_file_win(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("[radiance]\nstepz = 7", "--radiance.stepz"),
-        ("[radiance]\nsteps = 'many'", "--radiance.steps: invalid literal"),
+        ("[radiance]\nsteps = 'many'", "--radiance.steps: expected a whole number"),
         ("[radiance]\nsteps = 0", "--radiance.steps 0: must be 1 to"),
         ("phrases = ['--out', 'x']", "phrases"),
         ("config = 'other.toml'", "config"),

@@ -20,7 +20,6 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import psutil
 from imgui_bundle import imgui, immapp
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 
@@ -58,12 +57,6 @@ class Orbiting:
     cpu_to_sharp: list[float] = field(default_factory=list)
 
 
-def cpu() -> float:
-    """Return the processor time of this process, seconds."""
-    times = psutil.Process().cpu_times()
-    return times.user + times.system
-
-
 class Rider:
     """Moves the camera once a frame and keeps time."""
 
@@ -87,7 +80,7 @@ class Rider:
         elif self._resting_since is not None:
             self._rest(now)
         elif self._moving_since is None:
-            self._moving_since, self._started, self._pictures = now, cpu(), [0.0]
+            self._moving_since, self._started, self._pictures = now, time.process_time(), [0.0]
             self._longest, self.window.idles = 0.0, False
             self._turn()
         elif now - self._moving_since < self.seconds:
@@ -106,12 +99,12 @@ class Rider:
     def _stop(self, now: float) -> None:
         stats, count = self.window.viewer.state.stats, len(self._pictures)
         self.seen.pictures_per_second.append(count / (now - self._moving_since))
-        self.seen.cpu_per_picture.append((cpu() - self._started) / count)
+        self.seen.cpu_per_picture.append((time.process_time() - self._started) / count)
         self.seen.picture.append(statistics.median(self._pictures))
         self.seen.sizes.append((stats.width, stats.height))
         self.seen.merged.append(stats.merged)
         self.seen.longest_moving.append(self._longest)
-        self._resting_since, self._started, self._longest = now, cpu(), 0.0
+        self._resting_since, self._started, self._longest = now, time.process_time(), 0.0
         self.window.idles = True
 
     def _rest(self, now: float) -> None:
@@ -119,7 +112,7 @@ class Rider:
             return
         self.seen.longest_resting.append(self._longest)
         self.seen.sharp_after.append(now - self._resting_since)
-        self.seen.cpu_to_sharp.append(cpu() - self._started)
+        self.seen.cpu_to_sharp.append(time.process_time() - self._started)
         self._moving_since = self._resting_since = None
         if len(self.seen.sharp_after) == ROUNDS:
             glfw.set_window_should_close(glfw_window_hello_imgui(), True)
@@ -197,9 +190,9 @@ def idle(path: Path) -> None:
         while count != frames:  # something may still happen, where the cores are busy
             count = frames
             time.sleep(SETTLE)
-        before = cpu()
+        before = time.process_time()
         time.sleep(MEASURE)
-        print(f"frames {frames - count} share {(cpu() - before) / MEASURE:.4f}")
+        print(f"frames {frames - count} share {(time.process_time() - before) / MEASURE:.4f}")
         is_slow, count = True, frames
         imgui.get_io().add_mouse_pos_event(400, 300)
         glfw.post_empty_event()
