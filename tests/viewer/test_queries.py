@@ -321,7 +321,7 @@ def test_outline_row_is_named_and_selects_its_thing(outlined, monkeypatch):
         assert outline.sure_of(outlined, replace(row, word=likely)) == said
 
 
-def test_a_clicked_thing_is_selected_and_a_hidden_row_keeps_the_selection(outlined, nodes):
+def test_click_selects_an_instance_and_hidden_rows_keep_it(outlined, nodes):
     for choose, centre, word in (
         (outline.select, CENTRES[2], "plant"),
         (outline.find_alike, CENTRES[0], "mug"),

@@ -303,7 +303,7 @@ def opening(scene: Scene) -> Camera:
     return default_view(scene, extent_of(scene), SIZE).camera(*SIZE)
 
 
-def test_the_near_plane_comes_nearer_with_the_camera_and_clips_move_it_away():
+def test_near_plane_follows_the_camera_and_clips():
     scene = blob_scene()
     assert [image_formation(scene, camera).near for camera in scene.cameras] == [scene.near] * 3
     ahead, seen = scene.cameras[0], []

@@ -53,7 +53,7 @@ class MapRule:
 
 @dataclass(frozen=True)
 class SilhouetteRule:
-    """From the image of the selected Gaussians alone to a mask; no place is scored."""
+    """Rule that makes a mask from the image of the selected Gaussians alone; no place is scored."""
 
     alpha: float = 0.7  # strictly above, else the pixel is black
     grey: int = 10  # of 255, strictly above belongs to the mask

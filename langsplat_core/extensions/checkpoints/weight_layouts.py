@@ -545,7 +545,7 @@ class Tipsv2Encoder(Encoder):
     """
 
     def encode_regions(self, image: Array, label_maps: Array) -> Array:
-        """See `features.embed_regions`."""
+        """Return one unit vector for each region, as `features.embed_regions` does."""
         tower = cast("Tipsv2Images", self._images)
         height, width = image.shape[:2]
         scale = (
