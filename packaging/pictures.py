@@ -61,6 +61,7 @@ def _found(ctx: Any, window: Window) -> None:
 
 def _under_the_cursor(ctx: Any, window: Window) -> None:
     viewpoint.toggle_pointing(window.viewer)
+    _engine().config_mouse_draw_cursor = True
     ctx.mouse_teleport_to_pos((480, 430))
     for _ in range(FRAMES):
         ctx.yield_()
@@ -248,6 +249,10 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
 }
 
 
+def _engine() -> imgui.test_engine.TestEngineIO:
+    return imgui.test_engine.get_io(hello_imgui.get_imgui_test_engine())
+
+
 def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     """Write a screenshot of the window with the demo scene and answered queries."""
     options = ViewerOptions(query=queries, display="relevancy", size="1280x800", camera=BESIDE_THE_SEARCH)
@@ -256,8 +261,9 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     whole = path.with_suffix(".whole.png")
 
     def wait_and_capture(ctx: Any) -> None:  # imgui's test context has no public type
-        engine = imgui.test_engine.get_io(hello_imgui.get_imgui_test_engine())
+        engine = _engine()
         engine.config_watchdog_warning = engine.config_watchdog_kill_test = PATIENCE
+        engine.config_mouse_draw_cursor = False
         state = window.viewer.state
         for _ in range(FRAMES):
             ctx.yield_()
