@@ -61,7 +61,6 @@ def _found(ctx: Any, window: Window) -> None:
 
 def _under_the_cursor(ctx: Any, window: Window) -> None:
     viewpoint.toggle_pointing(window.viewer)
-    _engine().config_mouse_draw_cursor = True
     ctx.mouse_teleport_to_pos((480, 430))
     for _ in range(FRAMES):
         ctx.yield_()
@@ -249,10 +248,6 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
 }
 
 
-def _engine() -> imgui.test_engine.TestEngineIO:
-    return imgui.test_engine.get_io(hello_imgui.get_imgui_test_engine())
-
-
 def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     """Write a screenshot of the window with the demo scene and answered queries."""
     options = ViewerOptions(query=queries, display="relevancy", size="1280x800", camera=BESIDE_THE_SEARCH)
@@ -261,9 +256,8 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     whole = path.with_suffix(".whole.png")
 
     def wait_and_capture(ctx: Any) -> None:  # imgui's test context has no public type
-        engine = _engine()
+        engine = imgui.test_engine.get_io(hello_imgui.get_imgui_test_engine())
         engine.config_watchdog_warning = engine.config_watchdog_kill_test = PATIENCE
-        engine.config_mouse_draw_cursor = False
         state = window.viewer.state
         for _ in range(FRAMES):
             ctx.yield_()
@@ -273,7 +267,9 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
                 break
         act(ctx, window)
         ctx.yield_(30)
-        testing.capture(ctx, str(whole))
+        points = window.viewer.state.hover is not None  # at what the picture tells of
+        flags = imgui.test_engine.CaptureFlags_
+        testing.capture(ctx, str(whole), flags=flags.none if points else flags.hide_mouse_cursor)
 
     testing.run(test_function=wait_and_capture, runner_params=window.params())
     with opened(whole) as picture:
