@@ -238,8 +238,7 @@ class Window:
             return
         self._screen = ctx.detect_framebuffer()
         self.viewer.surface = self._canvas
-        self.viewer.worker.wake = self.viewer.recorder.wake = glfw.post_empty_event
-        self.viewer.watch.wake = glfw.post_empty_event
+        self.viewer.worker.wake = self.viewer.recorder.wake = self.viewer.watch.wake = glfw.post_empty_event
         self.viewer.watch.start()
         imgui.get_io().config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
         imgui.get_io().config_flags |= imgui.ConfigFlags_.nav_enable_keyboard
@@ -279,13 +278,11 @@ class Window:
         state, options = viewer.state, self._options
         assert state.scene is not None
         try:
-            camera = chosen_camera(options.camera, state.scene)
-            if camera is not None:
+            if (camera := chosen_camera(options.camera, state.scene)) is not None:
                 viewpoint.open_at(viewer, camera)
         except InputError as error:
             viewer.say_error(str(error))
-        span = options.orthographic
-        if span is not None:
+        if (span := options.orthographic) is not None:
             viewpoint.move(viewer, lambda view: spanning(view, span))
         wanted = options.picture
         settings.set_picture(

@@ -30,6 +30,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import queries, saving, settings
 from langsplat_viewer.options import ViewerOptions
+from langsplat_viewer.panels import layout
 from langsplat_viewer.panels.ui import scene_area
 from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
 from langsplat_viewer.viewer import Services, Viewer
@@ -422,6 +423,23 @@ def broken_renderer(s: Session) -> None:
     s.renderer.draw = draw
     s.key("3", frames=1)
     assert s.shot("mended")[:, 400:].max() > 100
+
+
+def broken_panel(s: Session) -> None:
+    """A panel that fails half way, as one of an extension may: it is closed, and the window lives on."""
+
+    def draw(viewer: Viewer) -> None:
+        imgui.begin_disabled(False)
+        imgui.begin_child("inside")
+        raise RuntimeError("of the extension")
+
+    layout.CORE_PANELS = (*layout.CORE_PANELS, layout.Panel("Broken", draw))
+    s.open_panel("Broken")
+    s.until(lambda: "Broken" not in layout.opened(s.state))
+    said = "the panel Broken was closed: internal error: RuntimeError: of the extension"
+    assert s.state.messages[-1].text == said
+    s.key("3", frames=1)
+    assert s.shot("without it")[:, 400:].max() > 100
 
 
 READ_ON = Event()

@@ -67,8 +67,7 @@ def open_at(viewer: Viewer, camera: Camera) -> None:
 
 def zoom_by(viewer: Viewer, factor: float) -> None:
     """Multiply the distance to the centre of turning, within limits set by the scene's size."""
-    extent = viewer.state.extent
-    if extent is not None:
+    if (extent := viewer.state.extent) is not None:
         nearest, farthest = NEAREST * extent.radius, extent.farthest
         move(viewer, lambda view: controls.zoom(view, factor, nearest, farthest))
 
@@ -96,8 +95,7 @@ def reset_view(viewer: Viewer) -> None:
         view = replace(view, orthographic=True)
         if state.opening_camera is None and not state.scene.cameras:
             view = controls.frame_all(view, state.extent, state.size)
-    other = _compared(viewer)
-    if other is not None:
+    if (other := _compared(viewer)) is not None:
         camera = view.camera(*state.size)
         if not camera.in_image(*camera.project(other.points)).any():
             is_left = (other.points.mean(0) - state.extent.centre) @ view.rotation[0] < 0

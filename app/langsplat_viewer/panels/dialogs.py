@@ -271,8 +271,7 @@ def _path_box(viewer: Viewer, choice: FileChoice) -> None:
     if imgui.is_window_appearing():
         imgui.set_keyboard_focus_here()
     hint = "path of a folder" if choice.kind == "folder" else "path; or drop a file onto the window"
-    typed = ui.kept_box(viewer, "##path", hint, "Save" if saves else "Open")
-    if typed is not None:
+    if (typed := ui.kept_box(viewer, "##path", hint, "Save" if saves else "Open")) is not None:
         settings.choose(viewer, typed)
         drafts["##path"] = typed
     for offer in completions(drafts.get("##path", ""), folder, _offered(choice)):

@@ -8,6 +8,7 @@ from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui, imgui_
 from langsplat_core import registry
 from langsplat_viewer.actions import queries, settings
 from langsplat_viewer.commands import with_key
+from langsplat_viewer.jobs import one_line
 from langsplat_viewer.panels import (
     dialogs,
     menus,
@@ -102,8 +103,19 @@ def _splits(scale: float, width: float) -> list[hello_imgui.DockingSplit]:
 
 
 def _draw(viewer: Viewer, panel: Panel) -> None:
-    with ui.disabled(panel.needs_scene and viewer.state.view is None):
-        panel.draw(viewer)
+    """Draw a panel; close it where it, or the extension that it is of, fails, and say why."""
+    before, io, alpha = imgui.internal.ErrorRecoveryState(), imgui.get_io(), imgui.get_style().alpha
+    imgui.internal.error_recovery_store_state(before)
+    try:
+        with ui.disabled(panel.needs_scene and viewer.state.view is None):
+            panel.draw(viewer)
+    except Exception as error:  # noqa: BLE001  it would take the whole window down
+        io.config_error_recovery_enable_assert = io.config_error_recovery_enable_tooltip = False
+        imgui.internal.error_recovery_try_to_recover_state(before)  # ends what was begun, of any kind
+        io.config_error_recovery_enable_assert = io.config_error_recovery_enable_tooltip = True
+        imgui.get_style().alpha = alpha  # which it takes for 0
+        settings.turn_panel(viewer, panel.title, is_open=False)
+        viewer.say_error(f"the panel {panel.title} was closed: {one_line(error)}")
 
 
 def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:

@@ -161,8 +161,7 @@ def draw_legend(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
     outline.wanted(viewer)  # is looked for, where it is not known yet
     seen: dict[str, tuple[float, float, float]] = {}
     for row in outline.in_view(viewer):
-        colour = outline.colour_of(viewer, row.node)
-        if colour is not None:
+        if (colour := outline.colour_of(viewer, row.node)) is not None:
             is_sure, name = outline.sure_of(viewer, row)[0], outline.name_of(viewer, row).split(OR)[0]
             seen.setdefault(name if is_sure else f"{name}?", colour)
         if len(seen) == LEGEND_ROWS:

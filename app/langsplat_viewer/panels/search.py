@@ -141,8 +141,7 @@ def _answers(viewer: Viewer) -> None:
                 with imgui_ctx.push_id(query.phrase):
                     _line(viewer, query)
         imgui.end_child()
-    chosen = viewer.state.session.query(viewer.state.session.chosen)
-    if chosen is not None:
+    if (chosen := viewer.state.session.query(viewer.state.session.chosen)) is not None:
         _details(viewer, chosen)
 
 

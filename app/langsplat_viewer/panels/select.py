@@ -88,8 +88,7 @@ def _name(viewer: Viewer) -> None:
     """Draw the box for a name by which what is selected is found from now on."""
     if settings.take(viewer.state, "focus_name"):
         imgui.set_keyboard_focus_here()
-    name = ui.kept_box(viewer, "##name", "a name for what is selected", "Name it")
-    if name is not None:
+    if (name := ui.kept_box(viewer, "##name", "a name for what is selected", "Name it")) is not None:
         editing.name_selection(viewer, name)
     ui.tip("Searching for the name finds this, and what is like it")
 

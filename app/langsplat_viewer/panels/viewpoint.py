@@ -95,8 +95,7 @@ def draw_timeline(viewer: Viewer) -> None:
         if changed:
             viewpoint.scrub(viewer, at)
         imgui.same_line()
-        wanted = _number("Duration", seconds, 1.0)
-        if wanted is not None:
+        if (wanted := _number("Duration", seconds, 1.0)) is not None:
             viewpoint.set_path_seconds(viewer, wanted)
     imgui.same_line()
     settings.put(record, loops=imgui.checkbox("Loop", record.loops)[1])
@@ -157,8 +156,7 @@ def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
     if key is None:
         return
     ui.beside("Time", hello_imgui.em_size(NUMBER_EM))
-    seconds = _number("Time", key.seconds, 0.5)
-    if seconds is not None:
+    if (seconds := _number("Time", key.seconds, 0.5)) is not None:
         viewpoint.put_keyframe(viewer, key, replace(key, seconds=seconds))
     view = viewer.state.view
     if ui.next_button("Set to this view", "Put the current view in its place") and view is not None:
@@ -195,8 +193,7 @@ def draw_record(viewer: Viewer) -> None:
 
 def draw_bookmarks(viewer: Viewer) -> None:
     """Draw the panel "Bookmarks": a box for a name, and the list."""
-    name = ui.kept_box(viewer, "##bookmark", "name of this view", "Keep")
-    if name is not None:
+    if (name := ui.kept_box(viewer, "##bookmark", "name of this view", "Keep")) is not None:
         viewpoint.add_bookmark(viewer, name)
     bookmarks, words = viewer.state.session.bookmarks, "views that you keep are listed here"
     rows = [ui.Row(bookmark.name) for bookmark in bookmarks]
