@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from assets.making import encoder as demo_encoder
-from assets.making.crops import EncoderConfig, plain_crops, room_crops
+from assets.making.crops import room_crops
 from assets.making.dataset import (
     LIGHT,
     SEED,
@@ -19,22 +18,20 @@ from assets.making.dataset import (
     truth_ids,
     write_dataset,
 )
-from assets.making.encoder import report, report_table, train_encoder
+from assets.making.encoder import report
 from assets.making.kit import Kit
 from assets.making.objects import EVERYTHING
 from assets.making.render import Renderer
 from assets.making.world import World, bounds, build_room, label_region
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.errors import EncoderError
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.progress import Progress, WorkCancelledError, silent
+from langsplat_core.progress import silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
 from tests.benchmarks.scoring import masks_and_peaks
-from tests.support.processes import stop_at
 
 pytestmark = pytest.mark.long
 
@@ -101,41 +98,12 @@ def test_things_have_sound_meshes_that_stand_and_nested_labels(name):
             assert set(subpart.materials) <= set(part.materials) <= set(whole.materials)
 
 
-# The demo encoder: a training in miniature, the bundled weights.
+# The demo encoder: the bundled weights.
 
 
 @pytest.fixture(scope="module")
 def unseen_room():
     return room_crops(3_000_000, views=2)
-
-
-@pytest.fixture
-def few_crops(monkeypatch):
-    """Crops that are trained with in place of those of 400 rooms."""
-    crops = plain_crops(40, 2)
-    monkeypatch.setattr(demo_encoder, "write_crops", lambda folder, config, progress: None)
-    monkeypatch.setattr(demo_encoder, "read_crops", lambda folder: (crops, crops))
-    return crops
-
-
-def test_interrupted_training_goes_on_and_answers(monkeypatch, few_crops, tmp_path):
-    """Two steps, an interruption, the rest: what is written loads and answers; all steps were taken."""
-    monkeypatch.setattr(demo_encoder, "SAVE_EVERY", 2)
-    config = EncoderConfig(steps=4, batch=8, phrases=8)
-    with pytest.raises(WorkCancelledError):
-        train_encoder(tmp_path, config, stop_at(fraction=0.7))
-    seen = []
-    figures = train_encoder(tmp_path, config, Progress(lambda at: seen.append(at.fraction)))
-    assert "| colour |" in report_table(figures)
-    assert seen == [0.75, 1.0]  # went on at step 3 of 4
-    encoder = load_encoder(str(tmp_path), "cpu")
-    assert (encoder.dim, encoder.image_size) == (512, 64)
-    vectors = encoder.encode_images(few_crops.images[:3])
-    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
-    with pytest.raises(EncoderError, match="xylophone"):
-        encoder.encode_texts(["red xylophone"])
-    size = sum(path.stat().st_size for path in tmp_path.iterdir() if path.is_file())
-    assert size < 12e6
 
 
 def test_bundled_encoder_recognises_unseen_crops(unseen_room):

@@ -401,13 +401,6 @@ def exact(view: OrbitCamera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return np.stack(pixels, 1), z
 
 
-def test_the_camera_is_orthographic():
-    wanted, depths = exact(FLAT, MEANS)
-    found, z = FLAT.camera(*FULL).project(MEANS)
-    assert_allclose(found, wanted, atol=1e-9)
-    assert_allclose(z, depths, atol=1e-12)
-
-
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
 def test_clicked_point_lies_on_the_surface(gl, backend):
     """By the depth of one pixel, and by that of all of them."""

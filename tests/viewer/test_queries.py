@@ -15,10 +15,9 @@ from langsplat_core.query.inventory import Outline
 from langsplat_viewer.actions import editing, opening, outline, queries, saving, settings
 from langsplat_viewer.actions.editing import take
 from langsplat_viewer.panels.search import BINS, hint, histogram
-from langsplat_viewer.program import answer_line
 from langsplat_viewer.session import Query, Things
 from langsplat_viewer.viewer import Services, Viewer
-from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, calibrated_for, language
+from tests.support.fakes import CENTRES, FakeEncoder, blob_scene
 from tests.support.scenes import with_tree
 from tests.support.windowless import (
     SCENES,
@@ -185,19 +184,6 @@ def test_letters_for_a_box_that_is_not_there_are_no_keys(viewer):
     assert (viewer.state.letters_muted, viewer.state.show_start) == (True, True)
     settings.escape(viewer)
     assert not viewer.state.letters_muted
-
-
-@pytest.mark.parametrize(("logit", "verdict"), [(9.0, "found"), (1.0, "weak match"), (-3.0, "not here")])
-def test_calibrated_scene_gives_probabilities(viewer, monkeypatch, logit, verdict):
-    sure = replace(language(), calibration=calibrated_for("mug", logit))
-    monkeypatch.setitem(SCENES, "sure.ply", replace(blob_scene(), language=sure))
-    open_scene(viewer, "sure.ply")
-    ask(viewer, "mug")
-    found = result(viewer)
-    assert (found.verdict, found.found) == (verdict, verdict == "found")
-    assert (viewer.state.session.queries[0].slot is None) == (verdict == "not here")
-    assert found.said == f"{verdict}, {100 * found.probability:.0f} %"
-    assert answer_line(found).startswith(f"'mug': {found.said}, score ")
 
 
 # Thresholds of one's own.

@@ -197,15 +197,6 @@ def test_absent_encoder_is_one_line(run_viewer, monkeypatch, folder):
     assert not (folder / "a.png").exists()
 
 
-def test_failed_image_leaves_the_old_one(run_viewer, folder):
-    (folder / "a.png").write_bytes(b"old")
-    run_viewer("truncated.ply", "--headless", "--out", "a.png")
-    assert (folder / "a.png").read_bytes() == b"old"
-    run_viewer("plain.ply", "--headless", "--out", "a.png", "--size", "32x32")
-    assert picture(folder / "a.png").shape == (32, 32, 3)
-    assert not [path for path in folder.iterdir() if path.name.startswith(".a")]
-
-
 def run_python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Of a process without a display, but for one that is given."""
     inherited = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
