@@ -204,21 +204,21 @@ class QueryScene:
         # One after the other: an answer has a number for every Gaussian and level.
         for text in dict.fromkeys(texts):
             result, tree, of = self._ask(engine, text, camera)
-            heard = compose.with_masks(engine, result, outlined[text][0]) if outlined else None
-            result = result if heard is None else heard.answer
+            masked = compose.with_masks(engine, result, outlined[text][0]) if outlined else None
+            result = result if masked is None else masked.answer
             answer = _answer(result, camera) | {"reading": None if tree is None else unparse(tree)}
             answer |= {} if view is None else _pixel(view, engine, result, self.mode)
             things = engine.instances(result, self.instances) if result.found else ()
             counts = result.found or (isinstance(tree, Counted) and result.verdict == "weak match")
-            number = compose.count_things(engine, result) if counts else compose.Number(0, 0, 0)
+            number = compose.count_instances(engine, result) if counts else compose.InstanceCount(0, 0, 0)
             answer |= {"count": {"best": number.best, "least": number.least, "most": number.most}}
             because = {} if explain is None else {"evidence": explain(engine, result, of)}
             answer |= basis_fields(engine) | {"metres_per_unit": unit.metres, **listed(things), **because}
             asked[text] = answer, instance_lines(things, unit) + _reasons(**because)
-            if heard is not None:
+            if masked is not None:
                 counted = f"outlined in {outlined[text][1]} of {len(scene.cameras)} photographs"
                 answer["photographs_with_masks"] = outlined[text][1]
-                asked[text][1].insert(0, _found_by(heard, answer, things, counted))
+                asked[text][1].insert(0, _found_by(masked, answer, things, counted))
         if explain is not None:
             explain.write()
         if self.json:
@@ -322,14 +322,16 @@ class _Explainer:
             Image.fromarray(np.concatenate(self._sheets)).save(temporary, "PNG")
 
 
-def _found_by(heard: compose.Heard, answer: dict[str, Any], things: Sequence[Instance], counted: str) -> str:
-    """Say in the answer, ready for JSON, of it and of its things who found them; return it as a line."""
-    by = [heard.who(thing.members) for thing in things]
-    for entry, who in zip(answer["instances"], by, strict=True):
-        entry["found_by"] = who
-    answer["found_by"] = heard.who()
-    listed = (f", {by.count(who)} listed by {who}" for who in dict.fromkeys(by))
-    return f"  found by {heard.who()}: {counted}{''.join(listed)}"
+def _found_by(
+    masked: compose.MaskedAnswer, answer: dict[str, Any], things: Sequence[Instance], counted: str
+) -> str:
+    """Add "found_by" to an answer, ready for JSON, and to its instances; return it as a line of text."""
+    by = [masked.found_by(thing.members) for thing in things]
+    for entry, found_by in zip(answer["instances"], by, strict=True):
+        entry["found_by"] = found_by
+    answer["found_by"] = masked.found_by()
+    listed = (f", {by.count(found_by)} listed by {found_by}" for found_by in dict.fromkeys(by))
+    return f"  found by {masked.found_by()}: {counted}{''.join(listed)}"
 
 
 def _reasons(evidence: dict[str, Any] | None = None) -> list[str]:

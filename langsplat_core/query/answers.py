@@ -1,4 +1,4 @@
-"""Answers to a phrase: whole regions of a scene's tree by `rule.decide`, or, as published, its peak."""
+"""Answers to a phrase: regions of a scene's tree by `rule.decide`, or by its peak, as published."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 import langsplat_core
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, pieces
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.lookup import TOGETHER, Lookup, Relevancy
@@ -19,12 +19,12 @@ from langsplat_core.scene import LEVELS, Fits, LanguageField, Tree
 from langsplat_core.scene.surface import NEIGHBOURS, Surface
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale
 
-LIGHT = 40_000  # Gaussians of a page that shows an answer
+LIGHT = 40_000  # Gaussians, at most, of a page that shows an answer in a notebook
 AnswerRule = Literal["regions", "peak"]  # by `rule.decide`, or as published
 
 
 class Deferred:
-    """A field of a dataclass: an array, or a function that makes it when the field is first read."""
+    """A dataclass field: an array, or a function that computes it when the field is first read."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
@@ -43,7 +43,7 @@ class Deferred:
 
 @dataclass(frozen=True, eq=False)
 class QueryResult(Judged):
-    """The answer to one phrase; its arrays of N numbers are made when they are first read."""
+    """The answer to one phrase; its arrays over N Gaussians are computed when they are first read."""
 
     phrase: str
     level: int  # index into LEVELS
@@ -51,15 +51,15 @@ class QueryResult(Judged):
     peak: float  # score of the chosen level
     fits: Fits  # of the best region, or neighbourhood, of each level, see `Scale.fit`
     judgement: Verdict
-    place: Array | None  # (3,) in the scene, which lies about its origin: see `Scene.in_world`
+    place: Array | None  # (3,) position in scene coordinates, see `Scene.in_world`; None if nothing fits
     box: Array | None  # (2, 3) corners, likewise
     points: Array  # (N, 3) means of the Gaussians
     relevancy: Deferred = Deferred()  # (3, N) float32 in [0, 1] per level and Gaussian
-    even: Deferred = Deferred()  # (N,) float32 relevancy at the level, the same all over a region
-    members: Deferred = Deferred()  # (N,) bool: the Gaussians that answer, wherever they are
-    own_cut: float | None = None  # relevancy from which on everything is a member, where it was set by hand
-    common: float = 0.0  # mean fit of the regions that the verdict counts
-    engine: Any = None  # the QueryEngine that was asked, whose scene a notebook shows
+    even: Deferred = Deferred()  # (N,) float32 relevancy at the level, constant over a region
+    members: Deferred = Deferred()  # (N,) bool: the Gaussians of the answer
+    own_cut: float | None = None  # threshold of relevancy for members that the user set; None: by the rule
+    common: float = 0.0  # mean fit of the regions that the verdict is based on
+    engine: Any = None  # the QueryEngine, whose scene a notebook shows
 
     def __repr__(self) -> str:
         known = self.engine is not None and self.place is not None
@@ -67,11 +67,11 @@ class QueryResult(Judged):
         return f"<{self.phrase!r}: {self.said}, as {LEVELS[self.level]}, near {near}>"
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what another process takes: all fields, their arrays made, but no engine."""
+        """Return the fields for another process: deferred arrays computed, without the engine."""
         return {name: getattr(self, name) for name in vars(self)} | {"engine": None}
 
     def _repr_html_(self) -> str | None:
-        """Return a light page of the scene with the phrase asked, for a notebook; None without an engine."""
+        """Return a small page of the scene with this query, for a notebook; None without an engine."""
         if self.engine is None:
             return None
         page = langsplat_core.show(self.engine, self.phrase, at_most=LIGHT, phrases=[self.phrase])
@@ -79,38 +79,38 @@ class QueryResult(Judged):
 
     @property
     def cut(self) -> float:
-        """The least relevancy of a member, of its region where it has one; the peak where there is none."""
+        """The threshold: `own_cut`, else the least relevancy `even` of a member, the peak without members."""
         if self.own_cut is not None:
             return self.own_cut
         return float(self.even[self.members].min(initial=self.peak))
 
     @property
     def heat_range(self) -> tuple[float, float]:
-        """The relevancies at which a heat map of this answer is coldest and hottest."""
+        """The relevancies at the cold and hot end of a heat map of this answer."""
         high = max(self.peak, float(self.smooth[self.members].max(initial=0)))
         if self.own_cut is not None:
             return min(self.own_cut, self.peak - MIN_HEAT_SPAN), high
-        if self.found and self.peak < FLOOR + MIN_HEAT_SPAN:  # best on its thing, not against all phrases
+        if self.found and self.peak < FLOOR + MIN_HEAT_SPAN:  # found by other means than relevancy
             return self.peak - MIN_HEAT_SPAN, high
         return FLOOR, max(high, FLOOR + MIN_HEAT_SPAN)
 
     @cached_property
     def smooth(self) -> Array:
-        """The (N,) float32 relevancy at the level: of members the mean over members around each."""
+        """The (N,) float32 relevancy at the level, that of members averaged over nearby members."""
         values = self.relevancy[self.level].copy()
         values[self.members] = smoothed(self.points[self.members], values[self.members])
         return values
 
 
 MOST_CELLS = 64  # along a side of the grid that relevancies are smoothed on
-SIDE = 5.0  # of that grid, in standard deviations of the points along the axis on which they lie widest
+SIDE = 5.0  # of that grid, in standard deviations of the points along the widest axis
 
 
 def smoothed(points: Array, values: Array) -> Array:
-    """Return (K,) means of `values` around (K, 3) points, of about as many as a surface has neighbours.
+    """Return (K,) means of `values` around (K, 3) points, over about as many as a surface has neighbours.
 
-    Values are shared among the corners of the cells of a grid, which grows with the answer, and read there
-    again, in the exported page, too: no neighbours need to be looked for.
+    Values are splatted to the corners of a grid's cells, which grow with the answer, and interpolated there
+    again, without a search for neighbours. The exported page does the same.
     """
     if len(points) == 0:
         return values
@@ -132,14 +132,14 @@ def smoothed(points: Array, values: Array) -> Array:
 
 
 def recut(result: QueryResult, cut: float) -> QueryResult:
-    """Return the answer with all as members whose even relevancy is at least `cut`; the verdict stays."""
+    """Return the answer whose members have an `even` of at least `cut`; the verdict stays."""
     return replace(result, own_cut=cut, members=result.even >= np.float32(cut))
 
 
-# Regions: the sets of Gaussians that a scene's tree makes at each level.
+# Regions: the nodes of a scene's tree at each level, as sets of Gaussians.
 
 CHUNK = 16_384  # distinct features read at a time
-MIDDLE = 16  # Gaussians around the middle of a region
+MIDDLE = 16  # Gaussians around the centre of a region
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,11 +148,11 @@ class Regions:
 
     nodes: tuple[Array, ...]  # (R,) number in the tree of each region of a level, rising
     everywhere: Array  # (3, N) int32 number of the region at each level, from 0; -1: in none
-    weights: Array  # (N,) float32 opacity of what counts, 0 for all others, see `surface_weights`
-    sizes: tuple[Array, ...]  # (R,) Gaussians that count
+    weights: Array  # (N,) float32 opacity of Gaussians on the surface, else 0, see `surface_weights`
+    sizes: tuple[Array, ...]  # (R,) Gaussians with a weight
     totals: tuple[Array, ...]  # (R,) float64 sums of their weights
-    table: RegionTable  # of all levels one after the other, as the rule for answers reads them
-    _places: dict[tuple[int, int], tuple[Array, Array]] = field(default_factory=dict)  # of those asked for
+    table: RegionTable  # of all levels one after the other, as `rule` reads them
+    _places: dict[tuple[int, int], tuple[Array, Array]] = field(default_factory=dict)  # cache of `place`
 
     def means(self, values: Array) -> tuple[Array, ...]:
         """Return the (R,) float64 opacity-weighted means of (3, N) values over the regions of every level."""
@@ -165,7 +165,7 @@ class Regions:
 
     @cached_property
     def counts(self) -> Array:
-        """The (M,) numbers of the Gaussians that count: they are in a region at every level."""
+        """The (M,) numbers of the Gaussians with a weight: they are in a region at every level."""
         return np.flatnonzero(self.weights > 0)
 
     def mixtures(self, features: Array, count: int) -> "scipy.sparse.csr_matrix":
@@ -174,7 +174,7 @@ class Regions:
         weights = self.weights[counts].astype(np.float64)
         for of, own, total in zip(self.everywhere[:, counts], features[:, counts], self.totals, strict=True):
             shape = len(total), count
-            if len(total) * count < 8 * len(counts):  # much faster, where the table is small
+            if len(total) * count < 8 * len(counts):  # much faster for a small table
                 table = np.bincount(of * np.int64(count) + own, weights, len(total) * count).reshape(shape)
                 parts.append(scipy.sparse.csr_matrix(table / total[:, None]))
             else:
@@ -182,16 +182,16 @@ class Regions:
         return scipy.sparse.vstack(parts, format="csr")
 
     def spread(self, level: int, values: Array, others: Array) -> Array:
-        """Return the (N,) of the (R,) `values` of a level's regions; in none, its own of `others` (N,)."""
+        """Return (N,): the (R,) `values` of a level's regions at their Gaussians, else `others` (N,)."""
         of = self.everywhere[level]
         return np.where(of >= 0, np.append(values, others.dtype.type(0))[of], others)
 
     def mostly(self, members: Array) -> Array:
-        """Return (R,) bool: the regions that are by more than half among `members` (N,) bool."""
+        """Return (R,) bool of all levels: regions that are by more than half among `members` (N,) bool."""
         return np.concatenate(self.means(np.tile(members, (len(LEVELS), 1)))) > 0.5
 
     def level_of(self, members: Array) -> int:
-        """Return the level with the region most like `members` (N,) bool, of equal ones the coarsest."""
+        """Return the level of the region most like `members` (N,) bool by IoU, of equal ones the coarsest."""
         best = []
         for of, sizes in zip(self.everywhere, self.sizes, strict=True):
             hits = np.bincount(of[members & (of >= 0) & (self.weights > 0)], minlength=len(sizes))
@@ -199,7 +199,7 @@ class Regions:
         return int(np.flatnonzero(np.array(best) == max(best))[-1])
 
     def place(self, means: Array, level: int, region: int) -> tuple[Array, Array] | tuple[None, None]:
-        """Return place (3,) and box (2, 3) of a region, see `place_of`; region: -1 for none."""
+        """Return position (3,) and box (2, 3) of a region, see `place_of`; region: -1 for none."""
         if region < 0:
             return None, None
         if (level, region) not in self._places:
@@ -234,7 +234,7 @@ def build_regions(tree: Tree, weights: Array) -> Regions:
 
 
 def place_of(points: Array) -> tuple[Array, Array]:
-    """Return place (3,), at what is nearest to the middle, and box (2, 3) of (K, 3) points, K >= 1."""
+    """Return the mean (3,) of the points nearest to the centre, and box (2, 3) of (K, 3) points, K >= 1."""
     points = points.astype(np.float64)
     far = ((points - points.mean(0)) ** 2).sum(1)
     near = np.argpartition(far, min(MIDDLE, len(far)) - 1)[:MIDDLE]
@@ -244,11 +244,11 @@ def place_of(points: Array) -> tuple[Array, Array]:
 def feature_sums(
     field: LanguageField, level: int, of: Array, weights: Array, count: int, read: Callable[[Array], Array]
 ) -> Array:
-    """Return (count, V) sums, over sets `of` (N,), -1: none, of `read` features (M, V), by `weights` (N,)."""
+    """Return (count, V) sums over sets `of` (N,), -1: none, of features that `read` maps to (M, V)."""
     rows = np.flatnonzero(field.known[level] & (of >= 0) & (weights > 0))
     latents, kinds = field.codec.unique(field.latents[level, rows])
     shares = scipy.sparse.csr_matrix((weights[rows], (of[rows], kinds)), shape=(count, len(latents))).tocsc()
-    parts = [slice(start, start + CHUNK) for start in range(0, max(len(latents), 1), CHUNK)]
+    parts = pieces(max(len(latents), 1), CHUNK)
     return sum((shares[:, part] @ read(latents[part])).astype(np.float64) for part in parts)
 
 
@@ -256,8 +256,8 @@ def chance_in(table: RegionTable, mixtures: "scipy.sparse.csr_matrix", lookup: L
     """Return the (R, V) float32 fits of everyday phrases in the regions of all levels; see `mixtures`."""
     assert scale.everyday is not None
     means = [
-        mixtures @ np.stack([one.values for one in lookup.relevancies(scale.everyday[i : i + TOGETHER])], 1)
-        for i in range(0, len(scale.everyday), TOGETHER)
+        mixtures @ np.stack([one.values for one in lookup.relevancies(scale.everyday[part])], 1)
+        for part in pieces(len(scale.everyday), TOGETHER)
     ]
     return region_fits(table, scale.fit(np.concatenate(means, 1)).astype(np.float32))
 
@@ -268,7 +268,7 @@ def chance_in(table: RegionTable, mixtures: "scipy.sparse.csr_matrix", lookup: L
 def by_regions(
     phrase: str, relevancy: Relevancy, decision: Decision, means: Array, regions: Regions
 ) -> QueryResult:
-    """Return the answer by the rule. means: (N, 3) of the Gaussians."""
+    """Return the answer that a decision of `rule` stands for. means: (N, 3) of the Gaussians."""
     chosen, values = decision.level, relevancy.values
     place, box = regions.place(means, chosen, decision.best)
     return QueryResult(
@@ -288,7 +288,7 @@ def by_regions(
     )
 
 
-SPAN = 0.02  # the least distance between the floor and the peak that is divided
+SPAN = 0.02  # least distance from floor to peak by which members are cut
 
 
 def by_peak(
@@ -300,9 +300,9 @@ def by_peak(
     found: float,
     level: LevelChoice,
 ) -> QueryResult:
-    """Return the published answer: highest peak, cut half way to the floor; found: from which relevancy.
+    """Return the published answer: the level of the highest peak, cut half way to the floor.
 
-    relevancy: (3, N); means: (N, 3) of the Gaussians.
+    relevancy: (3, N); means: (N, 3) of the Gaussians; found: least peak of what is found.
     """
     smoothed = np.stack([surface.smooth(values) for values in relevancy])
     scores = triple(smoothed.max(1, initial=0))
@@ -327,10 +327,10 @@ def by_peak(
 
 
 def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, Array] | tuple[None, None]:
-    """Return place (3,) and box (2, 3) of the connected part above `threshold` that holds the peak.
+    """Return position (3,) and box (2, 3) of the connected part above `threshold` that holds the peak.
 
-    smoothed: (M,) relevancy of the surface; None where all is 0. The place is around the middle of what is as
-    high as the peak: all of a thing may have the very same feature.
+    smoothed: (M,) relevancy of the surface; None if all is 0. The position is in the middle of all that is as
+    high as the peak: a whole instance may have one feature.
     """
     if smoothed.max(initial=0) <= 0:
         return None, None

@@ -1,7 +1,7 @@
-"""Phrases with structure: each phrase of the tree is asked for itself, and the answers are combined.
+"""Compositional queries: each phrase of the tree is answered by itself, and the answers are combined.
 
-The relevancy of a combined answer is zero wherever it does not hold, and the same at every level where it has
-parts of several; its peak is that of its weakest necessary part.
+The relevancy of a combined answer is zero outside its members, and equal at all levels if answers of several
+levels are joined; its peak is that of its weakest necessary part.
 """
 
 from collections.abc import Sequence
@@ -40,17 +40,17 @@ from langsplat_core.scene import LEVELS, Camera
 from langsplat_core.scene.language import phrase_key, tidy
 from langsplat_core.semantics.relevancy import FLOOR
 
-# Of the peak, where the place ends; of a thing's Gaussians, which two things share that are the same; of the
-# way below its best region, to which an unwanted name reaches.
+# Share of the peak at which the place ends; of an instance's Gaussians in another that is the same one; and
+# of the reach (`RULE`) within which an unwanted name excludes.
 HALF = 0.5
-SAID_BY_VIEWER = ("left of", "right of", "behind", "in front of", "leftmost", "rightmost")
+NEED_VIEWPOINT = ("left of", "right of", "behind", "in front of", "leftmost", "rightmost")
 
 
 @dataclass(frozen=True, eq=False)
 class ComposedResult:
-    """The answer to a phrase, and the tree as which it was read."""
+    """The answer to a phrase, and its parsed tree."""
 
-    answer: QueryResult  # in the form of a simple one
+    answer: QueryResult
     tree: Phrase
 
     @property
@@ -66,25 +66,25 @@ def run_phrase(
     viewpoint: Camera | None = None,
     progress: Progress = silent,
 ) -> ComposedResult:
-    """Answer a phrase as the grammar reads it.
+    """Answer a phrase as the grammar parses it.
 
-    It is asked whole, as `QueryEngine.run` does, where the grammar finds no structure, and where only the
-    whole phrase can be asked (of a phrasebook). level: of what is asked for; the things that it is related to
-    keep their own. viewpoint: from where left, right, behind and in front are said, and "nearest" and
-    "farthest" where they are of nothing else. Raises InputError as `grammar.parse` does and where a viewpoint
-    is needed, EncoderError as `QueryEngine.run`.
+    It is a plain query, as by `QueryEngine.run`, if the grammar finds no structure, or if only the whole
+    phrase is known (from a phrasebook). level: of what is searched for; what it is related to is searched at
+    "auto". viewpoint: the camera for left, right, behind and in front, and for "nearest" and "farthest"
+    without an anchor. Raises InputError as `grammar.parse` does and for a missing viewpoint, EncoderError as
+    `QueryEngine.run`.
     """
     tree = parse(text, engine.taught)
     if isinstance(tree, Atom):
         return ComposedResult(engine.run(tree.text, level, progress), tree)
     _check_viewpoint(tree, viewpoint)
     try:
-        found = _Asking(engine, viewpoint, progress).answer(tree, level)
+        found = _Evaluator(engine, viewpoint, progress).answer(tree, level)
     except EncoderError:
         if phrase_key(text) not in engine.field.phrasebook:
             raise
         return ComposedResult(engine.run(text, level, progress), Atom(tidy(text)))
-    # The place is that of the strongest connected members.
+    # The position is that of the connected members with the highest relevancy.
     values = np.where(found.members, found.relevancy[found.level], 0).astype(np.float32)
     smoothed = engine.surface.smooth(values)
     place, box = locate(engine.surface, smoothed, HALF * float(smoothed.max(initial=0)))
@@ -92,14 +92,14 @@ def run_phrase(
 
 
 def encoded_texts(engine: QueryEngine, tree: Phrase) -> list[str]:
-    """Return what of a phrase is encoded: its atoms, but for taught words."""
+    """Return the atoms of a phrase that the encoder reads: all but taught words."""
     return [atom.text for atom in atoms(tree) if not engine.is_taught(atom.text)]
 
 
 def check_phrase(
     engine: QueryEngine, text: str, viewpoint: Camera | None = None, progress: Progress = silent
 ) -> None:
-    """Raise what `run_phrase` would, without searching; what was encoded for it is kept."""
+    """Raise what `run_phrase` would, without searching; the encoded vectors are kept."""
     tree = parse(text, engine.taught)
     _check_viewpoint(tree, viewpoint)
     try:
@@ -110,7 +110,7 @@ def check_phrase(
 
 
 def encode_phrases(engine: QueryEngine, texts: Sequence[str]) -> None:
-    """Encode many phrases together, as far as they can be; `check_phrase` says of the others why not."""
+    """Encode many phrases together, without errors; `check_phrase` reports those that cannot be encoded."""
     wanted: list[str] = []
     for text in texts:
         with suppress(InputError):
@@ -120,60 +120,59 @@ def encode_phrases(engine: QueryEngine, texts: Sequence[str]) -> None:
 
 
 def _check_viewpoint(tree: Phrase, viewpoint: Camera | None) -> None:
-    """Raise InputError for the first word in the tree that only a viewer can say, if there is none."""
+    """Raise InputError for the first relation in the tree that needs a viewpoint, if there is none."""
     if viewpoint is None and isinstance(tree, Relation | Superlative):
         free = isinstance(tree, Superlative) and tree.kind in ("nearest", "farthest") and tree.anchor is None
-        if free or tree.kind in SAID_BY_VIEWER:
+        if free or tree.kind in NEED_VIEWPOINT:
             raise InputError(f"'{tree.kind}' depends on where one stands; give a camera, or say it otherwise")
     for child in children(tree):
         _check_viewpoint(child, viewpoint)
 
 
-class _Asking:
-    """The phrases of one tree, each asked once."""
+class _Evaluator:
+    """Evaluation of one tree, in which each phrase is queried once."""
 
     def __init__(self, engine: QueryEngine, camera: Camera | None, progress: Progress) -> None:
         self.engine, self._progress = engine, progress
-        self._asked: dict[tuple[str, LevelChoice], QueryResult] = {}
+        self._results: dict[tuple[str, LevelChoice], QueryResult] = {}
         self._frame = upright(engine.scene.up())
         self._viewpoint = None if camera is None else viewpoint(camera, self._frame)
 
     def answer(self, tree: Phrase, level: LevelChoice = "auto", count: int = 1) -> QueryResult:
-        """Return the answer to a tree, of a superlative the `count` that are most so; without a place."""
+        """Return the answer to a tree, without a position; count: how many a superlative selects."""
         match tree:
             case Atom(text):
-                return self._thing(text, level)
+                return self._atom(text, level)
             case Both(items) | Union(items):
                 return joined([self.answer(item, level) for item in items], isinstance(tree, Both))
             case Without(what, unwanted):
                 excluded, wanted = self.answer(unwanted), self.answer(what, level)
                 members = excluded.members
                 if isinstance(unwanted, Atom):
-                    # A green mug may be in the answer to "red mug", for want of a better one; it is not what
-                    # "not red mug" means.
+                    # "red mug" may also find a green mug, if nothing fits better; "not red mug" keeps it.
                     members = members & within_reach(self.engine, excluded, HALF)[0]
                 return restricted(wanted, ~members, wanted) if excluded.found else wanted
             case Inside(part, whole):
                 return self._inside(part, whole, level)
             case Counted(count, what):
                 every = self.answer(what, level, count)
-                enough = every.found and count_things(self.engine, every).most >= count
+                enough = every.found and count_instances(self.engine, every).most >= count
                 return replace(every, judgement=replace(every.judgement, found=enough))
             case Relation() | Superlative():
                 return self._chosen(tree, level, count)
 
-    def _ask(self, text: str, level: LevelChoice) -> QueryResult:
+    def _run(self, text: str, level: LevelChoice) -> QueryResult:
         key = (phrase_key(text), level)
-        if key not in self._asked:
-            self._asked[key] = self.engine.run(text, level, self._progress)
-        return self._asked[key]
+        if key not in self._results:
+            self._results[key] = self.engine.run(text, level, self._progress)
+        return self._results[key]
 
-    def _thing(self, text: str, level: LevelChoice) -> QueryResult:
-        """Return the answer to a phrase; a thing is looked for among wholes, unless it fits none."""
+    def _atom(self, text: str, level: LevelChoice) -> QueryResult:
+        """Return the answer to a phrase; a thing is searched among wholes, unless it fits none."""
         if level != "auto" or named(text) != "thing" or self.engine.is_taught(text):
-            return self._ask(text, level)
-        whole = self._ask(text, "whole")
-        return whole if whole.peak >= FLOOR else self._ask(text, "auto")
+            return self._run(text, level)
+        whole = self._run(text, "whole")
+        return whole if whole.peak >= FLOOR else self._run(text, "auto")
 
     def _inside(self, part: Phrase, whole: Phrase, level: LevelChoice) -> QueryResult:
         thing, engine = self.answer(whole), self.engine
@@ -183,7 +182,7 @@ class _Asking:
         names, on = [part.text], thing.members
         if isinstance(whole, Atom) and not engine.is_taught(whole.text):
             names += filter(engine.is_known, [f"{whole.text} {part.text}"])
-            if ADJECTIVES.isdisjoint(whole.text.lower().split()):  # else it is told from others of its kind
+            if ADJECTIVES.isdisjoint(whole.text.lower().split()):  # an adjective picks one of several
                 on = within_reach(engine, thing, RULE.around)[0]
         calibration = engine.calibration if thing.probability is not None else None
         found = engine.run_inside(names, on, level, calibration)
@@ -212,14 +211,14 @@ class _Asking:
         return restricted(what, keep, anchor or what)
 
     def _bodies(self, answer: QueryResult) -> list[tuple[Array, Body]]:
-        """Every single thing of an answer, as surface numbers and as the place it takes."""
+        """Return the instances of an answer, each as its surface numbers and its body."""
         surface = self.engine.surface
         parts = separate(surface, answer.members[surface.rows], self.engine.tree)
         return [(numbers, body(surface.positions[numbers], self._frame)) for numbers in parts]
 
 
 def joined(answers: Sequence[QueryResult], all_needed: bool) -> QueryResult:
-    """Return the union of answers, found if all are, or any; alternatives that are not found do not count."""
+    """Return the union of answers, found if all or any are found; alternatives not found are left out."""
     counting = answers if all_needed else [answer for answer in answers if answer.found] or answers
     score = min if all_needed else max
     values = np.max([np.where(a.members, a.relevancy[a.level], 0) for a in counting], axis=0)
@@ -236,7 +235,7 @@ def joined(answers: Sequence[QueryResult], all_needed: bool) -> QueryResult:
 
 
 def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryResult:
-    """`answer` limited to `keep` (N,); nothing is found where `needed` is not."""
+    """Return `answer` limited to `keep` (N,) bool; it is found only if `needed` is found too."""
     members = answer.members & keep
     judgement = combined([answer.judgement, needed.judgement], all_needed=True)
     return replace(
@@ -250,63 +249,63 @@ def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryRe
 
 
 def within_reach(engine: QueryEngine, answer: QueryResult, *shares: float) -> list[Array]:
-    """Return (N,) bool of each share: the answer if it reached so far below its best region."""
+    """Return for each share the (N,) bool members that the answer has with this share of `RULE`'s reach."""
     fits = engine.scale.fit(answer.even)
     best = float(fits[answer.members].max(initial=-np.inf))
     return [np.asarray(fits >= RULE.least_fit(best, share)) for share in shares]
 
 
 @dataclass(frozen=True)
-class Number:
-    """Number of single things in an answer, with the least and most that there may be."""
+class InstanceCount:
+    """Number of instances in an answer, with a range."""
 
     best: int
-    least: int  # with a stricter cut
-    most: int  # with a wider one
+    least: int  # by `RULE.strict`
+    most: int  # by `RULE.wide`
 
 
-def count_things(engine: QueryEngine, answer: QueryResult) -> Number:
-    """Return the number of single things in an answer, as `separate` tells them apart, and its range."""
+def count_instances(engine: QueryEngine, answer: QueryResult) -> InstanceCount:
+    """Return the number of instances in an answer, as `separate` divides it, and its range."""
     least, most = within_reach(engine, answer, RULE.strict, RULE.wide)
     low, own, high = (
         len(separate(engine.surface, inside[engine.surface.rows], engine.tree))
         for inside in (least & answer.members, answer.members, most | answer.members)
     )
-    return Number(own, min(low, own), max(high, own))
+    return InstanceCount(own, min(low, own), max(high, own))
 
 
-# Answers of a scene's field, and masks of the same phrase in its photographs.
+# Answers of a scene's field, combined with masks of the same phrase in its photographs.
 
-Spoke = Literal["both", "the field", "the photographs", "neither"]
-TOUCHED = 0.1  # of a region of the field, in masks: from then on these alone say what of it is the thing
+FoundBy = Literal["both", "the field", "the photographs", "neither"]
+TOUCHED = 0.1  # share of a region in masks from which the masks alone decide which of its Gaussians stay
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
-    """An answer of the field and of masks in photographs, and what each of them said."""
+class MaskedAnswer:
+    """An answer of the field combined with masks in photographs, and the members by each of them."""
 
     answer: QueryResult
-    field: Array  # (N,) bool members by the field; none where it did not find the phrase
+    field: Array  # (N,) bool members by the field; none if it did not find the phrase
     masks: Array  # (N,) bool members by masks
 
-    def who(self, rows: Array | slice = slice(None)) -> Spoke:
-        """Return who found the thing of these Gaussians, each having most of them, or any thing at all."""
+    def found_by(self, rows: Array | slice = slice(None)) -> FoundBy:
+        """Return which of them have most of the Gaussians `rows` as members; by default, any Gaussian."""
         least = 0.0 if isinstance(rows, slice) else HALF
-        spoke = self.field[rows].mean() > least, self.masks[rows].mean() > least
-        names: tuple[Spoke, ...] = ("neither", "the photographs", "the field", "both")
-        return names[2 * spoke[0] + spoke[1]]
+        found = self.field[rows].mean() > least, self.masks[rows].mean() > least
+        names: tuple[FoundBy, ...] = ("neither", "the photographs", "the field", "both")
+        return names[2 * found[0] + found[1]]
 
 
-def with_masks(engine: QueryEngine, found: QueryResult, shares: Array) -> Heard:
-    """Return an answer together with masks; shares: (N,) of `selection.shares_in_masks`.
+def with_masks(engine: QueryEngine, found: QueryResult, shares: Array) -> MaskedAnswer:
+    """Return an answer combined with masks; shares: (N,) of `selection.shares_in_masks`.
 
-    What lies by more than half in masks is the thing, more sharply than regions are, with their mean share as
-    its score. Regions of the field's answer that masks hardly touch stay, and so does what no photograph
-    sees: a segmenter misses, too.
+    Gaussians by more than half in masks are members, with sharper borders than regions have; their score is
+    the mean share. Of the field's answer, regions that masks hardly touch stay, and Gaussians that no
+    photograph sees: a segmenter misses some instances.
     """
     field, masks = found.members & found.found, shares > HALF
     if masks.sum() < RULE.smallest:
-        return Heard(found, field, np.zeros_like(masks))
+        return MaskedAnswer(found, field, np.zeros_like(masks))
     regions = engine.regions
     level = found.level if found.found else regions.level_of(masks)
     touched = regions.means(np.tile(masks, (len(LEVELS), 1)))[level] >= TOUCHED
@@ -318,4 +317,4 @@ def with_masks(engine: QueryEngine, found: QueryResult, shares: Array) -> Heard:
     merged = replace(found, level=level, members=masks | kept, even=even, peak=peak, judgement=judgement)
     best = engine.instances(merged, 1)
     place, box = place_of(best[0].points) if best else (None, None)
-    return Heard(replace(merged, place=place, box=box), field, masks)
+    return MaskedAnswer(replace(merged, place=place, box=box), field, masks)

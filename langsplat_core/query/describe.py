@@ -3,11 +3,11 @@
     p(word | x)  =  softmax over words of  scale * (cos(x, word) - hub(word) / 2)
 
 The hub of a word is its mean cosine with the features of the scene that are nearest to it. Some words lie
-near every image and would be the answer everywhere ("hubs"); what is left says how much better a word fits
-here than where it fits anyway. It is cross-domain similarity local scaling ("Word translation without
-parallel data", Conneau et al. 2018, equation 3): 2 cos(x, w) - hub(w) - hub(x), halved, and without hub(x),
-which all words have in common. The canonical phrases ("object", "things", "stuff", "texture") compete too:
-their share is the chance that no word of the vocabulary fits.
+near every image and would be the answer everywhere; subtracting the hub leaves how much better a word fits
+here than at its nearest features. This is cross-domain similarity local scaling ("Word translation without
+parallel data", Conneau et al. 2018, equation 3): 2 cos(x, w) - hub(w) - hub(x), halved, without hub(x), which
+is the same for all words. The canonical phrases ("object", "things", "stuff", "texture") compete too: their
+share is the probability that no word of the vocabulary fits.
 """
 
 from collections.abc import Sequence
@@ -28,26 +28,26 @@ from langsplat_core.scene import LEVELS, Camera, CodebookCodec, Codec, LanguageF
 from langsplat_core.scene.surface import surface_areas
 from langsplat_core.semantics.relevancy import bundled_vocabulary
 
-# Logits per spread of phrases' cosines with a feature: a probability is then right about so often, with the
-# bundled encoder and with the geometry of CLIP (rooms 201 to 203, docs/searching.md).
+# Logits per spread of phrases' cosines with a feature. With it probabilities are calibrated, for the bundled
+# encoder and for CLIP's geometry (rooms 201 to 203, docs/searching.md).
 WORD_SCALE = 6.0
-NEAREST = 10  # features that make a word's hub, as in the paper
-BANK = 4096  # features, at most, that are looked at for it
-LIKELY = 0.5  # probability from which a word is said
-OR = " or "  # between words for one thing
+NEAREST = 10  # features that a word's hub is averaged over, as in the paper
+BANK = 4096  # features, at most, among which they are found
+LIKELY = 0.5  # least probability of a name
+OR = " or "  # between words for one instance
 CELLS = 8_000_000  # numbers, at most, of features times words that are held at once: 32 MB
 
 
 @dataclass(frozen=True)
 class Word:
-    """A phrase and how probable it is, among its vocabulary."""
+    """A phrase and its probability within a vocabulary."""
 
     phrase: str
     probability: float  # in [0, 1]
 
 
 def likely_name(words: Sequence[Word]) -> Word | None:
-    """Return the best word, or as many as are `LIKELY` together: "mug or cup"; None where all are not."""
+    """Return the fewest best words that are `LIKELY` together, such as "mug or cup"; None if all are not."""
     for count in range(1, len(words) + 1):
         probability = sum(word.probability for word in words[:count])
         if probability >= LIKELY:
@@ -57,12 +57,12 @@ def likely_name(words: Sequence[Word]) -> Word | None:
 
 @dataclass(frozen=True, eq=False)
 class WordScores:
-    """A vocabulary as numbers: everything about it that does not depend on the place that is asked for."""
+    """Part of the probabilities of a vocabulary in a scene that does not depend on the Gaussians."""
 
     codec: Codec  # of the scene's features
     phrases: tuple[str, ...]  # V
-    vectors: Array  # (V + C, D) float32 unit; the last C stand for "none of these"
-    hubs: Array  # (V + C,) float32, taken half
+    vectors: Array  # (V + C, D) float32 unit; the last C are the canonical phrases: "none of these"
+    hubs: Array  # (V + C,) float32
     scale: float  # of the softmax
 
     def take(self, chosen: Array) -> "WordScores":
@@ -73,7 +73,7 @@ class WordScores:
 
     @cached_property
     def _of_codewords(self) -> Array | None:
-        """The (K, V + C) float32 probabilities of all codewords; None where there are none, or too many."""
+        """The (K, V + C) float32 probabilities at all codewords; None without a codebook or above `CELLS`."""
         if not isinstance(self.codec, CodebookCodec) or self.codec.size * len(self.vectors) > CELLS:
             return None
         return self._softmax(np.arange(self.codec.size)[:, None])
@@ -91,7 +91,7 @@ class WordScores:
     def mixture(self, latents: Array, weights: Array) -> Array:
         """Return the (V + C,) float64 mean of the probabilities for (M, d) latents, weighted by (M,).
 
-        Weights are >= 0, not all zero. Answers are blended, never features: between two things lies a third.
+        Weights are >= 0, not all zero. Probabilities are blended, as mean features may mean something else.
         """
         latents, of = self.codec.unique(latents)
         weights = np.bincount(of, weights, minlength=len(latents))
@@ -101,9 +101,9 @@ class WordScores:
         return total / total.sum()
 
     def best(self, latents: Array, count: int) -> tuple[Array, Array]:
-        """Return (M, count) numbers of the most probable phrases of (M, d) latents, best first, and these.
+        """Return (M, count) indices of the most probable phrases of (M, d) latents, best first.
 
-        Probabilities are float32; there are fewer columns where the vocabulary has fewer phrases.
+        Also returns their float32 probabilities. A vocabulary of fewer phrases gives fewer columns.
         """
         count = min(count, len(self.phrases))
         words = np.empty((len(latents), count), np.int32)
@@ -121,25 +121,25 @@ class WordScores:
 
 
 def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
-    """Return scores of names of things, from V phrases and their (V, D) unit vectors."""
+    """Return the scores of V phrases with (V, D) unit vectors in a scene's field."""
     every = np.concatenate([vectors, field.canonical]).astype(np.float32)
     bank = field_features(field)
-    # The scale is in the median, over features, of the spread of everyday phrases' cosines, else the words'.
+    # Median, over features, of the spread of their cosines with everyday phrases, else with the words.
     texts = vectors if field.everyday is None else field.everyday
     spreads = (bank @ texts.T).std(1) if len(bank) and len(texts) > 1 else np.ones(1)
-    scale = WORD_SCALE / max(float(np.median(spreads)), 1e-6)  # words that are all the same have none
+    scale = WORD_SCALE / max(float(np.median(spreads)), 1e-6)  # equal words have no spread
     return WordScores(field.codec, phrases, every, hubs(every, bank), scale)
 
 
 def field_features(field: LanguageField) -> Array:
-    """Return (B, D) float32 unit vectors of the scene's Gaussians, evenly chosen where there are many."""
+    """Return (B, D) float32 unit vectors of the scene's distinct features, evenly sampled above `BANK`."""
     latents, _ = field.codec.unique(field.latents[field.known])
     chosen = np.unique(np.linspace(0, len(latents) - 1, min(BANK, len(latents))).astype(np.int64))
     return field.codec.decode(latents[chosen])
 
 
 def hubs(vectors: Array, bank: Array) -> Array:
-    """Return the (V,) float32 mean cosines of (V, D) words with the nearest of (B, D) features."""
+    """Return the (V,) float32 mean cosines of (V, D) words with their `NEAREST` of (B, D) features."""
     count = min(NEAREST, len(bank))
     if count == 0:
         return np.zeros(len(vectors), np.float32)
@@ -147,24 +147,24 @@ def hubs(vectors: Array, bank: Array) -> Array:
     return near.mean(1, dtype=np.float64).astype(np.float32)
 
 
-# Places in words.
+# Words for Gaussians and pixels.
 
 
 @dataclass(frozen=True)
 class LevelWords:
-    """The most probable words for a place at one level."""
+    """The most probable words for some Gaussians at one level."""
 
     level: int  # index into LEVELS
-    words: tuple[Word, ...]  # the most probable first; none where nothing is known
+    words: tuple[Word, ...]  # the most probable first; none without features
     other: float  # probability that no word of the vocabulary fits
-    known: float  # share of the place that has a feature at this level, in [0, 1]
+    known: float  # share of the weight that has a feature at this level, in [0, 1]
 
 
 Levels = tuple[LevelWords, ...]  # of subpart, part and whole
 
 
 class Describer:
-    """Reverse queries against one scene, for one thread at a time; the vocabulary is encoded once, here."""
+    """Reverse queries against one scene, for one thread at a time."""
 
     def __init__(
         self, engine: QueryEngine, vocabulary: Sequence[str] | None = None, progress: Progress = silent
@@ -172,8 +172,8 @@ class Describer:
         """Encode a vocabulary.
 
         vocabulary: phrases for all levels, by default the bundled ones: everyday things, and below the level
-        "whole" parts of things too. Those with words that the encoder was never taught are left out. Raises
-        InputError for a scene without a language field and where no phrase is left, EncoderError as
+        "whole" parts of things too. Phrases with words that the encoder was never taught are left out. Raises
+        InputError for a scene without a language field and if no phrase is left, EncoderError as
         `QueryEngine.known_vectors` does.
         """
         things = tuple(vocabulary) if vocabulary is not None else bundled_vocabulary("things")
@@ -197,10 +197,10 @@ class Describer:
         return surface_areas(self.engine.scene.gaussians)
 
     def at_gaussians(self, rows: Array, weights: Array | None = None, top: int = 5) -> Levels:
-        """Return words for Gaussians at `rows` (M, or (N,) bool), by `weights` (M,), else their surface."""
+        """Return words for Gaussians at `rows` (M, or (N,) bool), weighted by (M,) `weights`, else area."""
         rows = np.flatnonzero(rows) if rows.dtype == bool else rows
         counted = self.areas[rows] if weights is None else np.asarray(weights, np.float64)
-        if weights is None and not counted.any():  # without any surface they still have features
+        if weights is None and not counted.any():  # without any area they still have features
             counted = np.ones(len(rows))
         return tuple(self.at_level(level, rows, counted, top) for level in range(len(LEVELS)))
 
@@ -222,11 +222,11 @@ class Describer:
 
 @dataclass(frozen=True, eq=False)
 class Pointed:
-    """The surface that one pixel shows, in words."""
+    """The surface at one pixel: its position, words and relevancies."""
 
     position: Array  # (3,) world units
     depth: float  # camera z, world units
-    words: Levels  # at each level the most probable
+    words: Levels  # the most probable at each level
     relevancy: tuple[float, ...]  # in [0, 1], of each answer at its level
 
 
@@ -239,10 +239,10 @@ def look_at_pixel(
     top: int = 3,
     settings: RasterSettings | None = None,
 ) -> Pointed | None:
-    """Return the surface that `camera` sees at a pixel (column, row); None where that is mostly empty.
+    """Return the surface that `camera` sees at a pixel (column, row); None if the pixel is mostly empty.
 
-    Every Gaussian counts by its blending weight there; the surface is at the median of their depths, as the
-    rasterizers have it. `settings` of image formation: by default the scene's own.
+    Every Gaussian counts by its blending weight there; the depth is the median by these weights, as in the
+    rasterizers. `settings` of image formation: by default the scene's own.
     """
     scene = describer.engine.scene
     rows, weights = pixel_weights(scene, camera, pixel, rasterizer, settings)

@@ -1,4 +1,4 @@
-"""Phrases asked of a scene, from the text to the answer.
+"""The query engine: from a phrase to its answer in a scene.
 
 A phrase becomes a text vector (`text_vectors`), the vector a relevancy of every Gaussian (`lookup`), these
 become fits of the regions of the scene's tree (`answers`), and the fits an answer (`rule`).
@@ -20,6 +20,7 @@ from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.sidecar import SUFFIX, Words
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query import taught as taught_words
 from langsplat_core.query.answers import (
     AnswerRule,
     QueryResult,
@@ -33,7 +34,6 @@ from langsplat_core.query.grammar import STOP_WORDS, check_names, named, only, t
 from langsplat_core.query.instances import Instance, find_instances, find_wholes
 from langsplat_core.query.lookup import Lookup, Relevancy, through_cells
 from langsplat_core.query.rule import Bars, bars_of, decide, on_things, scaling_of
-from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     LEVELS,
@@ -60,7 +60,7 @@ def no_field(scene: Scene) -> str:
 
 
 def searchable(path: Path) -> Scene:
-    """Return the scene of a file; InputError where it has no language field."""
+    """Return the scene of a file; InputError if it has no language field."""
     scene = load_scene(path)
     if scene.language is None:
         raise InputError(f"{path}: {no_field(scene)}")
@@ -69,20 +69,20 @@ def searchable(path: Path) -> Scene:
 
 @dataclass(frozen=True)
 class Basis:
-    """The encoder and calibration that the answers in a scene stand on, for people."""
+    """The encoder and calibration behind the answers in a scene, in words for people."""
 
     encoder: str  # as the scene names it
-    calibration: str | None  # where percentages were seen to hold; None: there are none
+    calibration: str | None  # scenes in which probabilities were calibrated; None: there are none
     short: str  # one line
-    long: str  # the same with what follows from it, and what to do about it
-    guesses: bool  # of the demo encoder, outside the rooms that it was made for
+    long: str  # the same with consequences and remedy
+    guesses: bool  # True for the demo encoder outside the rooms that it was made for
 
 
 class QueryEngine:
     """Queries against one scene.
 
-    What depends on the scene alone is computed at the first query, and the text encoder is loaded when a
-    phrase first needs it. Several threads may ask at once, and take turns at the encoder.
+    Everything that depends on the scene alone is computed at the first query, and the text encoder is loaded
+    when a phrase first needs it. Several threads may query at once; they take turns at the encoder.
     """
 
     def __init__(
@@ -97,10 +97,11 @@ class QueryEngine:
     ) -> None:
         """Prepare queries against a scene; nothing is computed yet.
 
-        load_encoder: or an encoder; without, only the scene's own phrasebook can be asked. encoder_id: in
-        place of the one that the scene names. exact: compare every latent itself instead of its cell, to
-        measure the cells by. rule: "regions" becomes "peak" where neither scene nor encoder has everyday
-        phrases. words: taught ones of the user, before the scene's; EncoderError if of another encoder.
+        load_encoder: an encoder or a function that loads one; without it, only phrases of the scene's
+        phrasebook are answered. encoder_id: in place of the one that the scene names. exact: compare every
+        latent itself instead of its cell, as a reference for the cells. rule: "regions" becomes "peak" if
+        neither scene nor encoder has everyday phrases. words: the user's, before the scene's; EncoderError if
+        they are of another encoder.
         """
         given: Any = load_encoder
         if isinstance(scene, str | Path) or isinstance(given, str):
@@ -112,8 +113,8 @@ class QueryEngine:
         self._encoder_id = encoder_id
         self._encoder: TextEncoder | None = None
         self._encoder_checked = False
-        self._turn = RLock()  # at the encoder, whose tokenizer is not made for two at once
-        # Of phrases that can be asked without encoding, 2 KB each at D = 512.
+        self._turn = RLock()  # guards the encoder, whose tokenizer is not thread-safe
+        # Vectors of phrases that need no encoding, 2 KB each at D = 512.
         self._vectors: dict[str, Array] = {} if scene.language is None else dict(scene.language.phrasebook)
         taught = () if scene.language is None else scene.language.taught
         if words is not None:
@@ -124,32 +125,32 @@ class QueryEngine:
     # Answers.
 
     def run(self, phrase: str, level: LevelChoice = "auto", progress: Progress = silent) -> QueryResult:
-        """Answer `phrase` as one name; a taught word by what was shown. Raises as `text_vectors` does.
+        """Answer `phrase` as one name; a taught word by its examples. Raises as `text_vectors` does.
 
-        The level is chosen for the scene and not for a view: the image does not flicker between levels. "Lid
-        of the teapot" is one name here; `run_phrase` reads it.
+        The level is chosen per scene and not per view, so that images do not flicker between levels. "Lid of
+        the teapot" is one name here; `run_phrase` parses it.
         """
         return self.run_many([phrase], level, progress)[0]
 
     def run_many(
         self, phrases: Sequence[str], level: LevelChoice = "auto", progress: Progress = silent
     ) -> list[QueryResult]:
-        """Return the answers of `run` to phrases, which are encoded and compared together."""
+        """Return the answers of `run` to several phrases, which are encoded and compared together."""
         if level not in ("auto", *LEVELS):
             raise InputError(f"no level {level!r}; choose auto or one of {', '.join(LEVELS)}")
         if isinstance(phrases, str) or not all(isinstance(phrase, str) for phrase in phrases):
             raise InputError("a phrase is text: run('blue gift'), or run_many(['cup', 'lamp']) for several")
         texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
-        vectors = self.text_vectors(texts, progress)  # first: what it refuses leaves nothing cached
+        vectors = self.text_vectors(texts, progress)  # first, so that a refused phrase leaves nothing cached
         relevancies = self._lookup.relevancies(vectors) if texts else iter(())
         others, answers = self._fits_of_names(texts), []
         for phrase in phrases:
             progress(f"searching '{tidy(phrase)}'", 0.5)
             if self.is_taught(phrase):
-                answers.append(self._by_showing(self.taught[phrase_key(phrase)], level))
+                answers.append(self._by_examples(self.taught[phrase_key(phrase)], level))
             else:
                 answers.append(self._answer(tidy(phrase), next(relevancies), level, others))
-            vars(answers[-1])["engine"] = self  # not by `replace`, which would make its arrays
+            vars(answers[-1])["engine"] = self  # `replace` would compute its deferred arrays
         return answers
 
     def relevancy(self, vector: Array) -> Array:
@@ -157,7 +158,7 @@ class QueryEngine:
         return next(self._lookup.relevancies(vector[None]))()
 
     def _fits_of_names(self, phrases: Sequence[str]) -> dict[str, Array]:
-        """Return the (R,) own fits of the things and parts that `phrases` name, as far as they are known."""
+        """Return the (R,) own fits of the wholes and parts in `phrases`, as far as the encoder knows them."""
         wanted = dict.fromkeys(name for phrase in phrases for name in thing_and_part(tidy(phrase)))
         names = [name for name in wanted if self.is_known(name) and self.bars is not None]
         relevancies = self._lookup.relevancies(self.text_vectors(names)) if names else ()
@@ -168,7 +169,7 @@ class QueryEngine:
         return self.scale.fit(self._mixtures @ relevancy.values)
 
     def is_known(self, name: str) -> bool:
-        """Return whether a phrase is a known text: no taught word, and of no unknown words."""
+        """Return True if the encoder knows all words of a phrase, and it is no taught word."""
         try:
             return bool(name) and not (self.is_taught(name) or self.unknown_words(name))
         except EncoderError:
@@ -193,9 +194,9 @@ class QueryEngine:
     def run_inside(
         self, names: Sequence[str], members: Array, level: LevelChoice, calibration: Calibration | None
     ) -> QueryResult:
-        """Answer a part by all its `names` on the thing that has `members` (N,) bool.
+        """Answer a part, by the mean over its `names`, among the regions of an instance, `members` (N,) bool.
 
-        It is judged there, by the first name. Raises as `text_vectors` does.
+        The verdict is by the first name, among these regions. Raises as `text_vectors` does.
         """
         assert self.bars is not None
         assert self.chance is not None
@@ -207,20 +208,20 @@ class QueryEngine:
         return by_regions(names[0], relevancy, decision, self.scene.gaussians.means, self.regions)
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
-        """Return the things among the members of an answer, best first, or only so many of them."""
+        """Return the instances among the members of an answer, best first, at most `at_most`."""
         wholes, join = self.tree.voted_wholes, result.level == len(LEVELS) - 1
         members, even, gaussians = result.members, result.even, self.scene.gaussians
-        if join and self.bars is not None:  # by peaks, relevancy is not even, and wants smoothing
+        if join and self.bars is not None:  # by the rule "peak", relevancies vary and need smoothing
             found = find_wholes(gaussians, members, even, wholes, at_most)
             if found is not None:
                 return found
         return find_instances(self.surface, gaussians, members, even, at_most, wholes, join)
 
-    # What answers stand on: each is computed when first needed.
+    # Data that answers are computed from, each made when it is first needed.
 
     @property
     def field(self) -> LanguageField:
-        """The scene's language field; InputError where it has none."""
+        """The scene's language field; InputError if it has none."""
         field = self.scene.language
         if field is None:
             raise InputError(no_field(self.scene))
@@ -228,7 +229,7 @@ class QueryEngine:
 
     @property
     def rule(self) -> AnswerRule:
-        """Rule for answers: "regions" where the field has everyday phrases to compare with, else "peak"."""
+        """Rule for answers: "regions" if there are everyday phrases to compare with, else "peak"."""
         return "regions" if self.scale.everyday is not None else "peak"
 
     @property
@@ -239,7 +240,7 @@ class QueryEngine:
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration of probabilities, by regions alone: the scene's own, else the user's."""
+        """The calibration of probabilities: the scene's own, else the user's; None by the rule "peak"."""
         return self.field.calibration or self._kept if self.rule == "regions" else None
 
     @cached_property
@@ -257,12 +258,12 @@ class QueryEngine:
 
     @cached_property
     def surface(self) -> Surface:
-        """The surface of the scene's Gaussians: a tenth of a second at 80k."""
+        """The surface of the scene's Gaussians; takes 0.1 s for 80 000."""
         return build_surface(self.scene.gaussians)
 
     @cached_property
     def tree(self) -> Tree:
-        """The scene's own tree; where it has none, one that is built."""
+        """The scene's own tree, else one that is built from its surface."""
         field = self.field
         if field.tree is not None:
             return field.tree
@@ -275,19 +276,19 @@ class QueryEngine:
 
     @cached_property
     def chance(self) -> Array | None:
-        """The (R, V) fits of everyday phrases in the regions of all levels; None where there are none."""
+        """The (R, V) fits of everyday phrases in the regions of all levels; None without such phrases."""
         if self.rule == "peak":
             return None
         return chance_in(self.regions.table, self._mixtures, self._lookup, self.scale)
 
     @cached_property
     def bars(self) -> Bars | None:
-        """The best fits of everyday phrases in the scene; None where there are none."""
+        """The best fits of everyday phrases in the scene; None without such phrases."""
         return None if self.chance is None else bars_of(self.regions.table, self.chance)
 
     @property
     def basis(self) -> Basis:
-        """The basis of answers, by what is known so far: nothing is loaded for it."""
+        """The basis of answers, as far as it is known: nothing is loaded for it."""
         field = self.field
         everyday = None if self._rule == "peak" else self.__dict__.get("_everyday", _enough(field.everyday))
         name = "demo encoder" if field.encoder_id == DEMO else field.encoder_id
@@ -315,7 +316,7 @@ class QueryEngine:
     # Text vectors.
 
     def load_encoder(self, progress: Progress = silent) -> TextEncoder:
-        """Return the text encoder, loaded at the first call, in seconds; EncoderError where that fails."""
+        """Return the text encoder, which the first call loads, in seconds; EncoderError if that fails."""
         with self._turn:
             if self._encoder is None:
                 if self._load_encoder is None:
@@ -328,7 +329,7 @@ class QueryEngine:
             return self._encoder
 
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
-        """Words for which `phrase` cannot be asked; EncoderError as `load_encoder` raises it."""
+        """Return the words of `phrase` that the encoder was never taught. Raises as `load_encoder` does."""
         key = phrase_key(phrase)
         return () if key in self.taught or key in self._vectors else self.load_encoder().unknown_words(key)
 
@@ -336,7 +337,7 @@ class QueryEngine:
         """Return (Q, D) unit vectors of phrases, from the scene's phrasebook, else encoded together.
 
         Raises InputError for an empty phrase and one of stop words alone, UnknownWordError for words that the
-        encoder was never taught, and EncoderError for one that is not the scene's or cannot be loaded.
+        encoder was never taught, and EncoderError if the encoder cannot be loaded or is not the scene's.
         """
         keys = list(map(phrase_key, phrases))
         fresh = [key for key in dict.fromkeys(keys) if key not in self._vectors]
@@ -357,7 +358,7 @@ class QueryEngine:
     ) -> tuple[tuple[str, ...], Array]:
         """Return the keys of `phrases` whose words the encoder was taught, each once, and (V, D) vectors.
 
-        Raises EncoderError for an encoder that is not the scene's, or one that cannot be loaded.
+        Raises EncoderError if the encoder cannot be loaded or is not the scene's.
         """
         keys = tuple(dict.fromkeys(map(phrase_key, phrases)))
         fresh = [key for key in keys if key not in self._vectors and not only(STOP_WORDS, key.split())]
@@ -369,12 +370,12 @@ class QueryEngine:
         return known, self._stacked(known)
 
     def _stacked(self, keys: Sequence[str]) -> Array:
-        """Return (Q, D) vectors of phrases that are all known already."""
+        """Return the (Q, D) vectors of phrases that have been encoded."""
         vectors = [self._vectors[key] for key in keys]
         return np.stack(vectors) if vectors else np.zeros((0, self.field.codec.vector_dim), np.float32)
 
     def _encode(self, encoder: TextEncoder, keys: Sequence[str], progress: Progress = silent) -> None:
-        """Keep the vectors of phrases that `encoder` knows; EncoderError where it is not the scene's."""
+        """Encode phrases in batches and keep their vectors; EncoderError if `encoder` is not the scene's."""
         for start in range(0, len(keys), BATCH):
             batch = list(keys[start : start + BATCH])
             with self._turn:
@@ -384,7 +385,7 @@ class QueryEngine:
             progress("reading the vocabulary", (start + len(batch)) / len(keys))
 
     def _check_encoder(self, encoder: TextEncoder) -> None:
-        """EncoderError unless `encoder` makes the scene's canonical vectors: others answer with noise."""
+        """Raise EncoderError unless `encoder` makes the scene's canonical vectors: others give noise."""
         if self._encoder_checked:
             return
         own, made_with = self.field.canonical, self.field.encoder_id
@@ -398,7 +399,7 @@ class QueryEngine:
 
     @cached_property
     def _everyday(self) -> Array | None:
-        """The scene's own everyday phrases, else the encoder's; None where the rule needs none."""
+        """The scene's own everyday vectors, else the encoder's; None by the rule "peak" or if too few."""
         if self._rule == "peak":
             return None
         if self.field.everyday is not None:
@@ -411,23 +412,23 @@ class QueryEngine:
         except EncoderError:
             return None
 
-    # Words that are taught by showing.
+    # Taught words.
 
     @cached_property
-    def word_space(self) -> WordSpace:
-        """The scene's regions as taught words see them."""
-        return build_word_space(self.field, self.regions, self.tree.votes[:, 0])
+    def word_space(self) -> taught_words.WordSpace:
+        """The scene's regions in the space where taught words are compared."""
+        return taught_words.build_word_space(self.field, self.regions, self.tree.votes[:, 0])
 
     def is_taught(self, phrase: str) -> bool:
-        """Return whether a phrase is a taught word, and is answered by what was shown."""
+        """Return True if a phrase is a taught word, which is answered by its examples."""
         return phrase_key(phrase) in self.taught
 
     def teach(self, name: str, members: Array, level: LevelChoice = "auto") -> TaughtWord:
-        """Learn `name` for the features of `members` (N,) bool, by default at the level most like them.
+        """Learn `name` for the features of `members` (N,) bool; "auto": at the level of their likest region.
 
-        The name answers from now on, in place of any text; taught again, at its own level, it has one example
-        more. Nothing is written. Raises InputError for what is no name, members without a feature, and a word
-        that is known at another level or by enough examples.
+        From now on the name is answered by its examples and not as text. Taught again, at its own level, it
+        gets one more example. Nothing is written. Raises InputError for an unusable name, for members without
+        a feature, and for a word that was taught at another level or has `MOST_SHOWN` examples.
         """
         tidied = tidy(name)
         unsayable = only(STOP_WORDS, phrase_key(name).split()) or split_phrases(name) != [tidied]
@@ -441,7 +442,7 @@ class QueryEngine:
             raise InputError(f"'{tidied}' was shown {MOST_SHOWN} times, which is the most; remove it first")
         if known is not None and level not in ("auto", LEVELS[known.level]):
             raise InputError(f"'{tidied}' was taught at level {LEVELS[known.level]}; teach it there again")
-        word = self._shown(tidied, members, level if known is None else LEVELS[known.level])
+        word = self._word_of(tidied, members, level if known is None else LEVELS[known.level])
         if known is not None:
             vectors = np.concatenate([known.vectors, word.vectors])
             word = replace(known, vectors=vectors, rivals=np.append(known.rivals, word.rivals))
@@ -449,29 +450,30 @@ class QueryEngine:
         return word
 
     def like(self, members: Array, level: LevelChoice = "auto") -> QueryResult:
-        """Everything that is like `members` (N,) bool, they too: `teach` and `run`, but nothing is kept."""
-        return self._by_showing(self._shown("more like this", members, level), "auto")
+        """Answer with all that resembles `members` (N,) bool, themselves included; no word is kept."""
+        return self._by_examples(self._word_of("more like this", members, level), "auto")
 
-    def _shown(self, name: str, members: Array, level: str) -> TaughtWord:
+    def _word_of(self, name: str, members: Array, level: str) -> TaughtWord:
         members = np.asarray(members)
         check_array("members", members, ("N",), {"N": len(self.field)}, bool)
         at = self.regions.level_of(members) if level == "auto" else LEVELS.index(level)
-        return shown(self.word_space, self.field, self.regions, name, members, at)
+        return taught_words.of_example(self.word_space, self.field, self.regions, name, members, at)
 
-    def _by_showing(self, word: TaughtWord, level: LevelChoice) -> QueryResult:
-        return by_showing(word, self.word_space, self.regions, self.scene.gaussians.means, level)
+    def _by_examples(self, word: TaughtWord, level: LevelChoice) -> QueryResult:
+        means = self.scene.gaussians.means
+        return taught_words.by_examples(word, self.word_space, self.regions, means, level)
 
     def compare(self, phrase: str, vectors: Array, level: int) -> tuple[Array, Array]:
-        """Return (M,) cosines of a phrase with (M, D) unit vectors of images, at a level, and their fits."""
+        """Return the (M,) cosines of a phrase with (M, D) unit image vectors at a level, and (M,) fits."""
         if self.is_taught(phrase):
-            return compared(self.taught[phrase_key(phrase)], self.word_space, vectors, level)
+            return taught_words.compare(self.taught[phrase_key(phrase)], self.word_space, vectors, level)
         cosines = vectors @ self.text_vectors([phrase])[0]
         zero, rate = self.scale.of(vectors @ self.scale.texts.T)
         return cosines, self.scale.fit(relevancy_of(cosines, zero, rate))
 
 
 def check_words(field: LanguageField, words: Words) -> None:
-    """EncoderError unless taught words are of the encoder of a field, whatever its folder is called."""
+    """Raise EncoderError unless taught words are of a field's encoder, by its canonical vectors."""
     if not same_vectors(words.canonical, field.canonical):
         raise EncoderError(
             f"these words were taught with {words.encoder_id}, the scene was made with {field.encoder_id}; "

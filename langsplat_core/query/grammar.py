@@ -1,4 +1,4 @@
-"""Phrases with structure, read as a tree of phrases, and the words that tell parts from things."""
+"""The grammar of compositional queries, which parses text into a tree, and word lists of parts and things."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -16,7 +16,7 @@ def _words(text: str) -> frozenset[str]:
 
 
 ARTICLES = _words("a an the my your his her its our their this that these those some any")
-# What alone names nothing to look for.
+# Words that alone name nothing to search for.
 STOP_WORDS = ARTICLES | _words(
     "of in on at to by from with without and or not but no nor is are was be am it as for into onto than "
     "then there here what where which who whose how i you he she we they me us them so do does did except "
@@ -26,7 +26,7 @@ COLOURS = _words(
     "red orange yellow green blue purple pink brown black white grey gray beige turquoise cyan magenta "
     "violet gold golden silver maroon navy teal olive cream tan"
 )
-# Words that describe and name nothing: "red handle" is one thing, "mug handle" is a part of another.
+# Words that only describe: "red handle" is a handle, "mug handle" is a part of a mug.
 ADJECTIVES = COLOURS | _words(
     "light dark bright pale deep colourful colorful plain striped dotted checkered spotted patterned "
     "wooden wood metal metallic steel iron plastic glass leather cloth fabric cotton paper rubber ceramic "
@@ -35,9 +35,9 @@ ADJECTIVES = COLOURS | _words(
     "shiny matte old new broken clean dirty open closed empty full upper lower left right front rear back "
     "middle top bottom outer inner first second third other same very"
 )
-# Of these, what is a thing where no noun follows: "a mug and a glass".
+# Adjectives that are nouns if no noun follows: "a mug and a glass".
 ALSO_NOUNS = _words("orange glass stone paper light cloth gold silver metal wood leather straw iron")
-# Things that are a part of another thing; plurals are found by their singular.
+# Parts of things, in the singular.
 PARTS = _words(
     "handle lid leg ear wheel knob spout rim base stem shade bulb screen keyboard touchpad button dial "
     "display strap buckle zip zipper lace sole heel toe tongue collar sleeve cuff pocket hood flap seam brim "
@@ -53,14 +53,14 @@ PARTS = _words(
     "bow bristle tine prong nib eraser tread trim skirting ledge sill arch column shaft joint ring loop hook "
     "chain clasp pendant"
 )
-# Heads of "X of Y" that hold or measure Y, and are no part of it: "cup of tea", "pair of scissors".
+# Words X of "X of Y" that hold or measure Y and are no part of it: "cup of tea", "pair of scissors".
 MEASURES = _words(
     "cup mug glass bottle bowl plate jar can box bag pot bucket basket pair piece bit slice loaf bunch stack "
     "pile heap set row group kind type sort lot number handful can tin tube roll sheet bar block picture "
     "photo painting drawing statue map model image portrait bouquet carton pack packet pitcher jug barrel "
     "tray tank"
 )
-# Owners of which nothing is a part: "children's book" is a book.
+# Owners without parts: "children's book" is a book.
 OWNERS = _words(
     "children child kid kids men man women woman baby boy girl ladies lady people person player driver "
     "reader writer painter baker fisherman valentine mother father"
@@ -68,7 +68,7 @@ OWNERS = _words(
 
 
 def forms(word: str) -> tuple[str, ...]:
-    """Return a word in lower case and what it may be the plural of."""
+    """Return a word in lower case and its possible singulars."""
     low = word.lower()
     return (low, low.removesuffix("s"), low.removesuffix("es"))
 
@@ -79,12 +79,12 @@ PLURALS = {
     "wolves": "wolf", "shelves": "shelf", "halves": "half", "scarves": "scarf", "shoes": "shoe",
 }  # fmt: skip
 ALWAYS_PLURAL = _words("scissors glasses jeans trousers headphones shorts pants pliers tongs binoculars")
-# Of other plurals, and what stands there in the singular.
+# Endings of regular plurals, and their replacement in the singular.
 ENDINGS = {"(?<=..)ies$": "y", "(?<=..ss|..ch|..sh)es$|(?<=..x)es$|(?<![sui])s$": ""}
 
 
 def singular(word: str) -> str:
-    """Return the singular of an English noun; a word that is none already stays."""
+    """Return the singular of an English noun; a word that is not plural is unchanged."""
     low = word.lower()
     if low in PLURALS or low in ALWAYS_PLURAL:
         return PLURALS.get(low, word)
@@ -94,12 +94,12 @@ def singular(word: str) -> str:
 
 
 def is_part(word: str) -> bool:
-    """Return whether a noun, in either number, is a part of things."""
+    """Return True if a noun, singular or plural, names a part of things."""
     return not PARTS.isdisjoint(forms(word))
 
 
 def named(phrase: str) -> Named:
-    """Return what a phrase names: "mug" a thing, "red handle" a part, "mug handle" a part of a thing."""
+    """Return the kind of a phrase: "mug" is a thing, "red handle" a part, "mug handle" a part of a thing."""
     *before, last = phrase.split() or [""]
     if not is_part(last):
         return "thing"
@@ -107,18 +107,18 @@ def named(phrase: str) -> Named:
 
 
 def thing_and_part(phrase: str) -> tuple[str, str]:
-    """Return the thing that a phrase names a part of, and the part: "red mug" and "handle"; else ""."""
+    """Return thing and part of "part of a thing", "red mug" and "handle" of "red mug handle"; else "", ""."""
     *thing, part = phrase.split() if named(phrase) == "part of a thing" else [""]
     return " ".join(thing), part
 
 
 def only(words: frozenset[str], tokens: Sequence[str]) -> bool:
-    """Return whether all `tokens` are among `words`, whatever their case; so also of no tokens."""
+    """Return True if all `tokens`, in any case, are among `words`; True for no tokens."""
     return all(token.lower() in words for token in tokens)
 
 
 def check_names(words: Sequence[str]) -> None:
-    """InputError for no word, and for stop words alone, whose vectors are near anything."""
+    """Raise InputError for no word, and for stop words alone, whose vectors are near everything."""
     if not words:
         raise InputError("the query is empty; type a word such as 'teapot'")
     if only(STOP_WORDS, words):
@@ -131,7 +131,7 @@ Extreme = Literal["biggest", "smallest", "nearest", "farthest", "highest", "lowe
 
 @dataclass(frozen=True)
 class Atom:
-    """A phrase that is asked as it is."""
+    """A plain query."""
 
     text: str
 
@@ -146,7 +146,7 @@ class Inside:
 
 @dataclass(frozen=True)
 class Relation:
-    """Those of `what` that are in the relation `kind` to one of `anchor`."""
+    """The instances of `what` in relation `kind` to an instance of `anchor`."""
 
     kind: Side
     what: "Phrase"
@@ -162,7 +162,7 @@ class Both:
 
 @dataclass(frozen=True)
 class Union:
-    """Those of several things that are found."""
+    """Several things, of which those that are found are the answer."""
 
     items: tuple["Phrase", ...]
 
@@ -177,7 +177,7 @@ class Without:
 
 @dataclass(frozen=True)
 class Superlative:
-    """The one of `what` that is the most `kind`; nearest to or farthest from `anchor`, else the camera."""
+    """The instance of `what` that is most `kind`; distances are to `anchor`, else to the camera."""
 
     kind: Extreme
     what: "Phrase"
@@ -186,7 +186,7 @@ class Superlative:
 
 @dataclass(frozen=True)
 class Counted:
-    """All of `what`, of which there must be `count` or more."""
+    """All of `what`, found if there are `count` instances or more."""
 
     count: int
     what: "Phrase"
@@ -196,22 +196,22 @@ Phrase = Atom | Inside | Relation | Both | Union | Without | Superlative | Count
 
 
 def atoms(tree: Phrase) -> tuple[Atom, ...]:
-    """Return the phrases of a tree, in the order in which they are written."""
+    """Return the plain queries of a tree, in the order of the text."""
     if isinstance(tree, Atom):
         return (tree,)
     return tuple(atom for child in children(tree) for atom in atoms(child))
 
 
 def heads(tree: Phrase) -> tuple[str, ...]:
-    """Return the words of what is asked for: "mug" and "handle" of "mug or handle of the cup"."""
+    """Return the phrases that are searched for: "mug" and "handle" of "mug or handle of the cup"."""
     if isinstance(tree, Atom):
         return (tree.text,)
-    asked = children(tree) if isinstance(tree, Both | Union) else children(tree)[:1]
-    return tuple(text for child in asked for text in heads(child))
+    wanted = children(tree) if isinstance(tree, Both | Union) else children(tree)[:1]
+    return tuple(text for child in wanted for text in heads(child))
 
 
 def unparse(tree: Phrase) -> str:
-    """Return a tree as text, such as "handle  inside  red mug"; groups in a group stand in brackets."""
+    """Return a tree as text, such as "handle  inside  red mug"; nested trees are in brackets."""
     match tree:
         case Atom(text):
             return text
@@ -231,12 +231,12 @@ def _nested(tree: Phrase) -> str:
 
 
 def children(tree: Phrase) -> tuple[Phrase, ...]:
-    """Return the trees that a tree is made of."""
+    """Return the direct subtrees of a tree."""
     values = (value if isinstance(value, tuple) else (value,) for value in vars(tree).values())
     return tuple(part for several in values for part in several if isinstance(part, Phrase))
 
 
-# Phrases with structure: text -> tree, by a small grammar, and a tree's reading for people.
+# The grammar of queries.
 #
 #     query       = alternatives { exclusion alternatives }
 #     exclusion   = ", not" | "but not" | "and not" | "not" | "without" | "except" | "other than"
@@ -251,12 +251,12 @@ def children(tree: Phrase) -> tuple[Phrase, ...]:
 #
 # "X of Y", "Y's X" and "Y X" with X a known part word are X inside Y; not "cup of tea" (X holds or measures
 # Y), not "children's book" (Y owns X), not "red handle" (Y only describes). "Y without X", X a part word,
-# leaves out the X inside Y. Words that only describe are no thing, so that "red and blue ball" stays whole.
-# Wherever a side of a construction would name nothing, the grammar finds nothing there, and the words are
-# asked as one phrase. A line of several queries is separated by `split_phrases`.
+# excludes the X inside Y. Words that only describe name no thing, so that "red and blue ball" is not divided.
+# A construction with a side that names nothing does not apply, and its words stay one plain query. A line of
+# several queries is separated by `split_phrases`.
 
 MAX_CHARACTERS = 400
-MAX_ATOMS = 12  # each is asked for itself
+MAX_ATOMS = 12  # plain queries in one tree
 _DISTANCES: dict[str, Literal["nearest", "farthest"]] = {
     "nearest": "nearest", "closest": "nearest", "farthest": "farthest", "furthest": "farthest",
 }  # fmt: skip
@@ -285,9 +285,9 @@ PREPOSITIONS: dict[str, Side | Literal["nearest", "farthest", "of"]] = {
 }
 _EMPTY = STOP_WORDS | ADJECTIVES
 _LONGEST = max(len(words.split()) for words in PREPOSITIONS)
-# Before what is looked for, where that is asked in a sentence: "where is the mug".
+# Beginnings of questions: "where is the mug".
 _QUESTION = r"(?i)^(?:(?:where|which)(?:'s| is| are)|(?:is|are) there|find(?: me)?|show me|look for) (?=.)"
-# Between the sides of a construction, in a text of words and commas with a blank between any two.
+# Separators in a text of words and commas, each followed by a blank.
 _EXCLUDED = r"(?i)(?: ,)?(?: (?:but|and))? (?:not|without|except|other than)(?= |$)"
 _OR = r"(?i)(?: ,)?(?:^| )or(?= |$)|(?:^| ),(?= )"
 _AND = r"(?i)(?:^| )(?:and|&|as well as)(?= |$)"
@@ -295,9 +295,9 @@ _LEADING = rf"(?i)^(?:(?:{'|'.join(sorted(ARTICLES))}) )+"
 
 
 def parse(text: str, names: Collection[str] = ()) -> Phrase:
-    """Return the tree of one query; `names` are keys of phrases that are one name, whatever their words.
+    """Return the tree of one query; names: keys of phrases that are not divided, such as taught words.
 
-    Raises InputError where nothing is named, where something is only excluded ("not the cup"), and for a text
+    Raises InputError if nothing is named, if something is only excluded ("not the cup"), and for a text
     beyond `MAX_CHARACTERS` or `MAX_ATOMS`.
     """
     if not isinstance(text, str):
@@ -320,7 +320,7 @@ def parse(text: str, names: Collection[str] = ()) -> Phrase:
 
 
 def _with_names(tokens: list[str], names: Collection[str]) -> list[str]:
-    """Return the tokens, those of a name as one with no-break spaces, the longest name first."""
+    """Return the tokens with those of each name joined by no-break spaces, the longest name first."""
     at = 0
     longest = max((len(name.split()) for name in names), default=0)
     while at < len(tokens):
@@ -334,11 +334,11 @@ def _with_names(tokens: list[str], names: Collection[str]) -> list[str]:
 
 def _query(text: str) -> Phrase:
     wanted, *others = map(_alternatives, _exclusions(text))
-    return Without(wanted, _group(Union, [_of_it(other, wanted) for other in others])) if others else wanted
+    return Without(wanted, _group(Union, [_own_part(it, wanted) for it in others])) if others else wanted
 
 
 def _exclusions(text: str) -> list[str]:
-    """Split a text into what is wanted and what is not, wherever both sides name something."""
+    """Split a text into what is wanted and what is excluded, where both sides name something."""
     for mark in re.finditer(_EXCLUDED, text):
         before, after = text[: mark.start()], text[mark.end() :]
         if _names(before) and _names(after):
@@ -346,8 +346,8 @@ def _exclusions(text: str) -> list[str]:
     return [text]
 
 
-def _of_it(unwanted: Phrase, wanted: Phrase) -> Phrase:
-    """In "mug without handle" the mug's own handle is meant: `unwanted`, as a part of `wanted`."""
+def _own_part(unwanted: Phrase, wanted: Phrase) -> Phrase:
+    """Return `unwanted` inside `wanted` if it is a part: "mug without handle" means the mug's handle."""
     part, whole = (atoms(tree)[0].text.split()[-1] for tree in (unwanted, wanted))
     own = isinstance(unwanted, Atom) and is_part(part) and isinstance(wanted, Atom) and not is_part(whole)
     return Inside(unwanted, wanted) if own else unwanted
@@ -363,13 +363,13 @@ def _group(kind: type[Both | Union], items: Sequence[Phrase]) -> Phrase:
 
 
 def _sides(text: str, mark: str) -> list[str]:
-    """Split a text at marks, unless a side would name nothing."""
+    """Split a text at separators, unless a side would name nothing."""
     sides = [side.strip(", ") for side in re.split(mark, text)]
     return sides if all(map(_names, sides)) else [text]
 
 
 def _names(text: str) -> bool:
-    """Return whether words name a thing: more than stop words and descriptions."""
+    """Return True if words name a thing: not only stop words and adjectives."""
     words = [word for word in text.split(" ") if word not in ("", ",")]
     return not only(_EMPTY, words) or (bool(words) and words[-1].lower() in ALSO_NOUNS)
 
@@ -403,7 +403,7 @@ def _extreme(kind: Extreme, text: str) -> Superlative:
 
 
 def _one_of(tree: Phrase) -> Phrase:
-    """Return the tree with what is asked for in the singular, since a mask shows one thing."""
+    """Return the tree with the searched noun in the singular, since a mask shows one instance."""
     match tree:
         case Atom(text):
             *before, last = text.split()

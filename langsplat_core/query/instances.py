@@ -1,4 +1,4 @@
-"""Instances of an answer: its Gaussians, taken apart where the surface is, with boxes and scores."""
+"""Instances of an answer: its Gaussians, separated along the surface, with boxes and scores."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -11,8 +11,8 @@ from langsplat_core.scene import Gaussians
 from langsplat_core.scene.language import NO_NODE
 from langsplat_core.scene.surface import FAINTEST, Surface, cross_sections, surface_weights
 
-INNER = (0.02, 0.98)  # a box holds the points between these quantiles of each coordinate: strays do not count
-COARSE = np.radians(np.arange(0.0, 90.0, 10.0))  # beginning with 0: of equal areas the principal axes stay
+INNER = (0.02, 0.98)  # a box holds the points between these quantiles of each coordinate, without outliers
+COARSE = np.radians(np.arange(0.0, 90.0, 10.0))  # 0 first, so that equal areas keep the principal axes
 FINE = np.radians([0.0, -2.0, 2.0, -4.0, 4.0])
 
 
@@ -37,39 +37,39 @@ def axis_aligned_box(points: Array) -> Array:
 
 
 def oriented_box(points: Array) -> OrientedBox:
-    """Box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
+    """Return the box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
 
-    The axes are the principal ones of the points that are no strays, turned about one another to the least
-    area of the box's faces: principal axes alone say nothing about how a square or a cube lies.
+    The axes are the principal ones of the points without outliers, rotated about one another to the least
+    area of the box's faces: principal axes alone do not define the orientation of a square or a cube.
     """
     columns = np.ascontiguousarray(points.T, np.float64)
     low, high = axis_aligned_box(points)[..., None]
     core = columns[:, ((columns >= low) & (columns <= high)).all(0)]
-    if core.shape[1] < 2:  # of few points the quantiles cut away all but the middle
+    if core.shape[1] < 2:  # the quantiles cut away all but the middle of few points
         core = columns
     middle = core.mean(1, keepdims=True)
     spread = core - middle
     axes = np.linalg.eigh(spread @ spread.T)[1]
-    axes = _turned(spread[:, :: -(-spread.shape[1] // 256)], axes)  # by 256 points at most
+    axes = _least_area(spread[:, :: -(-spread.shape[1] // 256)], axes)  # by 256 points at most
     low, high = np.quantile(axes.T @ (columns - middle), INNER, axis=1)
     order = np.argsort(low - high, kind="stable")
     axes, low, high = axes[:, order], low[order], high[order]
     centre = middle[:, 0] + axes @ ((low + high) / 2)
-    # Settled signs: the largest entry of the first two axes is positive, and the axes are right-handed.
+    # Sign convention: the largest entry of the first two axes is positive, and the axes are right-handed.
     signs = np.sign(axes[np.abs(axes).argmax(0), range(3)])
     signs[2] = signs[0] * signs[1] * np.sign(np.linalg.det(axes))
     return OrientedBox(centre, axes * signs, (high - low) / 2)
 
 
-@lru_cache(512)  # of many phrases, the same things answer; at most 25 MB
+@lru_cache(512)  # many phrases are answered by the same instances; at most 25 MB
 def _oriented_box(points: bytes) -> OrientedBox:
     return oriented_box(np.frombuffer(points).reshape(-1, 3))
 
 
-def _turned(columns: Array, axes: Array) -> Array:
-    """`axes` turned about each of them in turn, the shortest side's first; columns: (3, M) points."""
+def _least_area(columns: Array, axes: Array) -> Array:
+    """Return `axes` after a rotation about each, the shortest side's first; columns: (3, M) points."""
     axes = axes.copy()
-    for one, other in ((1, 2), (0, 2), (0, 1)) * 2:  # a second round: of a cube one is not enough
+    for one, other in ((1, 2), (0, 2), (0, 1)) * 2:  # a cube needs a second round
         pair = axes[:, [one, other]]
         for angles in (COARSE, FINE):
             along, across = pair.T @ columns
@@ -83,31 +83,31 @@ def _turned(columns: Array, axes: Array) -> Array:
 
 
 def _widths(rows: Array) -> Array:
-    """Return (A, M) -> (A,) between the `INNER` quantiles of each row, to the nearest point."""
+    """Return the (A,) widths of (A, M) rows between their `INNER` quantiles, to the nearest point."""
     low, high = (round(q * (rows.shape[1] - 1)) for q in INNER)
     rows.partition((low, high), axis=1)
     return rows[:, high] - rows[:, low]
 
 
-# Two members belong to one instance when they are of one whole that masks voted for, in an answer of wholes,
-# or when a walk over linked members of the surface, of the same such whole or of none, leads from one to the
-# other. What is too faint to be on the surface belongs where the surface Gaussian nearest to it belongs.
+# Two members belong to one instance if they are of one whole that masks voted for (in an answer at level
+# whole), or if linked members of the surface, of the same voted whole or of none, connect them. A Gaussian
+# too faint to be on the surface belongs to the instance of the nearest one that is.
 
-CRUMB_COUNT = 8  # Gaussians, half of the neighbourhood that relevancy is smoothed over: fewer are a crumb,
-CRUMB_SHARE = 0.01  # and so is less than this of the largest instance's extent on the surface
-EQUAL_SCORES = 1e-3  # of relevancy: instances this close are as good, and the larger comes first
-BOXED = 2048  # members, at most, that a box is taken from
+CRUMB_COUNT = 8  # least Gaussians of an instance: half of the neighbourhood that relevancy is smoothed over
+CRUMB_SHARE = 0.01  # least extent of an instance on the surface, as a share of the largest one's
+EQUAL_SCORES = 1e-3  # of relevancy: scores this close are equal, and the larger instance comes first
+BOXED = 2048  # members, at most, that a box is computed from
 
 
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """One connected thing among the Gaussians that answer a phrase."""
+    """One connected instance among the Gaussians that answer a phrase."""
 
-    members: Array  # (K,) int64 rows of the scene's N Gaussians, ascending; faint ones beside it included
-    score: float  # in [0, 1], its peak of the smoothed relevancy: the best one's is the answer's own
+    members: Array  # (K,) int64 rows of the scene's N Gaussians, ascending; faint ones included
+    score: float  # in [0, 1], peak of its smoothed relevancy
     mean: float  # in [0, 1], mean relevancy of its members on the surface, weighted by opacity
-    centre: Array  # (3,) world units, mean position of these, weighted by opacity
-    points: Array  # (P, 3) of these, at most `BOXED` evenly over the surface: what its boxes hold
+    centre: Array  # (3,) world units, mean position of the same, weighted by opacity
+    points: Array  # (P, 3) positions of at most `BOXED` of the same, for its boxes
     share: float  # in [0, 1], of the answer's extent: opacity times cross-section, summed over members
 
     @property
@@ -117,12 +117,12 @@ class Instance:
 
     @cached_property
     def box(self) -> Array:
-        """The (2, 3) lower and upper corner along the world's axes, world units, between 2 % and 98 %."""
+        """The (2, 3) lower and upper corner of its axis-aligned box, world units, from 2 % to 98 %."""
         return axis_aligned_box(self.points)
 
     @cached_property
     def oriented(self) -> OrientedBox:
-        """Box along its own axes, between the same quantiles."""
+        """Its oriented box, between the same quantiles."""
         return _oriented_box(self.points.tobytes())
 
     @property
@@ -131,8 +131,8 @@ class Instance:
         return 2 * self.oriented.half_extents
 
 
-def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: bool) -> list[Array]:
-    """Divide Gaussians `numbers` (K,) into things by voted `wholes` (N,); join: a whole is one thing."""
+def split_instances(surface: Surface, numbers: Array, wholes: Array | None, join: bool) -> list[Array]:
+    """Divide surface Gaussians `numbers` (K,) into instances by voted `wholes` (N,); join: one per whole."""
     if wholes is None:
         return surface.parts(numbers)
     owner = wholes[surface.rows[numbers]]
@@ -152,10 +152,10 @@ def find_instances(
     wholes: Array | None = None,
     join: bool = False,
 ) -> tuple[Instance, ...]:
-    """Return the instances among `members` (N,) bool, best first by score, of equal ones the larger first.
+    """Return the instances among `members` (N,) bool, best score first, of equal ones the larger first.
 
-    relevancy: (N,) in [0, 1], at the level of the answer. wholes, join: see `told_apart`. at_most: only so
-    many of the best. Crumbs are left out, unless all are: then the largest alone is kept.
+    relevancy: (N,) in [0, 1], at the level of the answer. wholes, join: see `split_instances`. at_most: how
+    many. Crumbs are left out; if all are crumbs, the largest is kept.
     """
     every = np.flatnonzero(members)
     numbers, labels = surface.anchors[every], np.full(len(every), -1)
@@ -164,12 +164,12 @@ def find_instances(
     visible = surface.rows[numbers] == rows
     if not visible.any():
         return ()
-    parts = told_apart(surface, numbers[visible], wholes, join)
+    parts = split_instances(surface, numbers[visible], wholes, join)
     counts = np.array(list(map(len, parts)))
     smoothed = surface.smooth(plain(relevancy), np.concatenate(parts))
     label_of = np.full(len(surface.rows), -1)
     label_of[np.concatenate(parts)] = np.repeat(np.arange(len(parts)), counts)
-    labels[near] = label_of[numbers]  # -1: faint ones beside something else
+    labels[near] = label_of[numbers]  # -1: faint ones whose nearest is no member
     scores = np.maximum.reduceat(smoothed, np.cumsum(counts) - counts)
     own = [surface.rows[np.sort(part)] for part in parts]
     return _ranked(gaussians, every, labels, own, scores, relevancy, at_most)
@@ -178,9 +178,10 @@ def find_instances(
 def find_wholes(
     gaussians: Gaussians, members: Array, even: Array, wholes: Array, at_most: int | None = None
 ) -> tuple[Instance, ...] | None:
-    """Return the instances among `members` that are voted wholes, as `find_instances` does.
+    """Return the instances among `members` as `find_instances` does, each one a voted whole.
 
-    even: (N,) in [0, 1], the same in all of a region. No surface is needed. None where one is of no whole.
+    even: (N,) relevancy in [0, 1], constant over a region. Needs no surface. Returns None if a visible member
+    is in no voted whole.
     """
     every = np.flatnonzero(members)
     seen, owner = surface_weights(gaussians)[every] > 0, wholes[every]
@@ -189,7 +190,7 @@ def find_wholes(
     own = [every[seen & (owner == whole)] for whole in np.unique(owner[seen])]
     if not own:
         return ()
-    label_of = np.full(int(wholes.max()) + 2, -1)  # the last: of no whole
+    label_of = np.full(int(wholes.max()) + 2, -1)  # the last entry is what -1, no whole, indexes
     label_of[[wholes[rows[0]] for rows in own]] = np.arange(len(own))
     labels = np.where(gaussians.valid()[every], label_of[owner], -1)
     return _ranked(gaussians, every, labels, own, np.array([even[rows].max() for rows in own]), even, at_most)
@@ -204,7 +205,7 @@ def _ranked(
     relevancy: Array,
     at_most: int | None,
 ) -> tuple[Instance, ...]:
-    """Return instances of P parts on the surface, given as rows, near ones near each other.
+    """Return the instances of P parts, given by their rows on the surface, in the order of `find_instances`.
 
     every: (K,) rows of all members; labels: (K,) part of each, -1 for none; scores: (P,).
     """
@@ -220,7 +221,7 @@ def _ranked(
         weights = np.maximum(sigmoid(gaussians.opacity_logits[own].astype(np.float64)), FAINTEST)
         weights /= weights.sum()
         points = gaussians.means[own].astype(np.float64)
-        thing = Instance(
+        instance = Instance(
             members=every[labels == part],
             score=float(scores[part]),
             mean=float(weights @ relevancy[own]),
@@ -228,5 +229,5 @@ def _ranked(
             points=points[:: -(-len(own) // BOXED)],
             share=float(extents[part] / max(sizes.sum(), 1e-300)),
         )
-        found.append(thing)
+        found.append(instance)
     return tuple(found)

@@ -1,8 +1,8 @@
-"""What is in a scene, in words: its inventory, the outline of its tree, and examples of what to ask.
+"""The contents of a scene in words: its inventory, the outline of its tree, and suggested queries.
 
-Every feature of the scene has its best word, and so every Gaussian. Words that cover enough of the surface
-are candidates for the inventory; those that claim the same features are one thing by two names ("mug" and
-"cup"); and what is listed was asked for, as a phrase, and found where it was claimed.
+Every feature of the scene, and so every Gaussian, has a best word. Words that cover enough of the surface are
+candidates for the inventory. Candidates that claim the same features are two names of one thing ("mug" and
+"cup"). A word is listed if a query for it finds what it claimed.
 """
 
 import json
@@ -29,19 +29,19 @@ from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.relevancy import FLOOR
 
-LEAST_SHARE = 5e-4  # of the scene's surface that a listed word or node must have
-LEAST_SPOT = 0.15  # of its largest spot's surface: a smaller one is a splinter of a border
-LEAST_COUNT = 12  # Gaussians of a spot or node
+LEAST_SHARE = 5e-4  # least share of the scene's surface of a listed word or node
+LEAST_SPOT = 0.15  # least area of a spot, as a share of the largest one's: smaller ones are border splinters
+LEAST_COUNT = 12  # least Gaussians of a spot or node
 SAME = 0.5  # overlap of claims from which two words name the same thing
 RUNNERS_UP = 5  # words per feature that may be names for it
 MOST = 200  # candidates per level, the largest first
-DEEPEST = 64  # nodes in one another, which the trees of scenes come nowhere near
-NAMES = 3  # words, at most, that a node is called by
+DEEPEST = 64  # levels of nesting that are listed, far beyond the trees of scenes
+NAMES = 3  # words, at most, in the name of a node
 
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """One connected place where a word is true."""
+    """One connected part of the surface that a word describes."""
 
     centre: Array  # (3,) world units
     box: Array  # (2, 3) lower and upper corner, world units, between 2 % and 98 % of its Gaussians
@@ -51,7 +51,7 @@ class Spot:
 
 @dataclass(frozen=True, eq=False)
 class InventoryEntry:
-    """A word that is true in the scene."""
+    """A word for something in the scene."""
 
     phrase: str
     also: tuple[str, ...]  # other words for the same
@@ -67,17 +67,17 @@ class _Claim:
     """A group of words that claim the same features at one level."""
 
     level: int
-    phrases: tuple[str, ...]  # the most claimed first
-    rows: Array  # (M,) int64 numbers of the Gaussians for which one of them is the best
+    phrases: tuple[str, ...]  # the largest claim first
+    rows: Array  # (M,) int64 numbers of the Gaussians whose best word is one of them
     probability: float
 
 
 def scene_inventory(
     describer: Describer, progress: Progress = silent, placed: bool = True
 ) -> list[InventoryEntry]:
-    """Return every word true in the scene, once, at its coarsest level; wholes first, then by surface.
+    """Return every word for something in the scene, once, at its coarsest level; wholes first, then by area.
 
-    placed: with the spots of each, which need the scene's surface.
+    placed: find the spots of each, which needs the scene's surface.
     """
     field, known = describer.engine.field, describer.known
     of = np.full(known.shape, -1, np.int64)
@@ -97,7 +97,7 @@ def scene_inventory(
 
 
 def _claims(describer: Describer, latents: Array, of: Array, level: int) -> Iterator[_Claim]:
-    """Yield a level's groups of words, the largest first; of: (N,) rows of the (M, d) latents, or -1."""
+    """Yield a level's groups of words, the largest first; of: (N,) rows of the (M, d) latents, -1: none."""
     words, areas = describer.words[level], describer.areas
     best, shares = words.best(latents, RUNNERS_UP)
     if best.size == 0:  # no words, or no features
@@ -124,11 +124,11 @@ def _claims(describer: Describer, latents: Array, of: Array, level: int) -> Iter
 
 
 def same_things(names: Array, surface: Array) -> list[list[int]]:
-    """Return groups of columns that name the same.
+    """Return groups of columns that name the same things.
 
-    names: (M, C) probabilities of C words, the most claimed first; surface: (M,) of each feature. A word
-    joins the first group with whose head b, the most claimed, it has most in common: sum_m s_m min(p_ma,
-    p_mb) >= SAME max(sum_m s_m p_ma, sum_m s_m p_mb).
+    names: (M, C) probabilities of C words, the largest claim first; surface: (M,) area of each feature. A
+    word a joins the first group whose head b, its first word, overlaps with it enough:
+    sum_m s_m min(p_ma, p_mb) >= SAME max(sum_m s_m p_ma, sum_m s_m p_mb).
     """
     weighted = names.astype(np.float64) * surface[:, None]
     totals = weighted.sum(0)
@@ -146,7 +146,7 @@ def same_things(names: Array, surface: Array) -> list[list[int]]:
 
 
 def _verified(describer: Describer, claim: _Claim, placed: bool) -> InventoryEntry | None:
-    """Return the claim as an entry under the first of its words that a query finds there, if any."""
+    """Return an entry under the claim's first word that a query finds at half its area; None without one."""
     engine, areas, level = describer.engine, describer.areas, claim.level
     for phrase in claim.phrases:
         result = engine.run(phrase, get_args(LevelChoice)[1 + level])  # after "auto"
@@ -162,7 +162,7 @@ def _verified(describer: Describer, claim: _Claim, placed: bool) -> InventoryEnt
 
 
 def _spots(describer: Describer, rows: Array) -> tuple[Spot, ...]:
-    """Return the connected parts of Gaussians `rows` (M,), the largest first, without splinters."""
+    """Return the connected parts of Gaussians `rows` (M,), the largest first, without small ones."""
     engine, areas, found = describer.engine, describer.areas, []
     on_surface = engine.surface.rows
     parts = [on_surface[part] for part in engine.surface.parts(np.flatnonzero(np.isin(on_surface, rows)))]
@@ -177,30 +177,30 @@ def _spots(describer: Describer, rows: Array) -> tuple[Spot, ...]:
     return tuple(found)
 
 
-# The outline: the tree in words, each thing with its parts.
+# The outline: the scene's tree, each node with a name and its parts.
 
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """A node of the scene's tree in words, with its parts."""
+    """A node of the scene's tree with its name and parts."""
 
     node: int  # number in the tree
     level: int  # index into LEVELS
-    word: Word | None  # the best name; None where nothing of the vocabulary is likely
+    word: Word | None  # the best name; None if no word of the vocabulary is likely
     count: int  # Gaussians
     share: float  # of the scene's surface, in [0, 1]
     centre: Array  # (3,) world units
     size: Array  # (3,) sides of the oriented box, longest first, world units
-    votes: tuple[int, int]  # photographs with a mask of just this, and those that show it without one
+    votes: tuple[int, int]  # photographs with a mask of exactly this node, and those that show it without
     parts: tuple["Outline", ...]  # the largest first
 
 
 def scene_outline(describer: Describer) -> tuple[Outline, ...]:
-    """Return the scene's tree, wholes with the largest surface first.
+    """Return the scene's tree, the whole with the largest surface first.
 
-    Left out are small nodes, and parts that say nothing new: without a word, or with that of what they are
-    in; their own parts take their place. A file may hold any tree: what lies in more than DEEPEST others is
-    not listed, nor named once each Gaussian was looked at DEEPEST times.
+    Small nodes are left out. Parts without a word, or with the word of the node they are in, are replaced by
+    their own parts. A file may hold any tree, so nodes nested deeper than DEEPEST are not listed, and none is
+    named after N * DEEPEST Gaussians were read.
     """
     tree, members, areas = describer.engine.tree, describer.engine.tree.gaussians(), describer.areas
     every = max(float(areas.sum()), 1e-300)
@@ -209,7 +209,7 @@ def scene_outline(describer: Describer) -> tuple[Outline, ...]:
     parts: dict[int, list[int]] = {}
     for node in sorted(large.tolist(), key=lambda node: -totals[node]):
         parts.setdefault(int(tree.parents[node]), []).append(node)
-    left = DEEPEST * len(areas)  # Gaussians to look at
+    left = DEEPEST * len(areas)  # Gaussians that may still be read
 
     def name_of(node: int) -> Word | None:
         nonlocal left
@@ -251,13 +251,12 @@ def scene_outline(describer: Describer) -> tuple[Outline, ...]:
 
 
 def export_labels(describer: Describer, path: Path) -> Path:
-    """Write the scene as a .ply of that name with labels, and return the `<name>.labels.json` beside it.
+    """Write the scene to `path` (.ply) with labels, and return the `<name>.labels.json` beside it.
 
-    Its Gaussians have the int properties `instance`, `part` and `class`. An instance is a node at the top of
-    the outline, a part the smallest node of it that a Gaussian is in, both by their numbers in the tree; a
-    class is the place of the instance's likeliest word in the JSON's `classes`. -1 is none. The JSON has the
-    nodes of the outline, each with its parent, level, word and class, Gaussians, axis-aligned box (lower and
-    upper corner, between 2 % and 98 % of the Gaussians) and votes.
+    Its Gaussians have the int properties `instance`, `part` and `class`, -1 for none: the node at the top of
+    the outline, the smallest node in it that holds the Gaussian, and the index in the JSON's `classes` of the
+    instance's most probable word. The JSON has the nodes of the outline, each with parent, level, word,
+    class, number of Gaussians, centre, `box` (axis-aligned, from 2 % to 98 % of the Gaussians) and votes.
     """
     scene, members = describer.engine.scene, describer.engine.tree.gaussians()
     none = np.full(len(scene.gaussians), NO_NODE, np.int32)
@@ -281,7 +280,7 @@ def export_labels(describer: Describer, path: Path) -> Path:
         positions = scene.in_world(scene.gaussians.means[rows])
         node |= {"gaussians": outline.count, "centre": scene.in_world(outline.centre).tolist()}
         nodes.append(node | {"box": axis_aligned_box(positions).tolist(), "votes": list(outline.votes)})
-        for part in outline.parts:  # whose Gaussians are among these, and take their own number
+        for part in outline.parts:  # whose Gaussians are a subset and get the number of the part
             place(part, outline.node)
 
     for outline in scene_outline(describer):
@@ -297,31 +296,31 @@ def export_labels(describer: Describer, path: Path) -> Path:
     return beside
 
 
-# Suggestions of what to ask: examples, completions and corrections of what is typed.
+# Suggested queries: examples, completions and corrections of the text that is typed.
 
 EXAMPLES = 6
-TRIES = 4  # candidates that are asked for each example wanted
+TRIES = 4  # candidates that are queried for each example wanted
 # The basic colours of English (Berlin and Kay 1969): all that the demo encoder recognises on photographs.
 COLOURS = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "grey")
 
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Examples and phrases for someone who does not know a scene."""
+    """Suggested queries for a user who does not know the scene."""
 
     examples: tuple[str, ...] = ()  # each is found in the scene
-    phrases: tuple[str, ...] = ()  # that its encoder or its phrasebook knows, what is in the scene first
+    phrases: tuple[str, ...] = ()  # known to its encoder or phrasebook; those in the scene first
 
 
 def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = silent) -> Suggestions:
-    """Return what is asked and found, in seconds: words of the inventory, colours where these are guesses."""
+    """Return queries that are found, in seconds: inventory words, or colours if answers are guesses."""
     here = taught = tuple[str, ...]()
     try:
         describer = Describer(engine, progress=progress)
         taught = describer.words[0].phrases
         entries = scene_inventory(describer, progress, placed=False)
         here = tuple(entry.phrase for entry in sorted(entries, key=lambda entry: -entry.probability))
-    except LangSplatError:  # no encoder here, or one that knows none of the words: the phrasebook is left
+    except LangSplatError:  # no encoder, or one that knows none of the words: the phrasebook remains
         pass
     candidates = tuple(dict.fromkeys((*here, *engine.field.phrasebook)))
     asked = COLOURS if engine.basis.guesses else candidates[: TRIES * at_most]
@@ -330,7 +329,7 @@ def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = s
 
 
 def combined(engine: QueryEngine, suggestions: Suggestions) -> tuple[str, ...]:
-    """Return a part of a thing and a thing near another, as phrases that are asked and found; maybe none."""
+    """Return up to two compositional queries that are found: a part of a thing, and a thing near another."""
     here = suggestions.phrases[: TRIES * EXAMPLES]
     parts = (phrase for phrase in here if " " in phrase and is_part(phrase.split()[-1]))
     pairs = (f"{thing} near the {other}" for thing, other in permutations(suggestions.examples, 2))
@@ -341,12 +340,12 @@ def combined(engine: QueryEngine, suggestions: Suggestions) -> tuple[str, ...]:
 def _is_found(engine: QueryEngine, phrase: str) -> bool:
     try:
         return run_phrase(engine, phrase).answer.found
-    except LangSplatError:  # "of", in someone's phrasebook
+    except LangSplatError:  # a stop word in a phrasebook, such as "of"
         return False
 
 
 def completions(text: str, phrases: Sequence[str], at_most: int = 6) -> list[str]:
-    """Return phrases that go on from what was typed, then its last word completed; none behind spaces."""
+    """Return phrases that begin with `text`, then completions of its last word; none after a space."""
     typed = phrase_key(text)
     if not typed or text[-1:].isspace():
         return []
@@ -358,7 +357,7 @@ def completions(text: str, phrases: Sequence[str], at_most: int = 6) -> list[str
 
 
 def corrected(text: str, near: Mapping[str, Sequence[str]]) -> str | None:
-    """Return `text` with unknown words replaced by the nearest, see `UnknownWordError`; None without one."""
+    """Return `text` with each unknown word replaced by the first in `near`; None if one has no near word."""
     if not all(near.values()):
         return None
     return " ".join(near[word][0] if near.get(word) else word for word in phrase_key(text).split(" "))

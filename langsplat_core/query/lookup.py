@@ -1,8 +1,8 @@
 """Relevancies of a phrase at every Gaussian and pixel: each distinct feature is compared once.
 
 A scene with a codebook has few distinct features. Latents of three numbers, as LangSplat's autoencoder makes,
-are unit vectors that hardly ever repeat; they are read through a codebook of cells of their sphere, which is
-decoded once. Of other codecs every latent is a feature of its own.
+are unit vectors that hardly ever repeat; they are quantised to cells of their sphere, which are decoded once.
+With other codecs every distinct latent is a feature.
 """
 
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ from langsplat_core.raster.protocol import View
 from langsplat_core.scene import CodebookCodec, LanguageField
 from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy_of
 
-CELLS = 32_768  # of the sphere, at most: twice as many halve the squared error, and take twice the time
+CELLS = 32_768  # of the sphere, at most: twice as many halve the squared error and double the time
 FINEST = 4096  # cells per side of the octahedral map
 CHUNK = 16_384  # latents decoded and compared at a time: 32 MB at 512 numbers
 TOGETHER = 16  # phrases compared with every feature at a time: 4 bytes each per feature
@@ -28,13 +28,13 @@ TOGETHER = 16  # phrases compared with every feature at a time: 4 bytes each per
 
 @dataclass(frozen=True, eq=False)
 class Relevancy:
-    """Relevancy of a phrase: of K distinct features, from which follows that of N Gaussians."""
+    """Relevancy of a phrase at K distinct features, and which of them each of N Gaussians has."""
 
-    values: Array  # (K + 1,) float32 in [0, 1]; the last, 0, is that of no feature
+    values: Array  # (K + 1,) float32 in [0, 1]; the last, 0, is for Gaussians without a feature
     features: Array  # (3, N) number of the feature of each Gaussian at each level
 
     def __call__(self) -> Array:
-        """Return (3, N) float32."""
+        """Return the (3, N) float32 relevancy of the Gaussians."""
         found = np.empty(self.features.shape, np.float32)
         flat = self.features.reshape(-1), found.reshape(-1)
         shared_workers().run(_fetch, found.size, self.values, *flat)
@@ -60,15 +60,15 @@ class Lookup:
 
     def relevancies(self, phrases: Array) -> Iterator[Relevancy]:
         """Yield the relevancy of each of (Q, D) unit phrase vectors."""
-        # A codebook's vectors are there already; what is decoded is decoded a chunk at a time.
+        # The vectors of a codebook are in memory; latents are decoded a chunk at a time.
         step = CHUNK if self._codec.blends else max(len(self._latents), 1)
         for first in range(0, len(phrases), TOGETHER):
             some = phrases[first : first + TOGETHER]
             values = np.zeros((len(some), len(self._latents) + 1), np.float32)  # the last: no feature
-            for start in range(0, len(self._latents), step):
-                part = slice(start, min(start + step, len(self._latents)))
+            for part in pieces(len(self._latents), step):
                 cosines = self._codec.cosines(self._latents[part], some)
-                values[:, part] = relevancy_of(cosines, self._zero[part, None], self._rate[part, None]).T
+                found = relevancy_of(cosines, self._zero[part, None], self._rate[part, None])
+                values[:, :-1][:, part] = found.T
             for row in values:
                 yield Relevancy(row, self.features)
 
@@ -81,7 +81,7 @@ def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> 
 
 
 def through_cells(field: LanguageField) -> LanguageField:
-    """Return the field with a codebook in place of unit latents of three numbers; another as it is."""
+    """Return the field with a codebook in place of unit latents of three numbers; other fields unchanged."""
     if not (field.codec.unit_latents and field.codec.latent_dim == 3):
         return field
     known = field.known
@@ -97,9 +97,9 @@ def through_cells(field: LanguageField) -> LanguageField:
 def sphere_cells(latents: Array, most: int = CELLS) -> tuple[Array, Array]:
     """Divide (M, 3) non-zero latents among at most `most` cells: (M,) numbers, (K, 3) float32 unit centres.
 
-    A cell is a square of an octahedral map, as small as leaves at most `most` that some latent lies in, and
-    its centre the mean of these. Few latents are a cell each. Relevancies change smoothly over the sphere, so
-    that their error falls with the side of a cell.
+    A cell is a square of an octahedral map, as small as `most` filled cells allow; its centre is the mean of
+    its latents. Up to `most` latents are a cell each. Relevancies change smoothly over the sphere, so their
+    error falls with the side of a cell.
     """
     directions = unit(latents.astype(np.float64), 1e-30)
     if len(directions) <= most:
@@ -130,11 +130,11 @@ def sphere_cells(latents: Array, most: int = CELLS) -> tuple[Array, Array]:
 
 # Pixels: relevancies of Gaussians are blended, one linear channel per phrase (ours); or latents are blended
 # and then decoded (the paper's order, section 3.4). Both are gated by alpha, because the zero latent of an
-# uncovered pixel decodes to a confident something.
+# uncovered pixel decodes to some unit vector.
 
 
 def splatted_relevancy(view: View, relevancy: Array, alpha_gate: float) -> Array:
-    """Return (H, W, Q) relevancy in [0, 1] of pixels from (N, Q) of Gaussians; 0 under the gate."""
+    """Return (H, W, Q) relevancy in [0, 1] of pixels from (N, Q) of Gaussians; 0 below the alpha gate."""
     total, alpha = view.splat(np.asarray(relevancy, np.float32))
     return gated_mean(total, alpha, alpha_gate)
 
@@ -144,7 +144,7 @@ def decoded_relevancy(
 ) -> Array:
     """Return (H, W, Q) relevancy of the decoded pixel latents for (Q, D) phrase vectors: the paper's order.
 
-    Raises InputError for a codebook, whose numbers cannot be blended.
+    Raises InputError for a codebook, whose indices cannot be blended.
     """
     if not field.codec.blends:
         raise InputError(
@@ -157,10 +157,13 @@ def decoded_relevancy(
     return values.reshape(*alpha.shape, len(phrases))
 
 
+TIED = 1e-6  # difference of two means up to which they are equal
+
+
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
     """Return the peak (column, row, value) of a (H, W) map's means over `window` px, edges repeated.
 
-    Of those as high the middle one: which is higher by its last digits follows from the unit of lengths.
+    Of several equal peaks the middle one is taken: their last digits depend on the scene's unit of length.
     """
     size = max(1, min(window, *relevancy.shape))
     means = scipy.ndimage.uniform_filter(np.asarray(relevancy, np.float64), size=size, mode="nearest")
@@ -169,6 +172,3 @@ def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
     middle = np.lexsort((columns, rows, away))[0]
     row, column = int(rows[middle]), int(columns[middle])
     return column, row, float(means[row, column])
-
-
-TIED = 1e-6  # means of pixels nearer than this are as high

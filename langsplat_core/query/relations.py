@@ -1,4 +1,4 @@
-"""How things stand to each other, measured in their own sizes, so that a scene needs no scale."""
+"""Spatial relations between instances, measured in their own sizes, so that a scene needs no scale."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,26 +8,25 @@ import scipy
 
 from langsplat_core.arrays import Array, across, affine
 from langsplat_core.query.grammar import Extreme, Side
-from langsplat_core.query.instances import axis_aligned_box, told_apart
-from langsplat_core.scene import LEVELS, Camera
+from langsplat_core.query.instances import axis_aligned_box, split_instances
+from langsplat_core.scene import Camera
 from langsplat_core.scene.language import Tree
 from langsplat_core.scene.surface import Surface
 
-WHOLE = LEVELS.index("whole")
-FEWEST, SPECK = 8, 0.1  # Gaussians, and of the largest instance's Gaussians; what has fewer is a speck
-SAMPLE = 1500  # points of a thing that distances are measured with
-NEAR = 0.75  # of the smaller thing's size: the widest gap that is still near
-TOUCH = 0.1  # of the smaller thing's size: the widest gap that is still touching
-FOOT = 0.4  # of a thing's height: what it stands on touches it below
-FLAT = 0.5  # of a thing's points: what touches so many, it lies or hangs on
-HELD = 0.6  # of a thing's points: what holds so many, it is in
-SUNK = 0.25  # of a thing's height: what is in another has so much of it below the rim
-ASIDE = 0.25  # of the mean size: what is closer than this sideways or in depth is level with the other
+FEWEST, SPECK = 8, 0.1  # least Gaussians of an instance, and least share of the largest one's
+SAMPLE = 1500  # points of an instance, at most, between which distances are measured
+NEAR = 0.75  # largest gap that is near, as a share of the smaller size
+TOUCH = 0.1  # largest gap that touches, likewise
+FOOT = 0.4  # share of an instance's height below which it touches what it stands on
+FLAT = 0.5  # share of an instance's points that touch what it lies or hangs on
+HELD = 0.6  # share of an instance's points within the box of what it is in
+SUNK = 0.25  # share of an instance's height below the rim of what it is in
+ASIDE = 0.25  # least offset to a side or in depth, as a share of the mean size
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """The points of one thing, in axes of which the last is up."""
+    """The points of one instance, in axes of which the last is up."""
 
     points: Array  # (P, 3) world units
     low: Array  # (3,) 2 % quantiles
@@ -71,35 +70,35 @@ def _centre(what: Body, seen_by: Array) -> Array:
 
 
 def _seen(what: Body, seen_by: Array) -> tuple[float, float]:
-    """Return the tangent of the angle to the right of the viewing direction, and depth; NaN behind."""
+    """Return the tangent of the angle to the right of the viewing direction, and the depth; NaN if behind."""
     x, _, z = _centre(what, seen_by)
     return (float(x / z), float(z)) if z > 0 else (float("nan"), float("nan"))
 
 
 def body(positions: Array, frame: Array) -> Body:
-    """Return the body, in the axes of `frame`, of a thing's (P, 3) points in the world, P >= 1."""
+    """Return the body, in the axes of `frame`, of an instance's (P, 3) points in the world, P >= 1."""
     points = positions[:: max(1, -(-len(positions) // SAMPLE))] @ frame.T
     low, high = axis_aligned_box(points)
     return Body(points, low, high)
 
 
 def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[Array]:
-    """Divide (M,) bool into surface numbers of each thing, by voted wholes, largest first, no specks."""
+    """Divide (M,) bool of the surface into the numbers of each instance, largest first, without specks."""
     wholes = None if tree is None else tree.voted_wholes
-    parts = told_apart(surface, np.flatnonzero(inside), wholes, join=True)
+    parts = split_instances(surface, np.flatnonzero(inside), wholes, join=True)
     parts.sort(key=len, reverse=True)
     return [part for part in parts if len(part) >= max(FEWEST, SPECK * len(parts[0]))]
 
 
 def gap(one: Body, other: Body) -> float:
-    """Least distance between points of two things, world units."""
+    """Return the least distance between points of two instances, world units."""
     return float(other.tree.query(one.points)[0].min())
 
 
 def stands(  # noqa: PLR0911  one row of a table each
     kind: Side, what: Body, anchor: Body, seen_by: Array | None
 ) -> bool:
-    """Return whether `what` stands so to `anchor`; a viewpoint says what is left, right, behind, in front."""
+    """Return True if `what` is in relation `kind` to `anchor`; seen_by: viewpoint of "left of", "behind"."""
     match kind:
         case "on":
             return _on(what, anchor)
@@ -131,14 +130,14 @@ def _on(what: Body, anchor: Body) -> bool:
 
 
 def _over(what: Body, anchor: Body) -> bool:
-    """Return whether the middle of `what`, seen from above, lies within `anchor`."""
+    """Return True if the centre of `what`, seen from above, lies within `anchor`."""
     return bool(((what.centre >= anchor.low) & (what.centre <= anchor.high))[:2].all())
 
 
 def _in(what: Body, anchor: Body) -> bool:
     height = what.high[2] - what.low[2]
-    head = np.array([0, 0, 0.5 * height])  # it may look out of an open vessel
-    sunk = what.low[2] <= anchor.high[2] - SUNK * height  # and does not merely stand on a flat top
+    head = np.array([0, 0, 0.5 * height])  # it may stick out of an open vessel
+    sunk = what.low[2] <= anchor.high[2] - SUNK * height  # not merely standing on a flat top
     held = ((what.points >= anchor.low) & (what.points <= anchor.high + head)).all(1)
     return bool(what.size < anchor.size and sunk and _over(what, anchor) and held.mean() >= HELD)
 
@@ -149,7 +148,7 @@ def _above(what: Body, anchor: Body) -> bool:
 
 
 def ranked(kind: Extreme, things: list[Body], anchors: list[Body], seen_by: Array | None) -> list[int]:
-    """Return numbers of `things`, what is most so first, as nearest to `anchors`, else the viewpoint."""
+    """Return indices of `things` by a superlative, best first; distances: to `anchors`, else to a camera."""
     sign = 1 if kind in ("smallest", "nearest", "lowest", "leftmost") else -1
     measured = [sign * _measure(kind, thing, anchors, seen_by) for thing in things]
     return [int(number) for number in np.argsort(measured, kind="stable")]

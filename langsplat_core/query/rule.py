@@ -1,10 +1,10 @@
 """The rule that turns the fits of regions into an answer: one table of numbers, `RULE`, and `decide`.
 
-A fit (`semantics.relevancy.Scale`) says by how many spreads a region is nearer to a phrase than everyday
-phrases are by chance, so that one rule serves all encoders. The exported page has the table as JSON and
+A fit (`semantics.relevancy.Scale`) is the number of spreads by which a region is nearer to a phrase than
+everyday phrases are by chance, so one rule serves all encoders. The exported page has the table as JSON and
 `decide` in JavaScript (`web/rule.js`); the index over scans calls these functions for many scenes at once.
 The numbers were chosen on rooms 201 to 203, with the bundled encoder and CLIP's geometry; `common_share` on
-401 and 402, in four real spaces and with CLIP's geometry; the bars of things on these, 501 and 502.
+401 and 402, in four real spaces and with CLIP's geometry; the thresholds of things on these, 501 and 502.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,39 +21,39 @@ from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, fit_of
 
-Sought = Named | Literal["inside"]  # "inside": a part, among what is on a thing that is there
+Sought = Named | Literal["inside"]  # "inside": a part among the regions of a given instance
 
 
 @dataclass(frozen=True)
 class Rule:
-    """The numbers of the rule. Fits are spreads, relevancies and probabilities are in [0, 1]."""
+    """The numbers of the rule. Fits are in spreads, relevancies and probabilities in [0, 1]."""
 
-    # Added to the fit of each level before the best is chosen: a thing is one whole, whatever its parts are.
+    # Added to the fit of each level before the best level is chosen: a thing is one whole.
     advantage: Mapping[Named, Fits]
-    # Spreads above the median best fit of everyday phrases from which a phrase is found: among whole things,
-    # and at the finer levels. One absent phrase in twenty exceeds them.
+    # Threshold of what is found, in spreads above the median best fit of everyday phrases: for wholes, and
+    # for the finer levels. One absent phrase in twenty exceeds it.
     found: Mapping[Sought, tuple[float, float]]
-    part_share: float = 0.25  # weight of its best part in the fit of a region: of a thing, something is sure
-    common_share: float = 0.4  # of a phrase's mean fit, by how near it lies to everything here: no evidence
-    reach: float = 0.45  # of the best fit: a region that fits less by this or less belongs to the answer,
-    nearest: float = 0.15  # by this at least,
-    farthest: float = 1.0  # and by this at most
-    around: float = 2.0  # times the reach: from wholes that fit a thing so nearly, its parts are taken
-    strict: float = 0.25  # times the reach: the answers that the range of a count is taken from
-    wide: float = 2.0
-    nothing: float = float(logit(np.array(2 * NARROWEST)))  # fit; what fits less has no feature behind it
-    smallest: int = SMALLEST  # Gaussians; smaller regions are crumbs and count where there is nothing else
-    narrowest: float = NARROWEST  # distance of a relevancy from 0 and 1; least spread
+    part_share: float = 0.25  # weight of the best part of a region in its fit
+    common_share: float = 0.4  # of a phrase's mean fit over all regions, subtracted from its fits
+    reach: float = 0.45  # distance below the best fit within which regions are members, as a share of it,
+    nearest: float = 0.15  # at least,
+    farthest: float = 1.0  # and at most
+    around: float = 2.0  # factor of the reach for the wholes of a thing in which its parts are searched
+    strict: float = 0.25  # factor of the reach for the least number of instances
+    wide: float = 2.0  # factor of the reach for the largest number
+    nothing: float = float(logit(np.array(2 * NARROWEST)))  # fit at or below which a region has no feature
+    smallest: int = SMALLEST  # Gaussians; smaller regions are crumbs, which count only if there are no others
+    narrowest: float = NARROWEST  # least distance of a relevancy from 0 and 1; least spread
     floor: float = FLOOR  # relevancy at which a heat map begins
     heat_span: float = MIN_HEAT_SPAN  # least range of a heat map
-    # Of phrases for nothing here, the share that fits as well as what is just found; and by how many logits
-    # it falls with each spread above that. Of 1 828 in four rooms, with real and simulated vectors.
+    # Share of absent phrases that fit as well as what is just found, and the logits by which it falls with
+    # each spread above that. From 1 828 phrases in four rooms, with real and simulated vectors.
     by_chance: tuple[float, float] = (0.05, 2.0)
-    weak_probability: float = 0.5  # from which what is not found is a weak match,
-    weak_excess: float = -0.5  # likewise in spreads, where there is no probability
+    weak_probability: float = 0.5  # least probability of a weak match,
+    weak_excess: float = -0.5  # or least excess in spreads, without a probability
 
     def least_fit(self, best: float, share: float = 1.0) -> float:
-        """Return the fit from which a region belongs to an answer; `share`: of the way that it reaches."""
+        """Return the least fit of a member of an answer; share: factor of the reach."""
         return best - share * float(np.clip(self.reach * best, self.nearest, self.farthest))
 
 
@@ -73,7 +73,7 @@ RULE = Rule(
 
 @dataclass(frozen=True, eq=False)
 class RegionTable:
-    """R regions of S scenes, scene by scene, each with its subparts first, then its parts and wholes."""
+    """R regions of S scenes, scene by scene; of each its subparts first, then its parts and wholes."""
 
     counts: Array  # (S, 3) int64 regions of each level
     parents: Array  # (R,) int64 row of the region of the level above; -1 for none
@@ -86,33 +86,33 @@ class RegionTable:
 
 
 def region_fits(table: RegionTable, own: Array) -> Array:
-    """Return the (R, ...) fits of regions, each its `own` of its mean relevancy mixed with its best part's.
+    """Return the (R, ...) fits of regions: the `own` fit of each mixed with that of its best part.
 
-    Parts that fit nothing, and crumbs, say nothing; a region without parts is its own part.
+    own: fits of the regions' mean relevancies. Crumbs and parts without a feature do not count; a region
+    without parts is its own part.
     """
-    telling = ((own > RULE.nothing).T & table.solid).T
-    heard = np.where(telling, own, -np.inf)
-    best = np.full_like(heard, -np.inf)
+    counted = np.where(((own > RULE.nothing).T & table.solid).T, own, -np.inf)
+    best = np.full_like(counted, -np.inf)
     parts = np.flatnonzero(table.parents >= 0)
-    np.maximum.at(best, table.parents[parts], heard[parts])
-    best = np.where(np.isfinite(best), best, heard)
+    np.maximum.at(best, table.parents[parts], counted[parts])
+    best = np.where(np.isfinite(best), best, counted)
     return np.where(np.isfinite(best), (1 - RULE.part_share) * own + RULE.part_share * best, own)
 
 
 def region_relevancies(fits: Array) -> Array:
-    """Return the relevancies that fits stand for, 0 for what fits nothing."""
+    """Return the relevancies that fits stand for, 0 for regions without a feature."""
     return np.where(fits > RULE.nothing, sigmoid(fits), 0)
 
 
 def on_things(table: RegionTable, thing: Array) -> Array:
-    """Return where, (R,) bool, parts of a thing may be in a scene, by its (R,) own fits of regions.
+    """Return the (R,) bool regions in which parts of a thing may be, from its (R,) own fits.
 
-    That is in and below the wholes that fit it nearly as well as the best does.
+    They are the wholes that fit nearly as well as the best one, and all regions below them.
     """
     last = len(LEVELS) - 1
     whole, solid = table.level(last, region_fits(table, thing)), table.level(last, table.solid)
     best = float(whole[solid if solid.any() else slice(None)].max(initial=RULE.nothing))
-    on = np.zeros(len(thing) + 1, bool)  # the last: what has no parent
+    on = np.zeros(len(thing) + 1, bool)  # the last entry is what -1, no parent, indexes
     on[len(thing) - len(whole) : -1] = whole >= RULE.least_fit(best, RULE.around)
     for _ in LEVELS[1:]:
         on[:-1] |= on[table.parents]
@@ -120,23 +120,23 @@ def on_things(table: RegionTable, thing: Array) -> Array:
 
 
 def common_fits(table: RegionTable, fits: Array) -> Array:
-    """Return the (S, ...) means of (R, ...) fits over the regions of each scene, without crumbs and nothing.
+    """Return the (S, ...) means of (R, ...) fits over each scene's regions with features, without crumbs.
 
-    Some phrases lie near to all images and others far from all: over seven real scenes "hand" has a mean
+    Some phrases are near to all images and others far from all: over seven real scenes "hand" has a mean
     cosine of 0.23 in CLIP, "pink ice cream" one of 0.09. The best fit of a phrase grows with its mean.
     """
-    heard = ((fits > RULE.nothing).T & table.solid).T
+    counted = ((fits > RULE.nothing).T & table.solid).T
     counts = table.counts.sum(1)
     filled, starts = counts > 0, np.cumsum(counts) - counts
     totals = np.zeros((2, len(counts), *fits.shape[1:]))
     if filled.any():
-        for total, values in zip(totals, (np.where(heard, fits, 0), heard), strict=True):
+        for total, values in zip(totals, (np.where(counted, fits, 0), counted), strict=True):
             total[filled] = np.add.reduceat(values, starts[filled], axis=0, dtype=np.float64)
     return np.asarray(totals[0] / np.maximum(totals[1], 1))
 
 
 def best_relevancies(table: RegionTable, relevancies: Array) -> Array:
-    """Return the (S, 3) best of the (R,) `relevancies`; of crumbs only where a level has no more."""
+    """Return the (S, 3) best of the (R,) `relevancies`; crumbs count only if a level has no other regions."""
     counts = table.counts.ravel()
     filled, starts = counts > 0, np.cumsum(counts) - counts
     best = np.zeros((2, len(counts)))
@@ -147,31 +147,31 @@ def best_relevancies(table: RegionTable, relevancies: Array) -> Array:
     return np.maximum(np.where(np.isfinite(solid), solid, every), 0).reshape(-1, len(LEVELS))
 
 
-# Chance: the more places a scene has, the better the best of them fits a phrase that names nothing there; so
-# what counts as found is measured by the best fits of everyday phrases in the scene itself.
+# Chance: the more regions a scene has, the better the best of them fits a phrase for something absent. So the
+# threshold is measured by the best fits of everyday phrases in the scene itself.
 
-LOW = 0.16  # quantile one standard deviation below the median; what is there lies above, and widens nothing
+LOW = 0.16  # quantile one standard deviation below the median: everyday phrases that are present lie above it
 
 
 @dataclass(frozen=True)
 class Bar:
-    """The best fit of phrases by chance: its median and spread."""
+    """Distribution of the best fit of phrases by chance."""
 
     median: float
     spread: float
 
     def excess(self, fit: float, spreads: float) -> float:
-        """Return the spreads by which `fit` exceeds what is so many above the median."""
+        """Return the spreads by which `fit` exceeds the threshold of so many `spreads` above the median."""
         return (fit - self.median) / max(self.spread, RULE.narrowest) - spreads
 
 
-Bars = tuple[Bar, Bar, Bar, Bar]  # of each level, and of the better one of the finer two
+Bars = tuple[Bar, Bar, Bar, Bar]  # of each level, and of the better of the two finer ones
 
 
 def bars_of(table: RegionTable, chance: Array, chosen: Array | None = None) -> Bars:
-    """Return the bars of (R, V) fits of everyday phrases in a scene, less their common fits.
+    """Return the bars from (R, V) fits of everyday phrases in a scene, less their common fits.
 
-    In its `chosen` (R,) regions alone, those of one thing, what phrases have in common with all is kept.
+    chosen: (R,) bool, to take the regions of one thing alone; their common fits are then not subtracted.
     """
     best, common = [], RULE.common_share * common_fits(table, chance)[0] if chosen is None else 0
     for level in range(len(LEVELS)):
@@ -192,7 +192,7 @@ def _bar(best: Array) -> Bar:
 
 
 def excess(fits: Fits, bars: Bars, sought: Sought, level: LevelChoice = "auto") -> float:
-    """Return the spreads by which the best fits of a phrase, at a level or any, exceed what is found."""
+    """Return the spreads by which the best fits of a phrase, at a level or any, exceed the threshold."""
     whole, finer = RULE.found[sought]
     if level != "auto":
         index = LEVELS.index(level)
@@ -203,25 +203,25 @@ def excess(fits: Fits, bars: Bars, sought: Sought, level: LevelChoice = "auto") 
 # Verdicts.
 
 Outcome = Literal["found", "weak match", "not here"]
-# By a calibrated probability, the fits of everyday phrases, likeness to examples of a taught word, masks in
-# photographs, or as published, relevancy; "several": by different ones for parts of a phrase with structure.
+# Basis of a verdict: a calibrated probability, fits of everyday phrases, similarity to examples of a taught
+# word, masks in photographs, relevancy (as published), or different ones for parts of a compositional query.
 Reached = Literal["calibration", "chance", "example", "masks", "relevancy", "several"]
 IN_SPREADS: tuple[Reached, ...] = ("chance", "example")  # those whose margins can be compared
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The judgement on whether what was asked for is there, and how it was reached."""
+    """Whether what was searched for is in the scene, and how this was decided."""
 
     found: bool
     reached: Reached
-    # above what counts as found: logits of the probability, spreads, tenths of relevancy or of masks' share
+    # above the threshold: in logits of the probability, spreads, tenths of relevancy or of the masks' share
     margin: float
-    probability: float | None = None  # that it is there at all; None where nothing is calibrated
+    probability: float | None = None  # that it is in the scene; None without a calibration
 
     @property
     def outcome(self) -> Outcome:
-        """The verdict in words: a weak match may be there, but was not found."""
+        """The verdict in words: a weak match may be in the scene, but was not found."""
         if self.found:
             return "found"
         if self.probability is not None:
@@ -232,7 +232,7 @@ class Verdict:
 
     @property
     def by_chance(self) -> float | None:
-        """The share of phrases for nothing here that fit as well; None unless reached by chance."""
+        """The share of absent phrases that fit as well; None unless the verdict is by chance."""
         if self.reached != "chance":
             return None
         at_bar, slope = RULE.by_chance
@@ -240,7 +240,7 @@ class Verdict:
 
     @property
     def absent(self) -> "Verdict":
-        """The same of nothing at all."""
+        """The verdict for an answer without members."""
         return Verdict(False, self.reached, -np.inf, None if self.probability is None else 0.0)
 
 
@@ -251,7 +251,7 @@ class Judged:
 
     @property
     def found(self) -> bool:
-        """True if what was asked for is there."""
+        """True if what was searched for is in the scene."""
         return self.judgement.found
 
     @property
@@ -261,7 +261,7 @@ class Judged:
 
     @property
     def probability(self) -> float | None:
-        """The probability that it is there at all; None where nothing is calibrated."""
+        """The probability that it is in the scene; None without a calibration."""
         return self.judgement.probability
 
     @property
@@ -271,25 +271,25 @@ class Judged:
             return f"{self.verdict}, {100 * self.probability:.0f} %"
         if (by_chance := self.judgement.by_chance) is None:
             return self.verdict
-        share = 100 * max(by_chance, 0.001)  # never none
+        share = 100 * max(by_chance, 0.001)  # never 0 %
         return f"{self.verdict}, by chance {share:.{0 if share >= 1 else 1}f} %"
 
 
 def combined(verdicts: Sequence[Verdict], all_needed: bool) -> Verdict:
-    """Return the verdict on several things: the weakest where all are needed, else the strongest."""
+    """Return the verdict on several things: the weakest if all are needed, else the strongest."""
     score = min if all_needed else max
-    ways = {verdict.reached for verdict in verdicts}
+    reached = {verdict.reached for verdict in verdicts}
     probabilities = [verdict.probability for verdict in verdicts if verdict.probability is not None]
     return Verdict(
         found=(all if all_needed else any)(verdict.found for verdict in verdicts),
-        reached=ways.pop() if len(ways) == 1 else "chance" if ways <= {*IN_SPREADS} else "several",
+        reached=reached.pop() if len(reached) == 1 else "chance" if reached <= {*IN_SPREADS} else "several",
         margin=score(verdict.margin for verdict in verdicts),
         probability=score(probabilities) if len(probabilities) == len(verdicts) else None,
     )
 
 
 def scaling_of(calibration: Calibration | None, sought: Sought, phrase: str) -> PlattScaling | None:
-    """Return the logistic function of a calibration that is for a phrase; None without a calibration."""
+    """Return the logistic function of a calibration for a phrase; None without a calibration."""
     if calibration is None or sought == "inside":
         return None if calibration is None else calibration.inside
     coloured = not COLOURS.isdisjoint(phrase_key(phrase).split()[:-1])
@@ -306,19 +306,19 @@ def judge(
     scaling: PlattScaling | None,
     common: float = 0.0,
 ) -> Verdict:
-    """Return the verdict that the best fits of a scene's levels stand for; `bars` without a `scaling`.
+    """Return the verdict on the best fits of a phrase at the levels, by `scaling`, or without it by `bars`.
 
-    common: the phrase's own of `common_fits`, in the scene or on the thing.
+    common: the phrase's mean fit, see `common_fits`, in the scene or on the thing.
     """
     if scaling is None:
         assert bars is not None
-        share = 0 if sought == "inside" else RULE.common_share  # on one thing, bars keep what is in common
+        share = 0 if sought == "inside" else RULE.common_share  # as in `bars_of` for one thing
         subpart, part, whole = (fit - share * common for fit in fits)
         margin = excess((subpart, part, whole), bars, sought, level)
         return Verdict(margin >= 0, "chance", margin)
     probability = scaling.probability(fits, common)
     margin = float(logit(np.array(probability)) - logit(np.array(min(scaling.found, 1 - RULE.narrowest))))
-    # It may be there, but what the wanted level shows is nearer to other phrases.
+    # It may be in the scene, but the regions of the wanted level are nearer to other phrases.
     shown = level == "auto" or sought == "inside" or fits[LEVELS.index(level)] >= 0
     return Verdict(shown and probability >= scaling.found, "calibration", margin, probability)
 
@@ -332,11 +332,11 @@ class Decision:
 
     level: int  # index into LEVELS
     scores: Fits  # best relevancy per level
-    fits: Fits  # of the best region per level that the verdict counts
-    common: float  # mean fit of the regions that it counts
+    fits: Fits  # best fit per level, by the first name, that the verdict is based on
+    common: float  # mean fit of the same regions
     relevancies: Array  # (r,) float32 of the regions of the level
-    inside: Array  # (r,) bool: the regions that answer
-    best: int  # the region that the place is taken from; -1 for none
+    inside: Array  # (r,) bool: the regions that are members
+    best: int  # the region whose position is the answer's; -1 for none
     verdict: Verdict
 
 
@@ -349,12 +349,12 @@ def decide(
     scaling: PlattScaling | None,
     on: Array | None = None,
 ) -> Decision:
-    """Return the answer of the whole regions of a scene that fit nearly as well as the best one.
+    """Return the answer: the regions of a scene that fit nearly as well as the best one.
 
-    own: (R,) fits of the mean relevancy of each region, of every name of what is sought. Where it is a part
-    of a thing, these are the phrase ("mug handle") and, if known, the part ("handle"), which count the same;
-    `on` (R,) bool are the regions on its thing, which alone have the part, and of which no whole is one.
-    Verdicts count the first name, in all regions, or on the thing where a part is sought "inside".
+    own: (R,) fits of the regions' mean relevancies, for every name of what is sought. A part of a thing has
+    the phrase ("mug handle") and, if known, the part ("handle"), which count the same. on: (R,) bool, the
+    regions of its thing, which alone may be members; "auto" is then not "whole". The verdict is by the first
+    name, over all regions, or over `on` if a part is sought "inside".
     """
     every, fits = region_fits(table, own[0]), region_fits(table, np.mean(own, axis=0))
     if on is not None:
@@ -369,10 +369,10 @@ def decide(
     given = best + RULE.advantage["part of a thing" if sought == "inside" else sought]
     if on is not None:
         given[-1] = RULE.nothing
-    # Of equal levels the coarsest.
+    # The coarsest of equal levels.
     chosen = int(np.flatnonzero(given == given.max())[-1]) if level == "auto" else LEVELS.index(level)
     shown = table.level(chosen, relevancies).astype(np.float32)
-    solid = np.where(shown > np.float32(scores[chosen]), 0, shown)  # what is above the best is a crumb
+    solid = np.where(shown > np.float32(scores[chosen]), 0, shown)  # only crumbs exceed the best
     return Decision(
         level=chosen,
         scores=triple(scores),

@@ -1,7 +1,7 @@
-"""Selections: (N,) bool arrays over Gaussians, by place, along the surface, drawn on an image, and by masks.
+"""Selections: (N,) bool arrays over Gaussians, by position, along the surface, drawn on an image or by masks.
 
-Growing and shrinking walk along the surface and never jump to a thing behind or above. Gaussians too faint to
-be on it go where the one goes that they are nearest to (`Surface.anchors`); those near none never change.
+Growing and shrinking follow links of the surface and never jump to something behind or above. Gaussians too
+faint to be on the surface follow the nearest one that is (`Surface.anchors`); those near none never change.
 """
 
 from collections.abc import Callable
@@ -21,14 +21,14 @@ from langsplat_core.scene.surface import Surface
 
 
 def of_rows(rows: Array, count: int) -> Array:
-    """Return (count,) bool that is True in (K,) `rows`."""
+    """Return (count,) bool that is True at (K,) `rows`."""
     selected = np.zeros(count, bool)
     selected[rows] = True
     return selected
 
 
 def in_sphere(means: Array, centre: Array, radius: float) -> Array:
-    """Return (N,) bool: points that are finite and at most `radius` from `centre` (3,), world units."""
+    """Return (N,) bool: finite points at most `radius` from `centre` (3,), world units."""
     offsets = np.asarray(means, np.float64) - centre
     with np.errstate(invalid="ignore"):
         return np.asarray((offsets**2).sum(1) <= radius**2)
@@ -48,14 +48,14 @@ def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Ar
 
 
 def in_pixel(regions: Regions, level: int, rows: Array, weights: Array) -> Array:
-    """Return the (N,) bool region, at a level, that paints most of a pixel: (M,) Gaussians, (M,) weights."""
+    """Return the (N,) bool region, at a level, with the most weight in a pixel: (M,) rows and weights."""
     of = regions.everywhere[level]
     shares = np.bincount(of[rows] + 1, weights, 1)[1:]
     return np.asarray(of == shares.argmax()) if shares.any() else np.zeros(len(of), bool)
 
 
 def grow(surface: Surface, selected: Array, distance: float) -> Array:
-    """Return `selected` and all that lies within `distance` of it along the surface, world units."""
+    """Return `selected` and everything within `distance` of it along the surface, world units."""
     if not 0 <= distance < float("inf"):
         raise InputError(f"a distance of {distance:g} cannot be walked along the surface; give 0 or more")
     reached = selected[surface.rows]
@@ -64,7 +64,7 @@ def grow(surface: Surface, selected: Array, distance: float) -> Array:
     links = surface.links
     source = np.repeat(np.arange(len(surface.rows)), np.diff(links.indptr))
     gaps = np.linalg.norm(surface.positions[source] - surface.positions[links.indices], axis=1)
-    # A stored zero is no link to the sparse format's walkers: coincident points are at the least distance.
+    # SciPy takes a stored zero for no link: coincident points get a tiny distance.
     lengths = scipy.sparse.csr_matrix((np.maximum(gaps, 1e-12), links.indices, links.indptr), links.shape)
     seeds = np.flatnonzero(reached)
     walk = scipy.sparse.csgraph.dijkstra
@@ -73,7 +73,7 @@ def grow(surface: Surface, selected: Array, distance: float) -> Array:
 
 
 def shrink(surface: Surface, selected: Array, distance: float) -> Array:
-    """Return `selected` without what is within `distance` of the rest; where the surface ends, none is."""
+    """Return `selected` without what is within `distance` of the rest; the surface's own borders stay."""
     return ~grow(surface, ~selected, distance)
 
 
@@ -85,20 +85,20 @@ def _with_reached(surface: Surface, selected: Array, reached: Array) -> Array:
 
 
 # Selections drawn on an image: the Gaussians whose centres a camera sees inside an outline or a stroke.
-# Places are pixels of the camera, the centre of the first at (0.5, 0.5).
+# Positions are in pixels of the camera; the centre of the first is at (0.5, 0.5).
 
-BEHIND = 0.03  # of the surface's depth: a centre no farther behind it is on the surface that one sees
+BEHIND = 0.03  # of the surface's depth: a centre this far behind the surface is still on it
 
 
 class Projected(NamedTuple):
-    """The places of N centres in one image."""
+    """The positions of N centres in one image."""
 
     pixels: Array  # (N, 2) float64
-    depths: Array  # (N,) float64 camera z, world units; -1 where there is no place
+    depths: Array  # (N,) float64 camera z, world units; -1 for a centre without a position in the image
 
 
 def project(means: Array, camera: Camera) -> Projected:
-    """Return (N, 3) world points as `camera` sees them."""
+    """Return the positions of (N, 3) world points in the image of `camera`."""
     with np.errstate(invalid="ignore", over="ignore"):
         pixels, depths = camera.project(np.asarray(means, np.float64))
         known = (depths > 0) & np.isfinite(depths) & np.isfinite(pixels).all(1)
@@ -106,14 +106,14 @@ def project(means: Array, camera: Camera) -> Projected:
 
 
 def in_rectangle(seen: Projected, corner: Array, opposite: Array) -> Array:
-    """Return (N,) bool: between two opposite corners (2,), pixels, borders included."""
+    """Return (N,) bool: centres between two opposite corners (2,), pixels, borders included."""
     corners = np.stack([corner, opposite]).astype(np.float64)
     low, high = corners.min(0), corners.max(0)
     return (seen.depths > 0) & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
 
 
 def in_polygon(seen: Projected, outline: Array, size: tuple[int, int]) -> Array:
-    """Return (N,) bool: in a pixel inside the closed `outline` (K, 2), pixels, of an image of `size`."""
+    """Return (N,) bool: centres in a pixel inside the closed `outline` (K, 2) px of an image of `size`."""
     check_array("outline", outline, ("K", 2))
     mask = Image.new("1", size)
     if len(outline) >= 3:
@@ -122,7 +122,7 @@ def in_polygon(seen: Projected, outline: Array, size: tuple[int, int]) -> Array:
 
 
 def in_stroke(seen: Projected, path: Array, radius: float, size: tuple[int, int]) -> Array:
-    """Return (N,) bool: in a pixel of `size` at most `radius` pixels from the line through `path` (K, 2)."""
+    """Return (N,) bool: centres in a pixel at most `radius` px from the line through `path` (K, 2)."""
     check_array("path", path, ("K", 2))
     mask = Image.new("1", size)
     draw = ImageDraw.Draw(mask)
@@ -141,18 +141,18 @@ def _in_mask(seen: Projected, mask: Image.Image) -> Array:
 def _cells(
     seen: Projected, across: float, down: float, width: int, height: int
 ) -> tuple[Array, Array, Array]:
-    """Return (N,) bool, which lie in a grid of that size, and their columns and rows."""
+    """Return (N,) bool, which centres lie in a grid of that size, and their columns and rows."""
     columns, rows = np.floor(seen.pixels * (across, down)).T
     inside = (seen.depths > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     return inside, columns[inside].astype(np.intp), rows[inside].astype(np.intp)
 
 
 def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: float = BEHIND) -> Array:
-    """Return (N,) bool: in the image of `size` and not hidden there.
+    """Return (N,) bool: centres in the image of `size` that no surface hides.
 
-    The depth of the centre is at most that of the surface in its pixel and `behind` of it more. depths:
-    (H, W) camera z of the surface, world units, 0 where nothing is drawn and nothing hides; it may be coarser
-    or finer than the image.
+    A centre is visible if its depth is at most 1 + `behind` times that of the surface in its pixel. depths:
+    (H, W) camera z of the surface, world units, 0 where there is none; it may be coarser or finer than the
+    image.
     """
     check_array("depths", depths, ("H", "W"))
     height, width = depths.shape
@@ -162,16 +162,16 @@ def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: fl
     return inside
 
 
-SEEN = 1e-3  # pixels over all photographs; what paints fewer was not seen
+SEEN = 1e-3  # total weight over all photographs, pixels, above which a Gaussian was seen
 
 
 def shares_in_masks(
     scene: Scene, masks_of: Callable[[Camera], Array], progress: Progress = silent
 ) -> tuple[Array, Array]:
-    """Return the (N, P) float64 shares of what is seen of each Gaussian that lie in P masks of photographs.
+    """Return the (N, P) float64 shares of each Gaussian's splatting weights that lie in P masks.
 
-    Over all cameras W^T mask / W^T 1, NaN for what none of them sees; and the (P,) numbers of photographs
-    with a mask. masks_of: from a camera of the scene to its (H, W, P) bool; one photograph is held at a time.
+    That is W^T mask / W^T 1 over all cameras, NaN for Gaussians that none sees. Also returns the (P,) numbers
+    of photographs with a mask. masks_of: from a camera to (H, W, P) bool; one photograph is held at a time.
     """
     sums, outlined = np.zeros((len(scene.gaussians), 1)), np.zeros(0, int)
     for index, camera in enumerate(scene.cameras):

@@ -1,10 +1,10 @@
-"""Words that are taught by showing: what else is like something that was pointed at.
+"""Taught words: names of examples that a user pointed at, and the regions that resemble these.
 
-Any two images of CLIP have a cosine of 0.65, and what tells things apart is lost in light and background. So
-regions are compared in the *word space*: along the directions in which everyday phrases differ, and less the
-mean of the scene's regions. How alike different things are there is measured as the scene's *rival*, the
-similarity that most pairs of its wholes stay below: the rest may show one thing twice. A region is what was
-shown if it is more like it than `FOUND` says for the mean rival of both scenes.
+Any two image vectors of CLIP have a cosine of 0.65: light and background hide what distinguishes instances.
+So regions are compared in the *word space*, along the directions in which everyday phrases differ, after the
+mean of the scene's regions is subtracted. The *rival* of a scene is the similarity in this space below which
+most pairs of its wholes lie; the other pairs may show one thing twice. A region matches an example if their
+similarity exceeds a threshold that follows from the mean rival of both scenes, see `FOUND`.
 """
 
 from dataclasses import dataclass
@@ -21,19 +21,18 @@ from langsplat_core.scene import LEVELS, LanguageField, TaughtWord
 from langsplat_core.scene.surface import SMALLEST
 
 VARIANCE = 0.95  # share of the everyday phrases' variance that the word space holds
-OTHERS = 0.9  # share of pairs of wholes
-# A region of each level is what was shown from a similarity of the first number plus the second times the
-# rival. Of what was shown in one of rooms 201 to 203 and is absent in another, 95 % stays below, with the
-# bundled encoder and with CLIP's geometry.
+OTHERS = 0.9  # quantile of the similarities of pairs of wholes that is the rival
+# Threshold of each level: the first number plus the second times the rival. Of what was shown in one of rooms
+# 201 to 203 and is absent in another, 95 % stays below, with the bundled encoder and with CLIP's geometry.
 FOUND = ((0.0, 2.8), (0.0, 2.8), (0.1, 1.9))
-HIGHEST = 0.95  # similarity from which anything is what was shown
-# Where everything is alike, as in real scenes, what is shown tells more than the scene: a rival counts up to
-# `LIKEST`, and where a whole is shown up to half of the way from the `NEXT` others that are most like it.
+HIGHEST = 0.95  # largest threshold
+# Where everything is similar, as in real scenes, the example tells more than the scene: a rival is at most
+# `LIKEST`, and the threshold of a whole at most half way from its `NEXT` most similar others to 1.
 LIKEST, NEXT = 0.42, 3
-# Of the similarity from which it is found: half of it below, 80 % of what is absent is less. What is exactly
-# as shown has a fit of 1 / UNIT, a relevancy of 0.97.
+# Unit of fits, as a share of the way from the threshold to 1, and of margins, as a share of the threshold.
+# Half a unit below it lies 80 % of what is absent. A copy of an example has fit 1 / UNIT, relevancy 0.97.
 UNIT = 0.3
-LEAST = -1 / UNIT  # fit, and margin, of what is like nothing
+LEAST = -1 / UNIT  # fit, and margin, at similarity 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +41,15 @@ class WordSpace:
 
     basis: Array  # (W, D) float32 orthonormal
     centres: Array  # (3, W) mean over the regions of each level
-    regions: tuple[Array, ...]  # (R, W) of each level, unit; zero for one without features
+    regions: tuple[Array, ...]  # (R, W) of each level, unit; zero for a region without features
     rival: float  # in [0, 1], see above; 0 where there is nothing to compare
 
 
 def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> WordSpace:
-    """Return the word space of a scene; the whole space where it keeps no everyday phrases.
+    """Return the word space of a scene; without everyday phrases it is the whole space of vectors.
 
-    votes: (K,) of the tree's nodes. Where masks voted, mean and rival are of regions with a vote: the others
-    are mostly fragments of walls and floors, many of one thing.
+    votes: (K,) of the tree's nodes. If masks voted, mean and rival are taken over regions with a vote: the
+    others are mostly fragments of walls and floors, many of one instance.
     """
     basis = np.eye(field.codec.vector_dim, dtype=np.float32)
     if field.everyday is not None and len(field.everyday) > 1:
@@ -74,17 +73,17 @@ def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> Wo
 def _means(
     field: LanguageField, basis: Array, level: int, of: Array, weights: Array, count: int
 ) -> tuple[Array, Array]:
-    """Return (count, W) mean features of sets of Gaussians in a space, and (count,) bool: it has any."""
+    """Return (count, W) mean features of sets of Gaussians in a space, and (count,) bool: the set has any."""
     counted = field.known[level] & (of >= 0)
     totals = np.bincount(of[counted], weights[counted], count)
     sums = feature_sums(field, level, of, weights, count, partial(field.codec.cosines, vectors=basis))
     return sums / np.maximum(totals, 1e-12)[:, None], totals > 0
 
 
-def shown(
+def of_example(
     space: WordSpace, field: LanguageField, regions: Regions, name: str, members: Array, level: int
 ) -> TaughtWord:
-    """Return the word for `members` (N,) bool at a level; InputError where they are like all the rest."""
+    """Return the word for `members` (N,) bool at a level; InputError if they resemble all the rest."""
     sets = np.where(members, 0, -1)
     (mean,), (known,) = _means(field, space.basis, level, sets, regions.weights, 1)
     vector = unit(mean - space.centres[level]) @ space.basis
@@ -98,12 +97,12 @@ def shown(
         base, times = FOUND[whole]
         if len(alike) == NEXT:
             rival = float(np.clip(((1 + alike.mean()) / 2 - base) / times, 0, rival))
-    # Of the precision of files: what is taught answers the same after it was saved.
+    # Rounded as in files, so that a word gives the same answer after it was saved.
     vector = unit(vector).astype(np.float16).astype(np.float32)
     return TaughtWord(name, level, vector[None], np.array([rival], np.float16).astype(np.float32))
 
 
-def compared(word: TaughtWord, space: WordSpace, vectors: Array, level: int) -> tuple[Array, Array]:
+def compare(word: TaughtWord, space: WordSpace, vectors: Array, level: int) -> tuple[Array, Array]:
     """Return (M,) largest cosines of (M, D) unit image vectors with an example, and (M,) fits, at a level."""
     examples, bars = _examples(word, space)
     alike = unit(vectors @ space.basis.T - space.centres[level]) @ examples.T
@@ -111,8 +110,8 @@ def compared(word: TaughtWord, space: WordSpace, vectors: Array, level: int) -> 
 
 
 def _examples(word: TaughtWord, space: WordSpace) -> tuple[Array, Array]:
-    """Return (T, W) unit examples, and (3, T) similarity from which something is as these, by level."""
-    rivals = np.maximum((word.rivals + space.rival) / 2, 0.08)  # of a few regions it says little
+    """Return (T, W) unit examples, and the (3, T) thresholds of similarity at each level."""
+    rivals = np.maximum((word.rivals + space.rival) / 2, 0.08)  # a few regions say little
     base, times = np.array(FOUND).T
     bars = np.minimum(base[:, None] + np.outer(times, rivals), HIGHEST)
     return unit(word.vectors @ space.basis.T), bars
@@ -123,7 +122,7 @@ def _fits(alike: Array, bar: Array) -> Array:
 
 
 def likeness(word: TaughtWord, space: WordSpace) -> tuple[list[Array], list[Array]]:
-    """Return of each level the (R,) fits of its regions, and (R,) `UNIT`s above what is found."""
+    """Return the (R,) fits of the regions of each level, and their (R,) margins in `UNIT`s."""
     examples, bars = _examples(word, space)
     fits, above = [], []
     for row, bar in zip(space.regions, bars, strict=True):
@@ -133,10 +132,10 @@ def likeness(word: TaughtWord, space: WordSpace) -> tuple[list[Array], list[Arra
     return fits, above
 
 
-def by_showing(
+def by_examples(
     word: TaughtWord, space: WordSpace, regions: Regions, means: Array, level: LevelChoice
 ) -> QueryResult:
-    """Return the answer to a taught word: the regions, usually at its own level, like one of its examples."""
+    """Return the answer to a taught word: regions that match one of its examples; "auto" is its own level."""
     chosen = word.level if level == "auto" else LEVELS.index(level)
     fits, above = likeness(word, space)
     every = [sigmoid(row) for row in fits]

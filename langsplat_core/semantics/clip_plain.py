@@ -1,13 +1,13 @@
-"""A small CLIP of few words in NumPy, from the files of its weights and tokenizer.
+"""A small CLIP with a closed vocabulary in NumPy, from the files of its weights and tokenizer.
 
-Written here so that search with the bundled encoder needs neither torch nor transformers nor tokenizers,
-which take seconds to import and hundreds of megabytes to install; training needs no transformers.
+It lets the bundled encoder run without torch, transformers and tokenizers, which take seconds to import and
+hundreds of megabytes to install; training needs no transformers.
 
-The network is that of Radford et al. 2021: token and position vectors, layers of causal self-attention and a
-two-layer perceptron, each behind a layer norm and added to what came in, a last norm, and the vector at the
-end token projected; of an image patches are tokens, and the first of them is projected. It is equal to
-`transformers.CLIPTextModelWithProjection` and its sister for vision but for rounding. The tokenizer is CLIP's
-byte-pair encoding (Sennrich et al. 2016) of words of the letters a to z.
+The network is that of Radford et al. 2021: token and position embeddings, residual layers of causal
+self-attention and a two-layer perceptron, each with a layer norm before it, a final norm, and a projection of
+the end token. Image tokens are patches after a class token, which is projected. Results equal those of
+`transformers.CLIPTextModelWithProjection` and `CLIPVisionModelWithProjection` up to rounding. The tokenizer
+is CLIP's byte-pair encoding (Sennrich et al. 2016) for words of the letters a to z.
 """
 
 import json
@@ -27,8 +27,8 @@ from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
 
 TOKENIZER = "tokenizer.json"
-VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder was taught, one per line
-TEMPERATURE = 10.0  # of LERF and LangSplat, whatever scale a checkpoint ended its training with
+VOCABULARY = "vocabulary.txt"  # beside the weights: all words that the encoder was taught, one per line
+TEMPERATURE = 10.0  # of LERF and LangSplat; the logit scale of a checkpoint is not used
 PREFIX = "text_model."
 TOKENS, POSITIONS = (f"{PREFIX}embeddings.{name}_embedding.weight" for name in ("token", "position"))
 PROJECTION = "text_projection.weight"
@@ -39,7 +39,7 @@ Tensors = Mapping[str, Array]  # name -> float32
 
 @dataclass(frozen=True)
 class TextConfig:
-    """Settings that the weights alone do not say; defaults as of `transformers.CLIPTextConfig`."""
+    """Settings that cannot be read from the weights; defaults as of `transformers.CLIPTextConfig`."""
 
     hidden_size: int = 512
     intermediate_size: int = 2_048
@@ -54,17 +54,17 @@ class TextConfig:
 
 @dataclass(frozen=True)
 class VisionConfig(TextConfig):
-    """The same of the image half, where its weights do not say it either."""
+    """The same for the image half."""
 
     num_attention_heads: int = 12
 
 
 def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int]) -> None:
-    """Refuse a phrase of which a model would not see all.
+    """Raise an error for a phrase of which the model would read only a part.
 
-    ids: its tokens without those that begin and end a phrase; room: how many the model reads; ends: tokens
-    that end a phrase, which some tokenizers give for every mark that they cannot read. Raises InputError for
-    a phrase that is too long, EncoderError for one that would end early.
+    ids: its tokens without those that begin and end a phrase; room: number that the model reads; ends: tokens
+    that end a phrase, which some tokenizers return for every character that they cannot read. Raises
+    InputError for a phrase that is too long, EncoderError for one that would end early.
     """
     if len(ids) > room:
         raise InputError(
@@ -77,7 +77,7 @@ def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int])
 class PlainClipText:
     """A `TextTower` in NumPy."""
 
-    batch = 512  # the threads of a product of matrices wait for each other, which takes longer than it does
+    batch = 512  # small matrix products spend their time on synchronising threads
 
     def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: "PairTokenizer") -> None:
         self.id = id
@@ -90,13 +90,13 @@ class PlainClipText:
         for text, row in zip(texts, rows, strict=True):
             check_whole(text, row[1:-1], self.config.max_position_embeddings - 2, {end})
         longest = max(map(len, rows))
-        # What follows the end token is not seen by it.
+        # By the causal mask, padding after the end token does not change its vector.
         ids = np.array([row + [end] * (longest - len(row)) for row in rows])
         return text_vectors(self.tensors, self.config, ids, np.array([len(row) - 1 for row in rows]))
 
 
 def plain_text_tower(weights: Weights) -> PlainClipText | None:
-    """Return the text half in `weights` if it was taught plain words and is whole; else None, for torch."""
+    """Return the text half of `weights` if it is complete with a vocabulary of plain words; else None."""
     if weights.converted or weights.device != "cpu" or not (weights.folder / VOCABULARY).is_file():
         return None
     try:
@@ -108,7 +108,7 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
         tensors = _tensors(weights.folder, config, PREFIX, PROJECTION, others=5)
         tower = PlainClipText(weights.id, config, tensors, tokenizer)
         rows = len(tensors[TOKENS]), len(tensors[POSITIONS])
-        # What a later phrase would meet, and what the first word shows.
+        # Checked here so that no later phrase fails.
         fits = set(tokenizer.numbers.values()) <= set(range(rows[0])) and tokenizer.end == config.eos_token_id
         fits = fits and config.hidden_act == "quick_gelu"
         plain = rows[1] == config.max_position_embeddings and all(re.fullmatch("[a-z]+", w) for w in words)
@@ -122,7 +122,7 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
 class PlainClipImages:
     """An `ImageTower` in NumPy."""
 
-    batch = 8  # images at a time: what a layer makes of more leaves the processor's cache
+    batch = 8  # images at a time: activations of more do not fit the processor's cache
 
     def __init__(self, config: VisionConfig, tensors: Tensors, statistics: tuple[Array, Array]) -> None:
         self.config, self.tensors, self.statistics = config, tensors, statistics
@@ -142,7 +142,7 @@ class PlainClipImages:
 
 
 def plain_image_tower(weights: Weights, statistics: tuple[Array, Array]) -> PlainClipImages | None:
-    """Return the image half of what `plain_text_tower` takes, if it is whole; else None, for torch."""
+    """Return the image half of weights as for `plain_text_tower`, if it is complete; else None."""
     if weights.converted or weights.device != "cpu" or not (weights.folder / VOCABULARY).is_file():
         return None
     try:
@@ -157,7 +157,7 @@ def plain_image_tower(weights: Weights, statistics: tuple[Array, Array]) -> Plai
 
 
 def _tensors(folder: Path, config: TextConfig, prefix: str, projection: str, others: int) -> dict[str, Array]:
-    """Return the tensors of a half as float32; ValueError where they are not those of its layers."""
+    """Return the tensors of one half as float32; ValueError if their number does not fit its layers."""
     from safetensors import SafetensorError, safe_open
 
     found: dict[str, Array] = {}
@@ -174,7 +174,7 @@ def _tensors(folder: Path, config: TextConfig, prefix: str, projection: str, oth
 
 
 def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) -> Array:
-    """Return (B, D) float32 of (B, L) tokens, of any length; ends: (B,) where each end token is."""
+    """Return (B, D) float32 vectors, not normalised, of (B, L) tokens; ends: (B,) index of each end token."""
     eps, length = config.layer_norm_eps, ids.shape[1]
     later = np.triu(np.full((length, length), -np.inf, np.float32), 1)
     x = tensors[TOKENS][ids] + tensors[POSITIONS][:length]
@@ -184,7 +184,7 @@ def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) 
 
 
 def _layers(tensors: Tensors, prefix: str, config: TextConfig, x: Array, later: Array | None = None) -> Array:
-    """Return (B, L, W) tokens behind all layers; `later` as of `_attention`."""
+    """Return (B, L, W) tokens after all layers; `later` as in `_attention`."""
     for number in range(config.num_hidden_layers):
         layer, eps = f"{prefix}encoder.layers.{number}.", config.layer_norm_eps
         before = _norm(tensors, f"{layer}layer_norm1", x, eps)
@@ -196,7 +196,7 @@ def _layers(tensors: Tensors, prefix: str, config: TextConfig, x: Array, later: 
 
 def _linear(tensors: Tensors, name: str, x: Array) -> Array:
     weight = tensors[f"{name}.weight"]
-    # As one product of matrices: NumPy would take (B, L, W) in B small ones, ten times slower.
+    # One matrix product: NumPy computes (B, L, W) as B small ones, ten times slower.
     product = x.reshape(-1, x.shape[-1]) @ weight.T
     product += tensors[f"{name}.bias"]
     return product.reshape(*x.shape[:-1], len(weight))
@@ -211,7 +211,7 @@ def _norm(tensors: Tensors, name: str, x: Array, eps: float) -> Array:
 
 
 def _attention(tensors: Tensors, name: str, x: Array, later: Array | None, heads: int) -> Array:
-    """x: (B, L, W); later: (L, L), -infinity where a token comes after another one; None: all are seen."""
+    """x: (B, L, W); later: (L, L) causal mask, -infinity for later tokens; None: no mask."""
     batch, length, wide = x.shape
     query, key, value = (
         _linear(tensors, f"{name}{part}_proj", x).reshape(batch, length, heads, -1).transpose(0, 2, 1, 3)
@@ -228,7 +228,7 @@ def _attention(tensors: Tensors, name: str, x: Array, later: Array | None, heads
 
 def _quick_gelu(x: Array) -> Array:
     shares = np.float32(-1.702) * x
-    with np.errstate(over="ignore"):  # of a large negative number: 0
+    with np.errstate(over="ignore"):  # x / infinity = 0 for a large negative x
         np.exp(shares, out=shares)
     shares += 1
     return np.asarray(np.divide(x, shares, out=shares))
@@ -236,19 +236,19 @@ def _quick_gelu(x: Array) -> Array:
 
 @dataclass(frozen=True)
 class PairTokenizer:
-    """Tokenizer of CLIP's byte-pair encoding, of words of the letters a to z with blanks between."""
+    """Tokenizer with CLIP's byte-pair encoding, for words of the letters a to z separated by blanks."""
 
     numbers: Mapping[str, int]  # token -> its number
-    ranks: Mapping[tuple[str, str], int]  # pair of tokens that are merged -> its place, the lowest first
+    ranks: Mapping[tuple[str, str], int]  # pair of tokens to merge -> rank; the lowest merges first
     begin: int  # number of the token before a phrase
-    end: int  # of the one behind it, which also stands for what the vocabulary lacks
+    end: int  # of the one after it, also used for tokens that are not in the vocabulary
 
     def encode(self, text: str) -> list[int]:
-        """Numbers of the tokens of `text`, without those that begin and end a phrase."""
+        """Return the numbers of the tokens of `text`, without those that begin and end a phrase."""
         return [self.numbers.get(token, self.end) for word in text.split() for token in self._merged(word)]
 
     def _merged(self, text: str) -> list[str]:
-        """Return the tokens of a word: its letters, of which neighbours are merged by their ranks."""
+        """Return the tokens of a word: its letters, merged in pairs by rank."""
         word = [*text[:-1], f"{text[-1]}</w>"]
         while pairs := [pair for pair in pairwise(word) if pair in self.ranks]:
             first = min(pairs, key=self.ranks.__getitem__)
@@ -262,7 +262,7 @@ class PairTokenizer:
 
 
 def read_tokenizer(path: Path) -> PairTokenizer:
-    """Return the tokenizer of a tokenizer.json as CLIP's; ValueError or LookupError for another one."""
+    """Return the tokenizer of a tokenizer.json of CLIP; ValueError or LookupError for another kind."""
     model: Any = json.loads(path.read_text(encoding="utf-8"))["model"]
     if (model["type"], model["end_of_word_suffix"]) != ("BPE", "</w>"):
         raise ValueError("no byte-pair encoding of CLIP's kind")

@@ -1,7 +1,7 @@
-"""Image-text encoders: what callers ask of them, the family CLIP, and their loading.
+"""Image-text encoders: their interface, the family CLIP, and their loading.
 
-CLIP is that of Radford et al. 2021, with OpenCLIP and the bundled demo encoder. A family brings two towers,
-each a few lines; checks of phrases and images, batches and unit vectors are the same for all.
+CLIP is that of Radford et al. 2021, with OpenCLIP and the bundled demo encoder. A family has two towers, each
+a few lines; checks of phrases and images, batches and unit vectors are shared.
 """
 
 import hashlib
@@ -45,39 +45,39 @@ log = logging.getLogger("langsplat")
 
 
 class TextTower(Protocol):
-    """The half of a model that reads phrases."""
+    """The text half of a model."""
 
     dim: int  # length D of the vectors
     temperature: float  # factor of a difference of cosines before the sigmoid, 10 for CLIP
 
     def encode(self, texts: list[str]) -> Array:
-        """Return (B, D) float32 vectors, of any length, of B > 0 phrases.
+        """Return (B, D) float32 vectors, not normalised, of B > 0 phrases.
 
-        Raises InputError and EncoderError as `check_whole`: no part of a phrase is left out in silence.
+        Raises InputError and EncoderError as `check_whole`: no phrase is truncated silently.
         """
 
 
 class ImageTower(Protocol):
-    """The half of a model that sees images."""
+    """The image half of a model."""
 
     image_size: int  # side of the images it takes, px
-    statistics: tuple[Array, Array]  # (3,) mean and deviation to be taken out, of values in [0, 1]
+    statistics: tuple[Array, Array]  # (3,) mean and deviation by which pixels in [0, 1] are normalised
 
     def encode(self, pixels: Array) -> Array:
-        """Map (B, 3, S, S) float32, normalised to (B, D) float32 vectors, of any length."""
+        """Return (B, D) float32 vectors, not normalised, of (B, 3, S, S) float32 normalised pixels."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """An architecture: how its two halves are loaded."""
+    """An architecture: functions that load its two halves."""
 
     text: Callable[[Weights], TextTower]
     images: Callable[[Weights], ImageTower]
-    encoder: "type[Encoder] | None" = None  # of its own, such as one that is a `features.RegionEncoder`
+    encoder: "type[Encoder] | None" = None  # another class, such as one that is a `features.RegionEncoder`
 
 
-class _Beside(Struct, forbid_unknown_fields=True):
-    """reading.json beside the weights, optional: how cosines are read, as a scene keeps it."""
+class _Reading(Struct, forbid_unknown_fields=True):
+    """The optional reading.json beside the weights: threshold and calibration."""
 
     found: Annotated[float, Meta(ge=0, le=1)] = LanguageField.found
     calibration: Calibration | None = None
@@ -85,14 +85,14 @@ class _Beside(Struct, forbid_unknown_fields=True):
 
 # Calibrations that a user made for an encoder (`langsplat doctor --encoder ID --calibrate`).
 
-SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
+SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder with different rounding
 
 
 class _Kept(Struct):
-    """A file of the user's configuration: a calibration from the bundled room, and whose it is."""
+    """A file of the user's configuration: a calibration of an encoder from the bundled room."""
 
     encoder: str
-    canonical: list[list[float]]  # which tell an encoder, whatever its folder is called
+    canonical: list[list[float]]  # these identify the encoder, not its name
     calibration: Calibration
 
 
@@ -111,9 +111,9 @@ def keep_calibration(encoder: "PhraseEncoder", calibration: Calibration) -> Path
 
 
 def kept_calibration(encoder: str, canonical: Array) -> Calibration | None:
-    """Return what was kept for the encoder of (C, D) canonical vectors; a damaged file is warned of.
+    """Return the user's calibration for the encoder of (C, D) canonical vectors; warns of damaged files.
 
-    The demo encoder stays a guess in scenes that are no drawn rooms.
+    There is none for the demo encoder, whose answers outside of drawn rooms are guesses.
     """
     found = None if encoder == DEMO else _kept(canonical)
     return None if found is None else found[1].calibration
@@ -131,7 +131,7 @@ def _kept(canonical: Array) -> tuple[Path, _Kept] | None:
 
 
 def same_vectors(canonical: Array, own: Array) -> bool:
-    """Return whether two sets of canonical vectors are of the same encoder."""
+    """Return True if two sets of canonical vectors are of the same encoder."""
     if canonical.shape != own.shape:
         return False
     return bool(((canonical.astype(np.float64) * own).sum(1) >= SAME_ENCODER).all())
@@ -141,41 +141,41 @@ class PhraseEncoder:
     """The text half of a model, in float32; it satisfies `relevancy.TextEncoder`."""
 
     def __init__(self, weights: Weights, tower: TextTower) -> None:
-        self.id = weights.id  # hub id or folder as it was asked for; "demo" for the bundled encoder
+        self.id = weights.id  # hub id or folder as the user gave it; "demo" for the bundled encoder
         self.tower = tower
         self.dim = tower.dim  # length D of the vectors
-        # Factor with which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy.
+        # Factor of the margin of cosines, phrase minus nearest canonical phrase, before the sigmoid.
         self.temperature = tower.temperature
         taught, reading = weights.folder / "vocabulary.txt", weights.folder / "reading.json"
-        # The only words the encoder was taught; None: open vocabulary.
+        # All words that the encoder was taught; None: open vocabulary.
         self.words = frozenset(read_text(taught).split()) if taught.is_file() else None
         try:
-            beside = decode_json(reading.read_bytes(), _Beside, reading) if reading.is_file() else _Beside()
+            beside = decode_json(reading.read_bytes(), _Reading, reading) if reading.is_file() else _Reading()
         except FormatError as error:
             raise EncoderError(f"{weights.id}: reading.json is none of an encoder's ({error})") from None
         self.found, self.calibration = beside.found, beside.calibration
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
-        """Words of `text` that the encoder was never taught; empty when it was taught open vocabulary."""
+        """Return the words of `text` that the encoder was never taught; empty for an open vocabulary."""
         if self.words is None:
             return ()
         return tuple(word for word in WORD.findall(text.lower()) if self._taught(word) is None)
 
     def near_words(self, word: str) -> tuple[str, ...]:
-        """Words it was taught that are written like an unknown one, the nearest first."""
+        """Return words of the vocabulary that are spelt like an unknown one, the nearest first."""
         return tuple(get_close_matches(word.lower(), sorted(self.words or ()), n=2))
 
     def _taught(self, word: str) -> str | None:
-        """Return the word in which the encoder was taught `word`: itself, or of a possessive its owner."""
+        """Return the vocabulary's form of `word`: itself, or a possessive without "'s"; None without one."""
         return next((form for form in (word, word.partition("'")[0]) if form in (self.words or ())), None)
 
     def encode_texts(self, texts: Sequence[str]) -> Array:
         """Return (M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat.
 
-        An encoder of a closed vocabulary is given its words and nothing else: any mark that its tokenizer
-        lacks might end the phrase. Raises InputError for a phrase without a letter or digit or with more
-        tokens than the model reads, UnknownWordError for words it was not taught, EncoderError for other
-        marks that it cannot read.
+        An encoder of a closed vocabulary gets only words, as any character that its tokenizer lacks might end
+        the phrase. Raises InputError for a phrase without a letter or digit or with more tokens than the
+        model reads, UnknownWordError for words it was not taught, EncoderError for characters that it cannot
+        read.
         """
         for text in texts:
             self._check(text)
@@ -219,7 +219,7 @@ class Encoder(PhraseEncoder):
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
     def _encode(self, images: Array, forward: Callable[[Array], Array] | None = None) -> Array:
-        """Return unit vectors of (B, H, W, 3) uint8, by `forward` in place of the tower where it is given."""
+        """Return unit vectors of (B, H, W, 3) uint8 images, by `forward`, by default the tower's `encode`."""
         mean, std = self._images.statistics
         pixels = (images.astype(np.float32) / 255 - mean) / std
         return unit((forward or self._images.encode)(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))))
@@ -234,14 +234,14 @@ def inferred(forward: Callable[[], Any]) -> Array:
         return np.asarray(forward().float().cpu().numpy())
 
 
-# What families share.
+# Shared by all families.
 
 
 def clean_text(text: str) -> str:
     """Return a text cleaned as open_clip does before its tokenizer reads it.
 
-    Broken Unicode is mended, curly quotes and ligatures are made plain, names of HTML replaced, spaces made
-    single. Raises InputError where no letter and no digit is left.
+    Broken Unicode is repaired, curly quotes and ligatures become plain, HTML entities are replaced, spaces
+    become single. Raises InputError if no letter or digit is left.
     """
     import ftfy
 
@@ -255,9 +255,9 @@ class Images:
     """An `ImageTower` computed by torch."""
 
     def __init__(self, kind: Any, weights: Weights, config: Any, output: str, usual: Array) -> None:
-        """kind: class of transformers; output: name of the vectors in what it returns.
+        """kind: class of transformers; output: name of the vectors in its output.
 
-        usual: (2, 3) mean and standard deviation of pixels, unless preprocessor_config.json states others.
+        usual: (2, 3) mean and standard deviation of pixels, unless preprocessor_config.json has others.
         """
         self._model, self._output = models.load_model(kind, weights, config), output
         self._device = weights.device
@@ -268,7 +268,7 @@ class Images:
         return self.infer(pixels, self._output)
 
     def infer(self, pixels: Array, output: str) -> Array:
-        """Return what the model calls `output`, of pixels (B, 3, H, W)."""
+        """Return the field `output` of the model's output for pixels (B, 3, H, W)."""
         import torch
 
         inputs = torch.from_numpy(pixels).to(self._device)
@@ -276,7 +276,7 @@ class Images:
 
 
 def _pixel_statistics(weights: Weights, usual: Array) -> tuple[Array, Array]:
-    """Return mean and deviation of the pixels a model was trained with. EncoderError for a broken file."""
+    """Return mean and deviation of the pixels a model was trained with; EncoderError for a damaged file."""
     path = weights.folder / "preprocessor_config.json"
     name = models.OPEN_CLIP_CONFIG if weights.converted else path.name
     try:
@@ -292,27 +292,27 @@ def _pixel_statistics(weights: Weights, usual: Array) -> tuple[Array, Array]:
     return found[0].astype(np.float32), found[1].astype(np.float32)
 
 
-UNUSUAL = "\u3042"  # where the token for what is not known is lacking, this cannot be read
-# The library ends the process over a token of 300 000 bytes; the table of a normaliser may be as long.
+UNUSUAL = "\u3042"  # a tokenizer without a token for unknown characters cannot read it
+# The library aborts the process at a token of 300 000 bytes; the table of a normaliser may be as long.
 _LONG = re.compile(rb'(?<!"precompiled_charsmap":)(?<!"precompiled_charsmap": )"[^"]{10000}')
 
 
 class TorchText:
     """A `TextTower` computed by torch.
 
-    The folder's tokenizer.json is read as it is, by the `tokenizers` library: what transformers' own classes
-    add around it (which side is padded, whether an end token is there) differs between its versions.
+    The folder's tokenizer.json is read by the `tokenizers` library and not by classes of transformers, whose
+    versions differ in padding and end tokens.
     """
 
-    ends = True  # whether a token marks the end of every phrase
-    padded = False  # whether phrases are padded to the length of training, not that of the longest of a batch
+    ends = True  # a token marks the end of every phrase
+    padded = False  # phrases are padded to the length of training, not to the longest of a batch
 
     def __init__(
         self, kind: Any, weights: Weights, config: Any, output: str, dim: int, begin: str = ""
     ) -> None:
-        """kind: class of transformers; output: name of the vectors in what it returns; dim: their length.
+        """kind: class of transformers; output: name of the vectors in its output; dim: their length.
 
-        begin: token that every phrase begins with, if one does.
+        begin: token that every phrase begins with, if any.
         """
         self.dim = dim
         self.temperature = TEMPERATURE
@@ -329,12 +329,12 @@ class TorchText:
 
     def encode(self, texts: list[str]) -> Array:
         ids, mask = self.tokens(texts)
-        # What follows the end token of a CLIP is not seen by it; without one, padding is masked.
+        # The causal mask of a CLIP hides padding from the end token; without one, padding is masked.
         masked = {} if self.ends else {"attention_mask": mask}
         return inferred(lambda: getattr(self._model(input_ids=ids, **masked), self._output))
 
     def tokens(self, texts: list[str]) -> tuple[Any, Any]:
-        """Return the (B, L) int64 tokens of B phrases, and likewise 1 where they are no padding, else 0."""
+        """Return the (B, L) int64 tokens of B phrases, and their attention mask: 1, or 0 for padding."""
         import torch
 
         plain = [clean_text(text) for text in texts]
@@ -350,7 +350,7 @@ class TorchText:
 
 
 def _tokenizer(weights: Weights, vocabulary: int) -> Any:
-    """Return the folder's `tokenizers.Tokenizer`, which neither cuts nor pads, if it is the model's."""
+    """Return the folder's `tokenizers.Tokenizer`, without truncation and padding."""
     from tokenizers import Tokenizer
 
     path = weights.folder / TOKENIZER
@@ -366,7 +366,7 @@ def _tokenizer(weights: Weights, vocabulary: int) -> Any:
         tokenizer.no_truncation()
         tokenizer.no_padding()
         tokenizer.encode(UNUSUAL, add_special_tokens=False)
-        # Without those that T5 was trained to fill gaps with, which no phrase has.
+        # Without the sentinel tokens of T5, which no phrase has.
         most = 1 + max(n for token, n in tokenizer.get_vocab().items() if "<extra_id_" not in token)
         if most > vocabulary:
             raise ValueError(f"{most} tokens, its model knows {vocabulary}")
@@ -377,7 +377,7 @@ def _tokenizer(weights: Weights, vocabulary: int) -> Any:
 
 
 def _special_token(weights: Weights, tokenizer: Any, role: str, usual: tuple[str, ...]) -> int:
-    """Return the number of the token with a role: as the folder states it, else by its usual names."""
+    """Return the number of the token with a role: from tokenizer_config.json, else by its usual names."""
     stated = None
     with suppress(OSError, ValueError, AttributeError, RecursionError):
         stated = json.loads((weights.folder / "tokenizer_config.json").read_bytes()).get(role)
@@ -396,12 +396,12 @@ CLIP_PIXELS = np.array([  # mean and standard deviation of OpenAI's CLIP, kept b
 
 
 def clip_text(weights: Weights) -> TextTower:
-    """Return the text tower in NumPy where the model is small, else by torch."""
+    """Return the text tower: in NumPy for a closed vocabulary on the CPU, else in torch."""
     return plain_text_tower(weights) or ClipText(weights)
 
 
 class ClipText(TorchText):
-    """The text tower of a CLIP, by torch; `name`: what its classes in transformers begin with."""
+    """The text tower of a CLIP in torch; name: prefix of its classes in transformers."""
 
     def __init__(self, weights: Weights, name: str = "CLIP", begin: str = "<|startoftext|>") -> None:
         kind, config = clip_tower(weights, name, "Text")
@@ -409,12 +409,12 @@ class ClipText(TorchText):
 
 
 def clip_images(weights: Weights) -> ImageTower:
-    """Return the image tower in NumPy where the model is small, else by torch."""
+    """Return the image tower: in NumPy as for `clip_text`, else in torch."""
     return plain_image_tower(weights, _pixel_statistics(weights, CLIP_PIXELS)) or torch_clip_images(weights)
 
 
 def torch_clip_images(weights: Weights, name: str = "CLIP") -> Images:
-    """Return the image tower of a CLIP, by torch; `name` as of `ClipText`."""
+    """Return the image tower of a CLIP in torch; name as of `ClipText`."""
     kind, config = clip_tower(weights, name, "Vision")
     return Images(kind, weights, config, "image_embeds", CLIP_PIXELS)
 
@@ -425,11 +425,11 @@ def clip_tower(weights: Weights, name: str, tower: Literal["Text", "Vision"]) ->
 
     config = models.load_config(getattr(transformers, f"{name}Config"), weights, name)
     tower_config = getattr(config, f"{tower.lower()}_config")
-    tower_config.projection_dim = config.projection_dim  # some files state it for the pair only
+    tower_config.projection_dim = config.projection_dim  # some files have it for the pair only
     return getattr(transformers, f"{name}{tower}ModelWithProjection"), tower_config
 
 
-# Loading by hub id, folder or file: a new family is two towers, and a row here or in an extension.
+# Loading by hub id, folder or file. A new family is two towers, and a row here or in an extension.
 
 DEMO = "demo"
 DEMO_ELSEWHERE = (
@@ -446,8 +446,8 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.
 def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
     """Load the text half of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
 
-    The device is the CPU unless told otherwise, because a phrase takes it a few milliseconds. Raises
-    EncoderError where the weights are absent or are those of no family here.
+    The device is the CPU by default, where a phrase takes a few milliseconds. Raises EncoderError if the
+    weights are missing or of an unknown family.
     """
     weights = models.open_weights(model, model_path(model, "--encoder"), device)
     return PhraseEncoder(weights, models.family_of(weights, FAMILIES, "encoders").text(weights))
@@ -455,14 +455,14 @@ def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
 
 @optional_imports(EncoderError)
 def load_encoder(model: str, device: str = "auto", batch: int = 32, option: str = "--clip.model") -> Encoder:
-    """Load both halves of `model`, as `load_text_encoder` does; batch: images per forward pass."""
+    """Load both halves of `model`, as in `load_text_encoder`; batch: images per forward pass."""
     weights = models.open_weights(model, model_path(model, option), device)
     family = models.family_of(weights, FAMILIES, "encoders")
     return (family.encoder or Encoder)(weights, family.text(weights), family.images(weights), batch)
 
 
 def model_path(model: str, option: str) -> Path:
-    """Return the folder or file of `model`; `option` is what messages name, see `weights.weights_path`."""
+    """Return the folder or file of `model`; option: the setting that messages name, see `weights_path`."""
     if model != DEMO:
         return models.weights_path(model, option)
     folder = Path(str(files("langsplat_assets") / "demo_encoder"))

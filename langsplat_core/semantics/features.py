@@ -1,6 +1,6 @@
-"""Features of photographs: regions at three levels, and what CLIP sees in each.
+"""Features of photographs: regions at three levels with a CLIP vector each.
 
-They are kept in a store, one compact file a photograph, so that an interrupted run can continue.
+They are kept in a store, one compact file per photograph, so that an interrupted run can continue.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ from langsplat_core.io.hostile import read_npz
 from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps, within
 
-VERSION = 1  # of what is stored of a photograph
+VERSION = 1  # of the stored features
 STAGE = "masks and vectors"
 K = TypeVar("K")
 T = TypeVar("T")
@@ -35,9 +35,9 @@ log = logging.getLogger("langsplat")
 
 @dataclass(frozen=True, eq=False)
 class ImageFeatures:
-    """The regions of one photograph at the levels subpart, part, whole, and what CLIP sees in them."""
+    """The regions of one photograph at the levels subpart, part, whole, and their CLIP vectors."""
 
-    labels: Array  # (3, H, W) int32, rows of `vectors`; -1 where there is no region
+    labels: Array  # (3, H, W) int32, rows of `vectors`; -1: no region
     vectors: Array  # (M, D) float32 unit vectors
 
     def __post_init__(self) -> None:
@@ -49,11 +49,11 @@ class ImageFeatures:
             )
 
 
-LARGEST_LABELS = 96 << 20  # bytes: of photographs of 4000 x 4000 px, however well they compress
+LARGEST_LABELS = 96 << 20  # bytes uncompressed, of photographs of 4000 x 4000 px
 
 
 class FeatureStore:
-    """A folder with one file per photograph, never pickled and never half written.
+    """A folder with one file per photograph, never pickled, written atomically.
 
     Labels are int16 (int32 from 32768 regions on), vectors float16 (cosine error below 1e-6), deflated.
     """
@@ -63,14 +63,14 @@ class FeatureStore:
         self._warned: set[str] = set()  # names of damaged files
 
     def path(self, name: str) -> Path:
-        """Return the file of the photograph called `name`: its name percent-encoded, if long cut."""
+        """Return the file of the photograph called `name`: the name percent-encoded, cut if long."""
         quoted = quote(name, safe=" ", errors="surrogateescape")
-        if len(quoted) > 200:  # file systems take 255, the suffix and a temporary name more
+        if len(quoted) > 200:  # file systems take 255, with the suffix and that of a temporary name
             quoted = f"{quoted[:100]}%~{hashlib.sha256(os.fsencode(name)).hexdigest()[:16]}"
         return self.folder / f"{quoted}.features.npz"
 
     def has(self, name: str, key: str | None = None) -> bool:
-        """Return True for a whole file of `name`, with that `key` if given; damage is warned of once."""
+        """Return True if there is a file of `name`, with `key` if given; damage is warned of once."""
         try:
             return os.path.exists(self.path(name)) and key in (None, self._read(name)[1])
         except InputError as error:
@@ -80,7 +80,7 @@ class FeatureStore:
             return False
 
     def save(self, name: str, features: ImageFeatures, key: str = "") -> None:
-        """Keep the features of one photograph; `key` names all that they depend on."""
+        """Write the features of one photograph; `key` is a digest of all that they depend on."""
         rows = np.int16 if len(features.vectors) <= np.iinfo(np.int16).max else np.int32
         with atomic_path(self.path(name)) as temporary:
             np.savez_compressed(
@@ -99,7 +99,7 @@ class FeatureStore:
             raise FormatError(f"{error}; delete it and run again") from None
 
     def of(self, names: Sequence[str]) -> "OnDemand[ImageFeatures]":
-        """Return the features of photographs, each read when it is used."""
+        """Return the features of photographs, each read on access."""
         return OnDemand(names, self.load)
 
     def _read(self, name: str) -> tuple[ImageFeatures, str]:
@@ -119,7 +119,7 @@ class FeatureStore:
 
 
 class OnDemand(Sequence[T]):
-    """Items that are read when they are used: label maps of all photographs are more than memory holds."""
+    """Items that are read on access: label maps of all photographs may exceed the memory."""
 
     def __init__(self, keys: Sequence[K], read: Callable[[K], T]) -> None:
         self._keys, self._read = keys, read
@@ -132,7 +132,7 @@ class OnDemand(Sequence[T]):
         return self._read(self._keys[index])
 
 
-# What CLIP is shown of a region, and the features of whole captures.
+# Crops of regions for CLIP, and the features of whole captures.
 
 
 class ImageEncoder(Protocol):
@@ -142,16 +142,16 @@ class ImageEncoder(Protocol):
     image_size: int  # side of the images it takes, px
 
     def encode_images(self, crops: Array) -> Array:
-        """Map (M, S, S, 3) uint8 to (M, D) float32 unit vectors."""
+        """Return (M, D) float32 unit vectors of (M, S, S, 3) uint8 images."""
 
 
 def masked_crop(image: Array, mask: Array, size: int) -> Array:
-    """Cut one region out: black outside the mask, bounding box, centred on a black square, resized.
+    """Return one region cropped to its bounding box, black outside the mask, centred on a black square.
 
     image: (H, W, 3) uint8; mask: (H, W) bool with at least one pixel set; size: side of the result, px.
-    Returns (size, size, 3) uint8. Bilinear, with antialiasing when shrinking. This is the crop of the
-    method's public code (LangSplat `preprocess.py`), which the encoder must also be trained with. Raises
-    ValueError for an empty mask, which has no bounding box.
+    Returns (size, size, 3) uint8, resized bilinearly, with antialiasing when shrinking. This is the crop of
+    the method's public code (LangSplat `preprocess.py`); an encoder must be trained with it, too. Raises
+    ValueError for an empty mask.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if rows.size == 0:
@@ -170,7 +170,7 @@ def masked_crop(image: Array, mask: Array, size: int) -> Array:
 
 @runtime_checkable
 class RegionEncoder(ImageEncoder, Protocol):
-    """An encoder that describes regions without crops of them."""
+    """An encoder that computes vectors of regions without crops."""
 
     def encode_regions(self, image: Array, label_maps: Array) -> Array:
         """See `embed_regions`."""
@@ -179,8 +179,8 @@ class RegionEncoder(ImageEncoder, Protocol):
 def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Array:
     """Return (M, D) float32 unit vectors of the M regions that `label_maps` numbers.
 
-    image: (H, W, 3) uint8; label_maps: (3, H, W) int32 as of `masks.label_maps`. A region is shown as it is
-    visible in its map, on black; where masks of one level overlap, LangSplat shows the covered part too.
+    image: (H, W, 3) uint8; label_maps: (3, H, W) int32 as of `masks.label_maps`. A crop shows the visible
+    part of a region; where masks of one level overlap, LangSplat shows the covered part too.
     """
     if isinstance(encoder, RegionEncoder):
         return encoder.encode_regions(image, label_maps)
@@ -189,14 +189,14 @@ def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Arr
         for row, box in enumerate(scipy.ndimage.find_objects(labels + 1)):
             if box is not None:  # a row of another level
                 crops[row] = masked_crop(image[box], labels[box] == row, encoder.image_size)
-    number = dict[bytes, int]()  # of each picture: many a part is a whole, too
+    number = dict[bytes, int]()  # of each distinct crop: many regions are equal at two levels
     of = [number.setdefault(hashlib.sha256(crop.tobytes()).digest(), len(number)) for crop in crops]
     _, first = np.unique(np.array(of, int), return_index=True)
     return encoder.encode_images(crops[first])[of] if of else encoder.encode_images(crops)
 
 
 def fingerprint(encoder: ImageEncoder) -> str:
-    """Return what tells an encoder from others of its name too: the vector that it makes of a ramp."""
+    """Return a text that identifies an encoder: its id, image size and vector of a ramp, as JSON."""
     side = encoder.image_size
     ramp = np.linspace(0, 255, side * side * 3).reshape(1, side, side, 3).astype(np.uint8)
     made = np.round(encoder.encode_images(ramp)[0], 2) + 0.0  # minus zero is zero
@@ -204,7 +204,7 @@ def fingerprint(encoder: ImageEncoder) -> str:
 
 
 def feature_key(image: Array, mask: Array | None, mask_source: MaskSource, encoder: str) -> str:
-    """Return a short name of all that features of an image depend on; encoder: its `fingerprint`."""
+    """Return a digest of all that features of an image depend on; encoder: its `fingerprint`."""
     settings = json.dumps([VERSION, mask_source.key, encoder, image.shape])
     key = hashlib.sha256(settings.encode() + np.ascontiguousarray(image).tobytes()).hexdigest()[:16]
     return key if mask is None else key + hashlib.sha256(np.packbits(mask).tobytes()).hexdigest()[:12]
@@ -219,11 +219,11 @@ def describe_capture(
     progress: Progress = silent,
     counted: Sequence[Array | None] = (),
 ) -> OnDemand[ImageFeatures]:
-    """Find the masks and CLIP vectors of every photograph, in order; those that `store` has are not redone.
+    """Return the masks and CLIP vectors of all photographs; those that `store` has are not computed again.
 
-    Without an encoder the vectors have no numbers. images: (H, W, 3) uint8 each; names: unique, one per
-    image; counted: (H, W) bool each, outside of which no mask is kept (None: everywhere). What is finished is
-    in the store even when `progress` interrupts the work, and does not depend on what was made beside it.
+    Without an encoder vectors have length 0. images: (H, W, 3) uint8 each; names: unique, one per image;
+    counted: (H, W) bool each, outside of which no mask is kept (None: everywhere). Finished photographs stay
+    in the store if `progress` interrupts the work; each is independent of the others.
     """
     made_by = "none" if encoder is None else fingerprint(encoder)
 
@@ -235,7 +235,7 @@ def describe_capture(
             vectors = embed_regions(images[index], labels, encoder)
         store.save(names[index], ImageFeatures(labels, vectors), key)
 
-    with ThreadPoolExecutor(1) as worker:  # filters, crops and files of one while masks of the next are found
+    with ThreadPoolExecutor(1) as worker:  # filters, crops and writes one while the next is segmented
         before: Future[None] | None = None
         for index, (image, name) in enumerate(zip(images, names, strict=True)):
             part = progress.part(index, len(images), STAGE, name)

@@ -1,4 +1,4 @@
-"""Masks at three levels: what every source gives, which of many are kept, and those found without weights."""
+"""Masks at three levels: the interface of mask sources, suppression of masks, and masks without weights."""
 
 import heapq
 import json
@@ -16,7 +16,7 @@ from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.config import MaskConfig
 from langsplat_core.progress import Progress
 
-# Masks at the levels subpart, part, whole: (M, H, W) bool each, M may be 0; later ones lie on top.
+# Masks at the levels subpart, part, whole: (M, H, W) bool each, M may be 0; later ones cover earlier ones.
 LevelMasks = tuple[Array, Array, Array]
 
 
@@ -24,8 +24,8 @@ class MaskSource(Protocol):
     """Finds the masks of a photograph."""
 
     agrees: bool = True
-    """False where masks of different photographs differ so much that what all of them agree on takes their
-    place (`pipeline.language_field`) before CLIP sees it."""
+    """False if masks of different photographs differ so much that they are replaced by what they agree on
+    (`pipeline.language_field`) before CLIP vectors are computed."""
 
     @property
     def name(self) -> str:
@@ -33,23 +33,23 @@ class MaskSource(Protocol):
 
     @property
     def key(self) -> str:
-        """Everything that its masks depend on besides the photograph: stored masks with another are stale."""
+        """All that its masks depend on besides the photograph: stored masks with another key are stale."""
 
     @abstractmethod
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
-        """Masks of an image (H, W, 3) uint8."""
+        """Return the masks of an image (H, W, 3) uint8."""
 
     def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
-        """Do the model's part, and return what does the rest, in any thread beside the next one."""
+        """Run the model, and return a function that computes the masks, which may run in another thread."""
         found = self(image, progress)
         return lambda: found
 
 
 def label_maps(levels: LevelMasks) -> Array:
-    """Return (3, H, W) int32: the row of the mask that is on top at each pixel, -1 where there is none.
+    """Return (3, H, W) int32: the row of the topmost mask at each pixel, -1 for none.
 
-    Rows count through all three levels, subpart first, as in LangSplat's `*_s.npy` (without its "default"
-    level); within a level later masks cover earlier ones. Unlike there, a mask that ends with no visible
+    Rows are counted through all three levels, subpart first, as in LangSplat's `*_s.npy` (without its
+    "default" level); within a level later masks cover earlier ones. Unlike there, a mask without a visible
     pixel has no row, so every row from 0 to the maximum occurs, each in one level.
     """
     maps = np.full((len(levels), *levels[0].shape[1:]), -1, np.int32)
@@ -62,7 +62,7 @@ def label_maps(levels: LevelMasks) -> Array:
 
 
 def within(labels: Array, mask: Array | None) -> Array:
-    """Return (L, H, W) label maps without what lies outside of the (H, W) mask, and numbers without gaps."""
+    """Return (L, H, W) label maps restricted to the (H, W) mask, renumbered without gaps."""
     kept = labels if mask is None else np.where(mask, labels, -1)
     numbers = np.unique(kept[kept >= 0])
     rows = np.full(int(kept.max(initial=-1)) + 2, -1, labels.dtype)  # the last entry is what -1 indexes
@@ -70,7 +70,7 @@ def within(labels: Array, mask: Array | None) -> Array:
     return rows[kept]
 
 
-# Which of many proposed masks are kept: suppression by box and by pixels, and the removal of crumbs.
+# Suppression of proposed masks by box and by pixels, and removal of small regions.
 
 PIXELS_PER_PRODUCT = 1 << 16  # columns of the matrix product that counts common pixels
 EIGHT = np.ones((3, 3), bool)  # diagonal neighbours are connected, as in SAM's own clean-up
@@ -107,13 +107,13 @@ def box_nms(boxes: Array, scores: Array, iou: float) -> Array:
 def clean_regions(mask: Array, min_region: int) -> tuple[Array, bool]:
     """Fill holes below `min_region` px, then drop islands below it; the largest island always stays.
 
-    mask: (H, W) bool, not empty. Returns the mask and whether anything changed. As SAM's
-    `remove_small_regions`; only the surroundings of the mask are looked at, which changes nothing else.
+    mask: (H, W) bool, not empty. Returns the mask and whether anything changed. The result equals that of
+    SAM's `remove_small_regions`; only the surroundings of the mask are processed.
     """
     (left, top, right, bottom), (height, width) = mask_boxes(mask[None])[0], mask.shape
     beyond = np.array([top * width, (height - bottom) * width, left * height, (width - right) * height])
     window = np.s_[max(top - 1, 0) : bottom + 1, max(left - 1, 0) : right + 1]
-    if ((beyond > 0) & (beyond < min_region)).any():  # what lies beyond the box may itself be a small hole
+    if ((beyond > 0) & (beyond < min_region)).any():  # the area beyond the box may itself be a small hole
         window, beyond = np.s_[0:height, 0:width], np.zeros(4, int)
     holes, count = scipy.ndimage.label(~mask[window], EIGHT)
     small = np.bincount(holes.ravel(), minlength=count + 1) < min_region
@@ -145,9 +145,9 @@ def common_pixels(masks: Array) -> Array:
 def mask_nms(masks: Array, scores: Array, config: MaskConfig) -> Array:
     """Return (K,) indices of the masks that stay, rising.
 
-    masks: (M, H, W) bool, none empty; scores: (M,) stability times predicted IoU. A mask goes when its IoU
-    with any higher-scored mask, gone or not, is > nms_iou; when its score is <= nms_score; or when it lies
-    inside another mask, whatever the scores, so that 1 - (its share in both areas multiplied) > nms_inner.
+    masks: (M, H, W) bool, none empty; scores: (M,) stability times predicted IoU. A mask is removed if its
+    IoU with any higher-scored mask, removed or not, is > nms_iou; if its score is <= nms_score; or if it is
+    inside another mask of any score, so that 1 - (product of the common shares of both areas) > nms_inner.
     Source: `mask_nms` of LangSplat's preprocessing, with the thresholds that it passes.
     """
     common = common_pixels(masks)
@@ -156,23 +156,23 @@ def mask_nms(masks: Array, scores: Array, config: MaskConfig) -> Array:
     rank[np.argsort(-scores, kind="stable")] = np.arange(len(scores))
     iou = common / np.maximum(area[:, None] + area[None] - common, 1)
     rival = (iou > config.nms_iou) & (rank[None] < rank[:, None])
-    share = common / np.maximum(area[:, None], 1)  # of the row's mask that lies in the column's
-    # nearly all of it in another mask, which is more than twice as large
+    share = common / np.maximum(area[:, None], 1)  # of the row's mask in the column's
+    # at least 85 % of it in another mask, of which it covers less than half
     inside = (share >= 0.85) & (share.T < 0.5) & (1 - share * share.T > config.nms_inner)
     return np.flatnonzero((scores > config.nms_score) & ~rival.any(axis=1) & ~inside.any(axis=1))
 
 
-# Hierarchical merging of the regions of a photograph: the data structure behind the graph's masks.
+# Hierarchical merging of the regions of a photograph, for `GraphMasks`.
 
 CONTRAST_REACH = 2  # px on either side of a boundary, because blurred edges are wider than one step
 
 
 class RegionGraph:
-    """Regions of an image with their neighbours.
+    """Region adjacency graph of an image.
 
-    The cheapest pair merges first, so that every later partition is made of unions of every earlier one. The
-    cost of a pair is the distance of its mean colours plus the mean contrast along the common boundary, less
-    for small regions and for those that the other one encloses.
+    The cheapest pair merges first, so that regions of a later partition are unions of earlier ones. The cost
+    of a pair is the distance of its mean colours plus the mean contrast along the common boundary, reduced
+    for small regions and for enclosed ones.
     """
 
     def __init__(self, labels: Array, colours: Array) -> None:
@@ -180,15 +180,15 @@ class RegionGraph:
         self._labels = labels
         count = int(labels.max()) + 1
         flat = labels.ravel()
-        # Plain numbers: thousands of costs are asked for, one at a time.
+        # Python numbers: thousands of costs are computed one at a time.
         self._size = np.bincount(flat, minlength=count).astype(float).tolist()  # px
-        shades = colours * (0.25, 1.0, 1.0)  # shade is no other thing
+        shades = colours * (0.25, 1.0, 1.0)  # differences in lightness are often shading
         sums = [np.bincount(flat, shades[..., c].ravel(), count) for c in range(3)]
         self._mean = (np.stack(sums, axis=1) / np.array(self._size)[:, None]).tolist()
         self._neighbours = _adjacency(labels, colours, count)
         self._perimeter = [sum(length for length, _ in edges.values()) for edges in self._neighbours]
         self._parent = np.arange(count)
-        self._version = [0] * count  # rises with every change: entries of the heap with another are stale
+        self._version = [0] * count  # rises with every change: heap entries of another version are stale
         self._heap: list[tuple[float, int, int, int, int]] = []
         for i in range(count):
             for j in self._neighbours[i]:
@@ -211,7 +211,7 @@ class RegionGraph:
             alive = alive[alive != smallest]
 
     def partition(self) -> Array:
-        """Return (H, W) int: the regions as they are now, numbered 0..M-1."""
+        """Return (H, W) int: the current regions, numbered 0..M-1."""
         roots = self._parent
         while not np.array_equal(roots, roots[roots]):
             roots = roots[roots]
@@ -223,7 +223,7 @@ class RegionGraph:
         shared = length / min(self._perimeter[i], self._perimeter[j])
         enclosure = 1 - 0.5 * max(0.0, 2 * shared - 1)  # half the cost for one wholly inside another
         difference = math.dist(self._mean[i], self._mean[j]) + contrast / length
-        # Small regions merge more cheaply; one of a 200th of the image at its plain cost.
+        # Small regions merge more cheaply; the factor is 1 at a 200th of the image.
         return difference * (smaller / 0.005) ** 0.25 * enclosure
 
     def _push(self, i: int, j: int) -> None:
@@ -251,7 +251,7 @@ class RegionGraph:
 
 
 def _adjacency(labels: Array, colours: Array, count: int) -> list[dict[int, tuple[float, float]]]:
-    """Per region: neighbour -> (length of the common boundary, px; sum of the contrast along it)."""
+    """Return for each region: neighbour -> (length of the common boundary, px; sum of contrast along it)."""
     weighted = colours * (0.4, 1.0, 1.0)
     pairs, contrasts = [], []
     for axis in (0, 1):
@@ -273,13 +273,11 @@ def _adjacency(labels: Array, colours: Array, count: int) -> list[dict[int, tupl
     return neighbours
 
 
-# Masks without any weights: superpixels, merged by colour and boundary into three nested partitions.
-#
-# It knows nothing of objects. What it calls whole is what one paint or one material covers; SAM does better
-# wherever its weights can be had.
+# Masks without weights: superpixels, merged by colour and boundary into three nested partitions. They follow
+# colours and materials and not objects; SAM's masks are better.
 
 VERSION = 2
-WORK_SIDE = 400  # px, longer side at which regions are found; contrasts below are per pixel of it
+WORK_SIDE = 400  # px, longer side of the image on which regions are found
 ROUNDS = 60  # of denoising at most
 CHROMA_FALL = 0.045
 MERGE_COSTS = (6.0, 11.0, 19.0)  # colour difference plus contrast; chosen on photographs and renderings
@@ -287,7 +285,7 @@ MIN_FRACTIONS = (0.0008, 0.002, 0.004)  # of the image's area
 
 
 class GraphMasks(MaskSource):
-    """Masks without weights: regions of like colour."""
+    """Masks without weights: regions of similar colour."""
 
     name = "graph (no weights)"
     agrees = False
@@ -297,7 +295,7 @@ class GraphMasks(MaskSource):
         return json.dumps(["graph", VERSION, WORK_SIDE, MERGE_COSTS, MIN_FRACTIONS])
 
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
-        """Masks of an image (H, W, 3) uint8; at every level they cover each pixel exactly once."""
+        """Return the masks of an image (H, W, 3) uint8; at every level they cover each pixel exactly once."""
         progress("finding regions", 0.0)
         labels = nested_partitions(image)
         progress("finding regions", 1.0)
@@ -306,7 +304,7 @@ class GraphMasks(MaskSource):
 
 
 def nested_partitions(image: Array) -> Array:
-    """Divide (H, W, 3) uint8 into (3, H, W) int32 regions, each a union of those of the level before."""
+    """Divide (H, W, 3) uint8 into (3, H, W) int32 regions, each a union of regions of the level before."""
     from skimage.color import rgb2lab
     from skimage.segmentation import slic
 
@@ -314,7 +312,7 @@ def nested_partitions(image: Array) -> Array:
     scale = min(1.0, WORK_SIDE / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
-    # A weight that removes carpet and keeps edges.
+    # The weight removes the texture of a carpet and keeps edges.
     lab = 100 * denoise((rgb2lab(small) / 100).astype(np.float32), 0.12)
     superpixels = slic(
         lab * np.array([0.6, 1, 1]),
@@ -336,9 +334,9 @@ def nested_partitions(image: Array) -> Array:
 
 
 def denoise(image: Array, weight: float) -> Array:
-    """Return an (H, W, C) float32 image of less total variation: less noise, the same edges.
+    """Return an (H, W, C) float32 image of reduced total variation: less noise, the same edges.
 
-    By Chambolle 2004, as scikit-image's `denoise_tv_chambolle`, to 1e-6, in an eighth of its time.
+    By Chambolle 2004; equals scikit-image's `denoise_tv_chambolle` to 1e-6, in an eighth of its time.
     """
     given = np.pad(image.transpose(2, 0, 1), ((0, 0), (0, 0), (0, 1)), "edge")
     images = given.copy()
@@ -348,7 +346,7 @@ def denoise(image: Array, weight: float) -> Array:
 
 @kernel
 def _denoise(first: int, last: int, given: Array, weight: float, images: Array) -> None:
-    """Fill `images` [first, last), (C, H, W) with the last column twice, from `given`, which is so too."""
+    """Fill `images` [first, last) from `given`, both (C, H, W + 1) with the last column repeated."""
     _, height, width = images.shape
     step, one, share, part = np.float32(0.25), np.float32(1), np.float32(0.25 / weight), np.float32(weight)
     energies, started, before = np.empty(width, np.float32), 0.0, 0.0
@@ -379,12 +377,12 @@ def _denoise(first: int, last: int, given: Array, weight: float, images: Array) 
 
 
 def _paint(lab: Array) -> Array:
-    """Return (H, W, 3) colours, of CIELAB, of which shading changes only the first channel, lightness.
+    """Return (H, W, 3) colours from CIELAB in which shading changes only the first channel, lightness.
 
-    In CIELAB both a, b and L + 16 are differences of cube roots, so all three scale alike with the light that
-    falls on a surface: a / (L + 16) and b / (L + 16) hardly depend on it. Large chromas are compressed, since
-    the eye tells those apart less well (the factor 0.045 is that of CIE 94), and since in deep shade the cube
-    roots of CIELAB turn into straight lines.
+    In CIELAB a, b and L + 16 are combinations of cube roots, so all three scale alike with the light on a
+    surface: a / (L + 16) and b / (L + 16) hardly depend on it. Large chromas are compressed, since the eye
+    distinguishes them less well (0.045 is the factor of CIE 94), and since in deep shade the cube roots of
+    CIELAB become linear.
     """
     lightness = np.maximum(lab[..., :1], 0)
     chromaticity = lab[..., 1:] * 66.0 / (lightness + 16)  # at L = 50 of the size of a and b

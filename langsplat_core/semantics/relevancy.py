@@ -1,19 +1,19 @@
-"""Relevancy of a phrase: as published (LERF, adopted by LangSplat, section 3.4), and on the scale of chance.
+"""Relevancy of a phrase: as published (LERF, adopted by LangSplat, section 3.4), and relative to chance.
 
     relevancy(F, q) = min over canonical phrases c of  softmax(t [F.q, F.c])[0]
                     = sigmoid(t (F.q - max_c F.c))
 
-The temperature t is 10 in the method's code, absent from the paper's formula; other encoders have another,
-and cosines of 0.3 for what one calls 0.6. So answers read a phrase against everyday phrases, most of which
-are not there: at every language feature its cosine is compared with theirs, in units of their spread,
+The temperature t is 10 in the method's code and absent from the paper's formula. Other encoders need another
+temperature, and their cosines have other ranges. So answers compare a phrase with everyday phrases, most of
+which are absent from the scene: at every language feature F,
 
     fit  =  (F.q - zero) / spread,        relevancy  =  sigmoid(fit),
 
-where the spread is the standard deviation of the everyday phrases' cosines there, and zero is what the best
+where the spread is the standard deviation of the everyday phrases' cosines with F, and zero is what the best
 of them have by chance (the mean of the largest `TOP`), mixed with the nearest of the canonical phrases, which
-are LERF's own null, of four. A feature that lies near all phrases ("hub") thereby loses its advantage.
+are LERF's own null. A feature that is near to all phrases ("hub") thereby loses its advantage.
 
-Below: vocabularies, which are plain lists of phrases, and the everyday phrases among them.
+The module also has vocabularies, which are plain lists of phrases, and the everyday phrases.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,23 +30,23 @@ from langsplat_core.io.hostile import read_text
 from langsplat_core.scene import Codec, LanguageField
 from langsplat_core.scene.language import phrase_key
 
-FLOOR = 0.5  # no closer to the phrase than to the closest of "object", "things", "stuff", "texture"
-MIN_HEAT_SPAN = 0.1  # a peak closer than this to the floor is not stretched to full heat
-TOP = 0.07  # of the everyday phrases: those that fit best by chance
+FLOOR = 0.5  # relevancy at fit 0: no closer to the phrase than to what is nearest by chance
+MIN_HEAT_SPAN = 0.1  # least range of relevancies that a heat map is stretched over
+TOP = 0.07  # share of the everyday phrases whose mean is the best by chance
 CANONICAL = 0.25  # weight of the nearest canonical phrase in the zero
-NARROWEST = 1e-6  # distance of a relevancy from 0 and 1, so that its fit is finite; least spread
+NARROWEST = 1e-6  # least distance of a relevancy from 0 and 1, so that its fit is finite; least spread
 CHUNK = 16_384  # decoded vectors held at a time: 32 MB at 512 float32 numbers
 
 
 def relevancy_of(cosines: Array, zero: Array, rate: Array | float) -> Array:
-    """Relevancy in (0, 1) of cosines; as published zero is the best canonical cosine, rate 10."""
+    """Return relevancies in (0, 1) of cosines; as published, zero is the best canonical cosine, rate 10."""
     return sigmoid(rate * (cosines - zero))
 
 
 def relevancy(
     vectors: Array, phrases: Array, canonical: Array, temperature: float = LanguageField.temperature
 ) -> Array:
-    """Return (M, Q) in (0, 1) of (M, D), (Q, D) phrases and (C, D) canonical unit vectors."""
+    """Return the published (M, Q) relevancy in (0, 1) of (M, D), (Q, D) and canonical (C, D) unit vectors."""
     return relevancy_of(vectors @ phrases.T, (vectors @ canonical.T).max(1, keepdims=True), temperature)
 
 
@@ -57,7 +57,7 @@ def latent_relevancy(
     canonical: Array,
     temperature: float = LanguageField.temperature,
 ) -> Array:
-    """Return exact (M, Q) relevancy of (M, d) latents, 0 if unobserved; texts (Q, D) and (C, D)."""
+    """Return the published (M, Q) relevancy of (M, d) latents, 0 if unobserved; texts (Q, D) and (C, D)."""
     out = np.zeros((len(latents), len(phrases)), np.float32)
     known = np.flatnonzero(codec.known(latents))
     texts = np.concatenate([phrases, canonical])
@@ -77,7 +77,7 @@ def fit_of(relevancy: Array | float, rate: float = 1.0) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """Scale on which the cosines of a field are read."""
+    """Scale that maps the cosines of a field to relevancies."""
 
     canonical: Array  # (C, D) float32 unit
     everyday: Array | None  # (V, D) float32 unit; None: as published
@@ -85,11 +85,11 @@ class Scale:
 
     @property
     def texts(self) -> Array:
-        """The (T, D) unit vectors of all phrases that `of` compares with."""
+        """The (T, D) unit vectors of the phrases that `of` needs cosines with."""
         return self.canonical if self.everyday is None else np.concatenate([self.canonical, self.everyday])
 
     def of(self, cosines: Array) -> tuple[Array, Array]:
-        """Return the (M,) float32 zeros and rates of language features with (M, T) cosines with `texts`.
+        """Return the (M,) float32 zeros and rates of features from their (M, T) cosines with `texts`.
 
         Their relevancy is sigmoid(rate * (cosine - zero)).
         """
@@ -104,14 +104,14 @@ class Scale:
         return zero.astype(np.float32), (1 / spread).astype(np.float32)
 
     def fit(self, relevancy: Array | float) -> Array:
-        """Relevancy in [0, 1] -> the fit it stands for, in spreads; as published, the margin of cosines."""
+        """Return the fits, in spreads, of relevancies in [0, 1]; as published, the margins of cosines."""
         return fit_of(relevancy, 1.0 if self.everyday is not None else self.temperature)
 
 
 # Vocabularies: plain lists of phrases that a scene can be described with.
 
-BUNDLED = "things", "parts", "colours", "materials"  # of which a page knows the phrases
-LONGEST = 80  # characters of a phrase: CLIP reads 77 tokens, and a whole paragraph is no word
+BUNDLED = "things", "parts", "colours", "materials"  # lists whose phrases are in exported pages
+LONGEST = 80  # characters of a phrase: CLIP reads 77 tokens
 
 
 def bundled_vocabulary(name: str) -> tuple[str, ...]:
@@ -122,8 +122,8 @@ def bundled_vocabulary(name: str) -> tuple[str, ...]:
 def read_vocabulary(path: Path) -> tuple[str, ...]:
     """Return the phrases of a text file, one a line, in lower case, each once, in the file's order.
 
-    Empty lines and lines that begin with # do not count. Raises InputError for a file that cannot be read,
-    that has no phrase, or with a line that is none (no letter or digit, too long, no text), which is named.
+    Empty lines and lines that begin with # are skipped. Raises InputError for a file that cannot be read or
+    has no phrase, and names a line that is no phrase (without letter or digit, too long, unprintable).
     """
     phrases: dict[str, None] = {}
     for number, line in enumerate(read_text(path).split("\n"), 1):
@@ -142,12 +142,11 @@ def read_vocabulary(path: Path) -> tuple[str, ...]:
     return tuple(phrases)
 
 
-# Everyday phrases: what a codec's errors are judged on, beside a scene's own vectors, and what answers are
-# compared with.
+# Everyday phrases: the null distribution of answers, and test vectors for codecs beside a scene's own.
 
 
 MIXED = 96  # phrases of two words
-FEWEST = 48  # phrases from which they tell what fits by chance
+FEWEST = 48  # least number of phrases for a distribution by chance
 
 
 class TextEncoder(Protocol):
@@ -157,14 +156,14 @@ class TextEncoder(Protocol):
         """Return (M, D) float32 unit vectors."""
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
-        """Words of `text` that the encoder was never taught; empty if it cannot tell."""
+        """Return the words of `text` that the encoder was never taught; empty for an open vocabulary."""
 
     def near_words(self, word: str) -> tuple[str, ...]:
-        """Words it was taught that are written like an unknown one, the nearest first."""
+        """Return words of the vocabulary that are spelt like an unknown one, the nearest first."""
 
 
 def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]:
-    """Nouns and `MIXED` random pairs of adjective and noun, always the same, without unknown words."""
+    """Return nouns and `MIXED` pairs of adjective and noun, of a fixed seed, without unknown words."""
     nouns, adjectives = (
         [word for word in bundled_vocabulary(name) if not unknown_words(word)]
         for name in ("nouns", "adjectives")
@@ -177,7 +176,7 @@ def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]
 
 
 def everyday_vectors(encoder: TextEncoder) -> Array | None:
-    """Return (V, D) float32 unit vectors of everyday phrases, as of float16; None if it knows too few."""
+    """Return (V, D) float32 unit vectors of everyday phrases, rounded to float16; None for too few words."""
     phrases = everyday_phrases(encoder.unknown_words)
     if len(phrases) < FEWEST:
         return None

@@ -1,7 +1,7 @@
-"""Masks by models of the SAM family: an image is seen once, asked about a grid of points, and filtered.
+"""Masks by models of the SAM family: an image is encoded, prompted with a grid of points, and filtered.
 
-The three answers to one point are taken as the levels subpart, part and whole (LangSplat section 3.1). The
-image is seen once, as a whole; the method's public code, not its paper, sees 2 x 2 crops of it too. Source:
+The three masks of one point are the levels subpart, part and whole (LangSplat section 3.1). By default the
+image is encoded as a whole; the method's public code, not its paper, encodes 2 x 2 crops of it too. Source:
 the mask generator of segment-anything, with the settings of LangSplat's public code.
 """
 
@@ -41,14 +41,14 @@ MASKS_PER_POINT = 3  # masks per point
 
 @dataclass(frozen=True, eq=False)
 class EncodedImage:
-    """An image after the model's encoder, which can be asked for masks at points."""
+    """An encoded image, which can be prompted with points."""
 
     model: Any  # a transformers model
-    seen: Mapping[str, Any]  # arguments of the model that stand for the image
-    side: int  # of the square that the model sees, px
-    size: tuple[int, int] | None  # (height, width) of the image in it; None where it fills the square
+    seen: Mapping[str, Any]  # arguments of the model with the encoded image
+    side: int  # of the model's square input, px
+    size: tuple[int, int] | None  # (height, width) of the image in it; None if it fills the square
     shape: tuple[int, int]  # (height, width) of the image itself, px
-    ordered: bool  # whether the three answers to a point are subpart, part, whole, in this order
+    ordered: bool  # True if the three masks of a point are subpart, part, whole, in this order
 
     @models.asking_errors("the segmenter")
     def masks_at(self, points: Array) -> tuple[Any, Any]:
@@ -81,18 +81,18 @@ class Segmenter(Protocol):
         """Name for messages, such as "SAM 2"."""
 
     def encode(self, image: Array) -> EncodedImage:
-        """Show the model an image (H, W, 3) uint8 once."""
+        """Encode an image (H, W, 3) uint8."""
 
 
 class TextSegmenter(Protocol):
     """A model that outlines what a phrase names."""
 
     def segment(self, image: Array, phrases: Sequence[str]) -> Array:
-        """Return (H, W, P) bool: pixels of all that each phrase names in (H, W, 3) uint8, in one pass."""
+        """Return (H, W, P) bool masks of all instances that each of P phrases names in (H, W, 3) uint8."""
 
 
 def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
-    """Return the (P, 3) scores and (P, 3, h, w) masks of each point from the smallest mask to the largest."""
+    """Return the (P, 3) scores and (P, 3, h, w) masks of P points, each from its smallest to its largest."""
     import torch
 
     order = torch.argsort((logits > 0).flatten(2).sum(2), dim=1, stable=True)
@@ -105,7 +105,7 @@ def normalised(
 ) -> tuple[Array, tuple[int, int]]:
     """Return (1, 3, side, side) float32 of (H, W, 3) uint8, and the (height, width) of the image in it.
 
-    It is stretched to the square, or with `padded` its longer side is, with zeros to the right and below.
+    The image is stretched to the square, or with `padded` scaled to it, with zeros to the right or below.
     """
     mean, deviation = statistics
     height, width = image.shape[:2]
@@ -139,18 +139,18 @@ class Sam:
 
 
 def load_sam(weights: Weights) -> Sam:
-    """Load a SAM from the classes of transformers; its three masks of a point are ordered."""
+    """Load a SAM; its three masks of a point are ordered."""
     from transformers import SamConfig, SamModel
 
     settings = models.load_config(SamConfig, weights, "SAM")
-    # Of the norms between attentions in segment_anything, PyTorch's; transformers has 1e-6 there.
+    # The value of segment_anything for norms between attentions; transformers has 1e-6.
     settings.mask_decoder_config.layer_norm_eps = 1e-5
     model = models.load_model(SamModel, weights, settings)
     return Sam("SAM", model, int(model.config.vision_config.image_size), ordered=True)
 
 
 def load_sam2(weights: Weights) -> Sam:
-    """Load the image half of a SAM 2: the hub's files state the video model's configuration."""
+    """Load the image half of a SAM 2; the hub's files have the configuration of the video model."""
     from transformers import Sam2Config, Sam2Model
 
     model = models.load_model(Sam2Model, weights, models.load_config(Sam2Config, weights, "SAM 2"))
@@ -158,25 +158,25 @@ def load_sam2(weights: Weights) -> Sam:
 
 
 SAM3_PIXELS = (127.5,) * 3, (127.5,) * 3
-SAM3_FOUND = 0.5  # score of an instance that is there, as in Meta's own code
+SAM3_FOUND = 0.5  # least score of an instance, as in Meta's own code
 
 
 class Sam3Text(TorchText):
-    """The half of a SAM 3 that outlines all that a short noun phrase names; a `TextSegmenter`."""
+    """The detector of a SAM 3, which outlines all instances of a short noun phrase; a `TextSegmenter`."""
 
     padded = True
 
     def __init__(self, weights: Weights, name: str = "Sam3") -> None:
-        """name: what the model's classes in transformers begin with."""
+        """name: prefix of the model's classes in transformers."""
         import transformers
 
         with models.loading_errors(weights.id, "SAM 3"):
             kind, settings = getattr(transformers, f"{name}Model"), getattr(transformers, f"{name}Config")
-        config = models.load_config(settings, weights, "SAM 3")  # of the model for films that of its detector
+        config = models.load_config(settings, weights, "SAM 3")  # of a video model, that of its detector
         super().__init__(kind, weights, config, "", 0, "<|startoftext|>")
         self._length = min(self._length, 32)  # as its processor pads
         self._side = int(config.image_size)
-        self._read: dict[str, tuple[Any, Any]] = {}  # what the model makes of phrases, and their masks
+        self._read: dict[str, tuple[Any, Any]] = {}  # features of phrases and their attention masks
 
     @models.asking_errors("the segmenter")
     def segment(self, image: Array, phrases: Sequence[str]) -> Array:
@@ -189,7 +189,7 @@ class Sam3Text(TorchText):
             return np.stack([self._outlined(seen, phrase, image.shape[:2]) for phrase in phrases], -1)
 
     def _outlined(self, seen: Any, phrase: str, shape: tuple[int, int]) -> Array:
-        """Return (H, W) bool of `shape`: the union of the instances that are found, of an image `seen`."""
+        """Return (H, W) bool of `shape`: the union of all instances of a phrase in an encoded image."""
         from torch.nn.functional import interpolate
 
         if phrase not in self._read:
@@ -205,7 +205,7 @@ class Sam3Text(TorchText):
         return inside
 
 
-# Loading by hub id, folder or file: a new family is a function above and one row here.
+# Loading by hub id, folder or file. A new family is a function above and one row here.
 
 FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by `model_type` of config.json
     {"sam": load_sam, "sam2": load_sam2, "sam2_video": load_sam2}
@@ -213,7 +213,7 @@ FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by
 TEXT_FAMILIES: Mapping[str, Callable[[Weights], TextSegmenter]] = MappingProxyType(
     {"sam3": Sam3Text, "sam3_video": Sam3Text, "sam3_lite_text": partial(Sam3Text, name="Sam3LiteText")}
 )
-HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven times as large
+HALF_ON = "cuda"  # device type with float16 products; the error of bfloat16 is seven times as large
 
 
 def load_segmenter(model: str, device: str = "auto") -> Segmenter:
@@ -224,13 +224,13 @@ def load_segmenter(model: str, device: str = "auto") -> Segmenter:
 
 @optional_imports(EncoderError)
 def load_text_segmenter(model: str, device: str = "auto") -> TextSegmenter:
-    """Load `model`, which outlines what phrases name: a folder in Hugging Face layout or a hub id."""
+    """Load `model`, a folder in Hugging Face layout or a hub id, for segmentation by phrases."""
     weights = models.open_weights(model, models.weights_path(model, "--segmenter"), device)
     return models.family_of(weights, TEXT_FAMILIES, "text_segmenters")(weights)
 
 
 def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
-    """Return the source of masks that `config` asks for; "auto": SAM if it names weights, else the graph."""
+    """Return the mask source of `config`; "auto": SAM if weights are named, else the graph."""
     if config.source == "graph" or (config.source == "auto" and not config.sam):
         return GraphMasks()
     if config.source not in ("auto", "sam"):
@@ -245,15 +245,15 @@ def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
     return SamMasks(load_segmenter(config.sam, device), config, half_on)
 
 
-# The grid of points, and layers of crops: parts of a photograph that are looked at for themselves, for masks
-# of small things.
+# The grid of points, and layers of crops: parts of a photograph that are encoded by themselves, for masks of
+# small things.
 
 OVERLAP = 512 / 1500  # of neighbouring crops, as a share of the image's shorter side, in the first layer
-EDGE = 20.0  # px: a box that ends this near to an edge touches it
+EDGE = 20.0  # px: largest distance at which a box touches an edge
 
 
 def grid_points(per_side: int, size: tuple[int, int]) -> Array:
-    """Return (per_side^2, 2) float32 x, y, centres of equal cells of an image of `size` (height, width)."""
+    """Return (per_side^2, 2) float32 x, y: centres of equal cells of an image of `size` (height, width)."""
     centres = (np.arange(per_side) + 0.5) / per_side
     x, y = np.meshgrid(centres * size[1], centres * size[0])
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
@@ -272,40 +272,40 @@ def crop_boxes(shape: tuple[int, int], layers: int) -> Array:
 
 
 def _spans(length: int, count: int, overlap: int) -> list[tuple[int, int]]:
-    """`count` equal pieces that cover `length` px and share `overlap` px with the next."""
+    """Return `count` equal intervals that cover `length` px and share `overlap` px with the next."""
     size = ceil((overlap * (count - 1) + length) / count)
     starts = [(size - overlap) * i for i in range(count)]
     return [(start, min(start + size, length)) for start in starts if start < length]
 
 
 def cut_by_crop(boxes: Array, crop: Array, shape: tuple[int, int]) -> Array:
-    """Return (...,) bool, True where a box ends at an edge of the crop that is no edge of the image.
+    """Return (...,) bool: True if a box touches an edge of the crop that is no edge of the image.
 
-    What such a mask shows goes on outside, and the next crop or the whole image shows it better. boxes:
-    (..., 4); crop: (4,) left, top, right, bottom, px of the image; shape: its (height, width).
+    Such a mask is cut off; the next crop or the whole image has it complete. boxes: (..., 4); crop: (4,)
+    left, top, right, bottom, px of the image; shape: its (height, width).
     """
     whole = np.array([0, 0, shape[1], shape[0]])
     at_crop, at_edge = np.abs(boxes - crop) <= EDGE, np.abs(boxes - whole) <= EDGE
     return (at_crop & ~at_edge).any(axis=-1)
 
 
-# Asking, and what is kept of the answers.
+# Prompting with points, and filtering of the masks.
 
 VERSION = 2
-# Full-size masks of float logits held at one time: on a CPU 16 take twice as long as four times 4, since the
-# system gives and takes back large memory page by page.
+# Full-size masks of float logits held at a time. On a CPU 16 take twice as long as four times 4, since large
+# memory is mapped page by page.
 MASKS_AT_ONCE = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A mask that is the best of those like it in its crop."""
+    """A mask that remains after suppression in its crop."""
 
     bits: Array  # (ceil(h w / 8),) uint8, packed, of its box: thousands of masks are held at once
     box: Array  # (4,) left, top, right, bottom, px of the image; right and bottom exclusive
     predicted_iou: float
     stability: float
-    crop_area: int  # px, of the crop that it was found in
+    crop_area: int  # px, of its crop
 
     def mask(self, shape: tuple[int, int]) -> Array:
         """Return (H, W) bool: the mask in an image of `shape`."""
@@ -318,11 +318,11 @@ class Proposal:
 
 @dataclass(frozen=True)
 class SamMasks(MaskSource):
-    """Masks of a segmenter's answers to a grid of points."""
+    """Masks of a segmenter that is prompted with a grid of points."""
 
     segmenter: Segmenter
     config: MaskConfig
-    half_on: str | None = None  # type of device on which the model multiplies in float16; None: in float32
+    half_on: str | None = None  # device type on which the model multiplies in float16; None: in float32
 
     @property
     def name(self) -> str:
@@ -330,16 +330,16 @@ class SamMasks(MaskSource):
 
     @property
     def key(self) -> str:
-        """The settings that change the masks, as JSON; the size of batches does not."""
+        """The settings that masks depend on, as JSON, without the batch size."""
         settings = asdict(self.config) | {"source": "sam", "points_per_batch": 0}
         return json.dumps(["sam", VERSION, settings, *["float16"] * bool(self.half_on)], sort_keys=True)
 
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
-        """Masks of an image (H, W, 3) uint8, by falling predicted IoU; a level may have none."""
+        """Return the masks of an image (H, W, 3) uint8; a level may have none."""
         return self.begin(image, progress)()
 
     def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
-        """Ask the model; the function that is returned compares pixels and gives the masks."""
+        """Run the model; the returned function filters by pixels and returns the masks."""
         crops = crop_boxes(image.shape[:2], self.config.crop_layers)
         levels: list[list[Proposal]] = [[] for _ in range(MASKS_PER_POINT)]
         for index, crop in enumerate(crops):
@@ -357,7 +357,7 @@ class SamMasks(MaskSource):
     def _in_crop(
         self, image: Array, crop: Array, progress: Progress, half_on: str | None
     ) -> list[list[Proposal]]:
-        """Return proposals of each level in one crop (4,); OverflowError beyond float16."""
+        """Return the proposals of each level in one crop (4,); OverflowError beyond float16's range."""
         import torch
 
         left, top, right, bottom = crop
@@ -385,7 +385,7 @@ class SamMasks(MaskSource):
     def _passing(
         self, encoded: EncodedImage, answer: tuple[Any, Any], crop: Array, shape: tuple[int, int]
     ) -> tuple[Array, Any]:
-        """Return (M, 7) level, IoU, stability, box of masks that pass, and (M, h, w) logits on the device."""
+        """Return (M, 7) level, IoU, stability, box of accepted masks, and (M, h, w) logits on the device."""
         import torch
 
         ious, logits = (found.flatten(0, 1).float() for found in answer)
@@ -393,7 +393,7 @@ class SamMasks(MaskSource):
         offset = self.config.stability_offset
         measured = [measure(encoded.enlarge(logits[some]), offset) for some in rows.split(MASKS_AT_ONCE)]
         columns = [rows % MASKS_PER_POINT, ious[rows], *torch.cat(measured).unbind(1)]
-        figures = torch.stack(columns, dim=1).cpu().numpy()  # the one transfer
+        figures = torch.stack(columns, dim=1).cpu().numpy()  # a single transfer
         figures[:, 3:] += np.tile(crop[:2], 2)
         boxes = figures[:, 3:]
         good = (figures[:, 2] >= self.config.stability) & (boxes[:, 0] < boxes[:, 2])
@@ -403,7 +403,7 @@ class SamMasks(MaskSource):
     def _best(
         self, encoded: EncodedImage, figures: Array, logits: Any, level: int, crop: Array
     ) -> list[Proposal]:
-        """Return the proposals of a level whose box no better one resembles; only they leave the device."""
+        """Return the proposals of a level after suppression by box; only these leave the device."""
         rows = np.flatnonzero(figures[:, 0] == level)
         rows = rows[box_nms(figures[rows, 3:], figures[rows, 1], self.config.box_nms)]
         area = int((crop[2] - crop[0]) * (crop[3] - crop[1]))
@@ -422,8 +422,8 @@ class SamMasks(MaskSource):
 def measure(logits: Any, offset: float) -> Any:
     """Return (B, 5) float32 stability, left, top, right, bottom of (B, H, W) full-size logits.
 
-    On their device, px; right and bottom exclusive, all 0 of an empty mask. At full size, as in
-    segment_anything: at the decoder's own, areas and boxes of small masks differ.
+    On their device, px; right and bottom exclusive, a box of zeros for an empty mask. At full size, as in
+    segment_anything: at the decoder's own size, areas and boxes of small masks differ.
     """
     import torch
 
@@ -437,11 +437,11 @@ def measure(logits: Any, offset: float) -> Any:
 
 
 def filter_level(proposals: list[Proposal], shape: tuple[int, int], config: MaskConfig) -> Array:
-    """Filter one level: (M, H, W) bool masks; scores are stability times IoU.
+    """Return the (M, H, W) bool masks of one level that remain after filtering.
 
-    proposals: of each crop those that no better one resembled. Order of the steps as in SAM's mask generator
-    with LangSplat's mask suppression behind it: boxes of different crops, where the smaller crop shows more
-    of a thing, crumbs, boxes again (there an untouched mask beats a cleaned one), pixels.
+    The steps are those of SAM's mask generator followed by LangSplat's mask suppression: suppression by box
+    between crops, in favour of the smaller crop; removal of small regions; suppression by box again, in
+    favour of masks that this left unchanged; suppression by pixels, with stability times IoU as the score.
     """
     if not proposals:
         return np.zeros((0, *shape), bool)

@@ -28,7 +28,7 @@ OPEN_CLIP = ["open_clip_model.safetensors", "open_clip_pytorch_model.bin"]  # ei
 
 @dataclass(frozen=True, eq=False)
 class Converted:
-    """Weights of another layout as transformers names them."""
+    """Weights of another layout with the names of transformers."""
 
     config: dict[str, Any]  # of config.json
     tensors: Mapping[str, Any]  # name -> torch.Tensor
@@ -37,22 +37,22 @@ class Converted:
 
 @dataclass(frozen=True)
 class Weights:
-    """A model that was found, and where it shall run."""
+    """The files of a model, and the device that it runs on."""
 
-    id: str  # hub id or folder, as it was asked for
-    folder: Path  # in Hugging Face layout, or that of `converted`, with what lies beside the weights
+    id: str  # hub id or folder, as the user gave it
+    folder: Path  # with the weights, in Hugging Face layout unless `converted`, and the tokenizer
     device: str  # of torch: "cpu", "cuda:0"
-    converted: Converted | None = None  # where they are in another layout than Hugging Face's
+    converted: Converted | None = None  # if they are in another layout than Hugging Face's
 
 
-Layout = Callable[[str, Path], Converted | None]  # id for messages, file -> None where it is of another one
+Layout = Callable[[str, Path], Converted | None]  # id for messages, file -> None for a file in another layout
 
 
 def open_weights(model: str, path: Path, device: str) -> Weights:
-    """Return the weights at a path that `weights_path` found, for a device as `torch_device` has it.
+    """Return the weights at a path from `weights_path`, for a device as `torch_device` takes it.
 
-    Other layouts than Hugging Face's are read by extensions. Raises EncoderError for a file that is damaged,
-    or of no layout known here.
+    Other layouts than Hugging Face's are read by extensions. Raises EncoderError for a file that is damaged
+    or in an unknown layout.
     """
     device = torch_device(device)
     if path.is_dir() and _is_hugging_face(path):
@@ -70,11 +70,11 @@ def open_weights(model: str, path: Path, device: str) -> Weights:
 
 
 def weights_path(model: str, option: str) -> Path:
-    """Return the folder or file that holds `model`, downloaded when it is a hub id that is not cached yet.
+    """Return the folder or file that holds `model`, downloaded if it is a hub id that is not cached.
 
     model: an existing folder or file, or a hub id "owner/name"; option: the setting to name in messages, such
-    as "--clip.model". What exists is never looked up on the hub, and with HF_HUB_OFFLINE set, or where
-    nobody but a file names the model, nothing is. Raises EncoderError saying what to pass or to run.
+    as "--clip.model". Existing paths are never looked up on the hub; with HF_HUB_OFFLINE set, or if the name
+    comes from a file and not from the user, nothing is. Raises EncoderError that says what to pass or run.
     """
     path, said = local_path(model), shown(model)
     if os.path.isfile(path):
@@ -96,14 +96,14 @@ def weights_path(model: str, option: str) -> Path:
 
 
 def local_path(model: str) -> Path:
-    """Return where `model` lies if it is a file or folder here; `~` and other machines are the user's own."""
+    """Return the path of `model` if it is a local one; names from files get no `~` and no network share."""
     if not isinstance(model, FromFile):
         return Path(os.path.expanduser(model))
     return Path(os.devnull if model[:2].replace("\\", "/") == "//" else model)
 
 
 def _is_hugging_face(folder: Path) -> bool:
-    """Return True where a folder holds weights and their configuration as transformers saves them."""
+    """Return True if a folder holds weights and their configuration as transformers saves them."""
     return bool(weight_files(folder)) and (folder / CONFIG).is_file()
 
 
@@ -125,7 +125,7 @@ def _from_hub(model: str, option: str) -> Path:
             if _is_complete(found):
                 return found
             reason = reason if local_only else "it has no weights for transformers"
-        except (OSError, ValueError, errors.HTTPError) as error:  # of whichever client the hub uses
+        except (OSError, ValueError, errors.HTTPError) as error:  # HTTPError of the hub's current client
             reason = reason if local_only else type(error).__name__
     supply, give = ("was not asked", shown(model)) if unasked else ("cannot supply it", "FOLDER")
     raise EncoderError(
@@ -136,16 +136,16 @@ def _from_hub(model: str, option: str) -> Path:
 
 
 def weight_files(folder: Path) -> list[Path]:
-    """Return the files with a folder's weights: of both kinds the first, which transformers prefers, too."""
+    """Return the files with a folder's weights: safetensors, else pickles, as transformers prefers them."""
     kinds = (sorted(path for pattern in kind for path in folder.glob(pattern)) for kind in (SAFE, PICKLED))
     return next(filter(None, kinds), [])
 
 
-# Building a model: transformers fills with random numbers what its configuration has and its weights lack.
+# Building a model. transformers fills parameters that the weights lack with random numbers, without an error.
 
 
 def family_of(weights: Weights, families: Mapping[str, T], kind: registry.Kind) -> T:
-    """Return the row of what config.json names: one of `families`, or of an extension's `kind`."""
+    """Return the row for config.json's `model_type` in `families`, else the part `kind` of an extension."""
     if weights.converted:
         named = str(weights.converted.config["model_type"])
     else:
@@ -164,7 +164,7 @@ def family_of(weights: Weights, families: Mapping[str, T], kind: registry.Kind) 
 
 
 def load_config(kind: Any, weights: Weights, name: str) -> Any:
-    """Return the configuration of `weights` as transformers' class `kind`; `name` is for messages."""
+    """Return the configuration of `weights` as transformers' class `kind`; name: for messages."""
     with loading_errors(weights.id, name):
         if weights.converted:
             return kind.from_dict(deepcopy(weights.converted.config))
@@ -172,13 +172,13 @@ def load_config(kind: Any, weights: Weights, name: str) -> Any:
         return kind.from_pretrained(weights.folder, local_files_only=True)
 
 
-# Settings whose parts are built one by one, for hours before anybody compares, and the side of images in px.
+# Largest allowed counts of parts, which would be built one by one for hours, and side of images in px.
 _PARTS = ("num_hidden_layers", "blocks_per_stage", "iou_head_depth", "num_multimask_outputs")
 LARGEST = {**dict.fromkeys((*_PARTS, "num_point_embeddings"), 512), "image_size": 1 << 14}
 
 
 def _check_counts(id: str, settings: Any) -> None:
-    """Raise EncoderError where a configuration, or a part of it, asks for absurdly many parts."""
+    """Raise EncoderError if a count in a configuration, or in a part of it, exceeds `LARGEST`."""
     for name, value in settings.items() if isinstance(settings, dict) else ():
         _check_counts(id, value)
         most = LARGEST.get(name)
@@ -191,7 +191,7 @@ def _check_counts(id: str, settings: Any) -> None:
 
 
 def _check_size(kind: Any, weights: Weights, config: Any) -> None:
-    """Raise EncoderError where a model of this configuration has more numbers than its files have bytes."""
+    """Raise EncoderError if a model of this configuration has more numbers than its files have bytes."""
     import torch
 
     with torch.device("meta"):
@@ -205,11 +205,10 @@ def _check_size(kind: Any, weights: Weights, config: Any) -> None:
 
 
 def load_model(kind: Any, weights: Weights, config: Any) -> Any:
-    """Return a transformers model of class `kind` in float32 on the device of `weights`, ready to be asked.
+    """Return a transformers model of class `kind` in float32 on the device of `weights`, for inference.
 
-    Raises EncoderError where the folder lacks some of its weights or has them in another shape. Nor may it
-    have more layers than the model, and converted weights anything more: what was deduced from them may be
-    wrong.
+    Raises EncoderError if weights are missing or have another shape, if the folder has more layers than the
+    model, and if converted weights have any unused tensors, as their deduced configuration may be wrong.
     """
     import torch
 
@@ -225,7 +224,7 @@ def load_model(kind: Any, weights: Weights, config: Any) -> Any:
     wrong = sorted(report["missing_keys"]) or sorted(str(key[0]) for key in report["mismatched_keys"])
     if not wrong:
         halves = {name.partition(".")[0] for name in model.state_dict()}
-        outer = f"{model.base_model_prefix}."  # before a half's names where the whole model was saved
+        outer = f"{model.base_model_prefix}."  # prefix of a half's names if the whole model was saved
         more = (
             name
             for name in report["unexpected_keys"]
@@ -242,7 +241,7 @@ def load_model(kind: Any, weights: Weights, config: Any) -> Any:
 
 @contextmanager
 def loading_errors(id: str, kind: str) -> Iterator[None]:
-    """While transformers reads a folder: nothing on the terminal, and one line in place of its tracebacks."""
+    """Silence transformers while it reads a folder, and turn its errors into EncoderError."""
     from huggingface_hub.errors import StrictDataclassError
     from transformers.utils import logging
 
@@ -256,9 +255,9 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
     except (EncoderError, MemoryError):
         raise
     except Exception as error:  # tokenizers raises no narrower class for a damaged file
-        # Its own text names the class that complains; why it does stands in its cause.
+        # Its own text only names the class; the reason is in its cause.
         told = (error.__cause__ or error) if isinstance(error, StrictDataclassError) else error
-        # torch's own words advise to run the file.
+        # torch's own text advises to run the file.
         pickled = isinstance(error, pickle.UnpicklingError) or "weights_only" in str(error)
         reason = "a pickle that holds more than tensors, which is not run" if pickled else _first_line(told)
         raise EncoderError(f"{id}: not {kind} weights that can be loaded ({reason})") from error
@@ -270,7 +269,7 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
 
 @contextmanager
 def asking_errors(what: str) -> Iterator[None]:
-    """Turn errors of asking a model into EncoderError: loading compares no more than sizes."""
+    """Turn errors of inference into EncoderError: loading only compares sizes."""
     import torch
 
     try:
@@ -287,9 +286,9 @@ def _first_line(error: BaseException) -> str:
 
 
 def torch_device(device: str) -> str:
-    """Return the device that "auto" means here: cuda where PyTorch sees one, by its number, else cpu."""
+    """Return the torch device of "auto", "cpu" or "cuda"; "auto" is the current CUDA device, if any."""
     if device == "cpu":
-        return device  # without importing torch, which a small text encoder does without
+        return device  # without importing torch, which a small text encoder does not need
     import torch
 
     if torch.cuda.is_available():

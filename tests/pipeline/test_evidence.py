@@ -243,11 +243,11 @@ def test_true_masks_lift_to_the_things_that_they_show():
     shares, _ = shares_in_masks(scene, lambda camera: view_of(scene, camera).splat(truth)[0] > 0.5)
     spoke = ("lid", "both"), ("spout", "the photographs")
     for (name, who), own, share in zip(spoke, truth.T > 0, shares.T, strict=True):
-        heard = with_masks(engine, run_phrase(engine, name).answer, share)
-        found = np.stack([heard.field, heard.masks, heard.answer.members])
+        masked = with_masks(engine, run_phrase(engine, name).answer, share)
+        found = np.stack([masked.field, masked.masks, masked.answer.members])
         field, lifted, both = (found & own).sum(1) / (found | own).sum(1)
         assert min(lifted, both) > max(field + 0.1, 0.95)
-        assert (heard.who(), heard.answer.found) == (who, True)
+        assert (masked.found_by(), masked.answer.found) == (who, True)
 
 
 @pytest.mark.parametrize("spoil", ["work", "mask", "truncated", "report", "photograph"])

@@ -35,7 +35,7 @@ from langsplat_core.query.rule import (
     region_fits,
     scaling_of,
 )
-from langsplat_core.query.taught import FOUND, LIKEST, NEXT, shown
+from langsplat_core.query.taught import FOUND, LIKEST, NEXT, of_example
 from langsplat_core.scene import (
     LEVELS,
     NO_NODE,
@@ -482,7 +482,7 @@ def test_rival_of_a_shown_whole_follows_from_the_next_ones():
     base, times = FOUND[2]
     assert space.rival <= LIKEST
     for rival in (0.0, 0.9):
-        (said,) = shown(replace(space, rival=rival), *given[1:], "vase", there, 2).rivals
+        (said,) = of_example(replace(space, rival=rival), *given[1:], "vase", there, 2).rivals
         assert said == pytest.approx(min(rival, ((1 + alike) / 2 - base) / times), abs=1e-3)
 
 

@@ -28,7 +28,7 @@ from langsplat_core.io.scenes import format_of
 from langsplat_core.pipeline.notebook import view_distance
 from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import count_things, run_phrase
+from langsplat_core.query.compose import count_instances, run_phrase
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine, searchable
 from langsplat_core.query.relations import body, gap, separate, upright
@@ -127,7 +127,7 @@ class Door:
         """Count what a phrase names, with the least and most there may be; 0 where it is not found."""
         engine = self.engine(scene)
         answer = run_phrase(engine, phrase, viewpoint=_first(engine.scene)).answer
-        number = count_things(engine, answer) if answer.found else None
+        number = count_instances(engine, answer) if answer.found else None
         counts = (0, 0, 0) if number is None else (number.best, number.least, number.most)
         return dict(zip(("count", "least", "most"), counts, strict=True)) | {"verdict": answer.verdict}
 
