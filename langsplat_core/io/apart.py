@@ -1,13 +1,13 @@
-"""A function in a process of its own, for native libraries that abort where they should raise.
+"""A function call in a process of its own, for native libraries that abort instead of raising.
 
-The process is a fresh interpreter, which knows nothing of this one but what it is given: the function, named
-by its module, and arguments, which are pickled, how much is said, and whether a loss is an error (--strict).
-Progress and messages come back while it runs. It ends with this process, however that ends (native code that
-holds the interpreter ends its call first), and at once where the work is cancelled.
+The process is a fresh interpreter. It gets the function, by module and name, the arguments, pickled, the log
+level, and whether a loss is an error (--strict). Progress and messages come back while it runs. It ends with
+this process, however that ends (after a call of native code that holds the interpreter lock), and at once if
+the work is cancelled.
 
-Not `concurrent.futures.ProcessPoolExecutor`: its processes import the caller's ``__main__`` anew, which a
-script without a guard does not survive; it does not say how a process ended, nor the last that it printed;
-and what it runs outlives a caller that is killed.
+`concurrent.futures.ProcessPoolExecutor` is not used: its processes import the caller's ``__main__`` again,
+which breaks scripts without a guard; it does not report how a process ended, nor its last output; and its
+processes outlive a caller that is killed.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ log = logging.getLogger("langsplat")
 
 
 class AbortedError(Exception):
-    """The process ended without a result; the message is how, and the last it said."""
+    """The process ended without a result; the message has the signal or exit code and its last output."""
 
 
 def run(
@@ -43,9 +43,9 @@ def run(
 ) -> Any:
     """Return what ``function(*arguments, progress)`` returns, or raise what it raises, in another process.
 
-    environment: variables of that process, beside those of this one. Raises AbortedError where the process
-    ended before. What `progress` raises ends the process. Where programs are frozen into one folder there is
-    no interpreter to start, and the function runs here.
+    environment: additional variables of that process. Raises AbortedError if the process ends without a
+    result. An exception in `progress` ends the process. In a frozen program there is no interpreter to start,
+    and the function runs in this process.
     """
     if getattr(sys, "frozen", False) or not sys.executable:
         return function(*arguments, progress)
@@ -58,13 +58,13 @@ def run(
             stdout=subprocess.PIPE,
             stderr=printed,
             env={**os.environ, **environment, **path},
-            start_new_session=True,  # Ctrl-C in the terminal is ours
+            start_new_session=True,  # Ctrl-C in the terminal goes to this process alone
         ) as process,
     ):
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            with contextlib.suppress(OSError):  # it has ended, which reading tells
+            with contextlib.suppress(OSError):  # it has ended, which the loop below reports
                 pickle.dump((log.getEffectiveLevel(), STRICTNESS.on, function, arguments), process.stdin)
                 process.stdin.flush()
             while True:
@@ -78,7 +78,7 @@ def run(
                     case _, (result, losses):
                         STRICTNESS.said.extend(losses)
                         return result
-        except (EOFError, pickle.UnpicklingError):  # it ended within or before a message
+        except (EOFError, pickle.UnpicklingError):  # it ended before or within a message
             code = process.wait()
             how = signal.Signals(-code).name if code < 0 else f"code {code}"
             how += ", as where memory runs out" if how == "SIGKILL" else ""
@@ -93,10 +93,10 @@ def run(
 
 
 def serve() -> None:
-    """Run in the other process what standard input brings, and write the result to standard output."""
+    """Run, in the other process, the call from standard input, and write its result to standard output."""
     given, out = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints is no message
-    # Windows would not load a library that looks at standard input while a thread waits for it.
+    os.dup2(2, 1)  # output of libraries must not mix with messages
+    # Windows does not load a library that inspects standard input while a thread waits for it.
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     lock = threading.Lock()
 
@@ -111,7 +111,7 @@ def serve() -> None:
             send("message", (record.levelno, "%s", record.getMessage()))
 
     def end_with_caller() -> None:
-        given.read(1)  # nothing, once the caller's end of the pipe is closed
+        given.read(1)  # returns when the caller's end of the pipe is closed
         os._exit(1)
 
     level, STRICTNESS.on, function, arguments = pickle.load(given)
@@ -122,10 +122,10 @@ def serve() -> None:
     progress = Progress(lambda at: send("progress", (at.stage, at.fraction, at.note, dict(at.metrics))))
     try:
         send("result", (function(*arguments, progress), STRICTNESS.said))
-    except Exception as error:  # noqa: BLE001  raised there instead
+    except Exception as error:  # noqa: BLE001  raised in the caller instead
         try:
             pickle.loads(pickle.dumps(error))
-        except Exception:  # noqa: BLE001  whatever its class does
+        except Exception:  # noqa: BLE001  its class may do anything
             error = RuntimeError(f"{type(error).__name__}: {error}")
         send("error", error)
-    os._exit(0)  # not past the thread that waits for input
+    os._exit(0)  # without joining the thread that waits for input

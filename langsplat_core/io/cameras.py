@@ -1,4 +1,4 @@
-"""Cameras as the INRIA code stores them beside a scene: `scene.cameras.json`.
+"""Camera files as the INRIA code writes them beside a scene: `scene.cameras.json`.
 
 A JSON list with one object per camera:
 
@@ -8,8 +8,8 @@ A JSON list with one object per camera:
     position      [x, y, z] of the camera in the world
     rotation      camera-to-world, three rows; OpenCV axes (x right, y down, z forward)
     fx, fy        pixels
-    cx, cy        pixels, principal point from the top left corner; ours, absent in INRIA's own files:
-                  then it is the middle
+    cx, cy        pixels, principal point from the top left corner, by default the centre; INRIA's own files
+                  do not have it
 """
 
 import json
@@ -28,10 +28,10 @@ from langsplat_core.scene import FARTHEST, Camera
 SUFFIX = ".cameras.json"
 SIZE_LIMIT = 64 * 1024 * 1024  # bytes; a camera takes about 500
 
-# A side of the image; beyond it a renderer would be asked for gigabytes
+# Side of an image; larger ones would make a renderer allocate gigabytes.
 Pixels = Annotated[float, Meta(ge=1, le=1 << 16, multiple_of=1)]
 Coordinate = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]
-Cosine = Annotated[float, Meta(ge=-2, le=2)]  # generously: the camera judges
+Cosine = Annotated[float, Meta(ge=-2, le=2)]  # only a coarse bound: `Camera` checks rotations
 Row = tuple[Cosine, Cosine, Cosine]
 
 
@@ -48,7 +48,7 @@ class _Entry(Struct):
 
 
 def read_cameras(path: Path | str) -> tuple[Camera, ...]:
-    """Return the cameras in the file, in its order, and report losses; InputError and FormatError."""
+    """Return the cameras in a file, in order, and report losses. Raises InputError and FormatError."""
     path = Path(path)
     text = read_file(path, SIZE_LIMIT)
     entries = decode_json(text, list[_Entry], path)
@@ -81,7 +81,7 @@ def _camera(entry: _Entry, what: str) -> Camera:
     """Return the camera of an entry; `what` names the file and the camera in messages."""
     rotation = np.array(entry.rotation)
     pose = affine(rotation.T, -rotation.T @ np.array(entry.position))
-    # Newer INRIA files keep the photograph's suffix; a name such as "frame.01" must keep its own dot.
+    # Newer INRIA files have the photograph's suffix; the dot in a name such as "frame.01" is kept.
     name = entry.img_name
     ending = next((suffix for suffix in PHOTO_SUFFIXES if name.lower().endswith(suffix)), "")
     cx = entry.width / 2 if entry.cx is None else entry.cx
@@ -89,5 +89,5 @@ def _camera(entry: _Entry, what: str) -> Camera:
     size = int(entry.width), int(entry.height)
     try:
         return Camera(*size, entry.fx, entry.fy, cx, cy, pose, name[: len(name) - len(ending)])
-    except ValueError as error:  # what the camera itself refuses: fx of 0, for one
+    except ValueError as error:  # such as fx = 0
         raise malformed(what, f"{error}") from None

@@ -1,4 +1,4 @@
-"""How files are written, whole or not at all; and checks of where none can be written."""
+"""Atomic writing of files, and checks that a path can be written."""
 
 import errno
 import json
@@ -20,12 +20,12 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-TEMPORARY = ".writing-"  # how names of files begin that are not written whole yet
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # where a disk is full, or broken
-# Names that Windows does not take, or takes for a device.
+TEMPORARY = ".writing-"  # prefix of names of temporary files
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # errors of a full or broken disk
+# Names that Windows refuses or takes for a device.
 _NOT_OF_WINDOWS = re.compile(r"""(?i)[<>:"|?*\0-\x1f]|[. ]$|^(con|prn|aux|nul|(com|lpt)[1-9]) *(\.|$)""")
 _UMASK = os.umask(0o077)
-os.umask(_UMASK)  # the only way to ask is to change it
+os.umask(_UMASK)  # it can only be read by changing it
 
 
 @contextmanager
@@ -33,8 +33,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary name beside `path`; on a clean exit it is renamed to `path`, else removed.
 
     The temporary name keeps the suffix, because some writers choose the format by it. A symbolic link stays
-    one, and a file its mode and group and, where it may be written, its other names. Where the disk takes no
-    more, an OSError with `path` comes out, whatever the writer said; none names the temporary file.
+    one; a file keeps its mode, its group and, if it is writable, its hard links. If the disk is full, an
+    OSError with `path` is raised, whatever the writer raised; no error names the temporary file.
     """
     target = Path(path)
     suffix = target.suffix if len(os.fsencode(target.suffix)) <= 64 else ""  # else the name may be too long
@@ -51,7 +51,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         if not (place.is_file() and place.stat().st_nlink > 1 and _filled(place, temporary)):
             _take_rights(temporary, place)
             patiently(lambda: temporary.replace(place))
-    except LangSplatError as error:  # which may name what is written: by the name that the user knows
+    except LangSplatError as error:  # its message may have the temporary name
         error.args = tuple(str(part).replace(str(temporary), str(target)) for part in error.args)
         raise
     except Exception as error:
@@ -59,7 +59,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         if cause is None and isinstance(error, OSError) and error.errno and error.filename == name:
             cause = error
         if cause is None or getattr(error, "filename", None) not in (None, name):
-            raise  # the second names another file already, of those that are written together
+            raise  # as it is; also if it names another file of those that are written together
         raise OSError(cause.errno, cause.strerror, str(target)) from error
     finally:
         with suppress(PermissionError):
@@ -67,9 +67,9 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 
 def patiently(step: Callable[[], object]) -> object:
-    """Replace or remove a file; Windows refuses that as long as another program has it open.
+    """Call `step`, which replaces or removes a file, again if Windows refuses because the file is open.
 
-    A window that looks at a training's checkpoint has it for a moment, and so have scanners for viruses.
+    A window that reads a checkpoint of a training opens it for a moment, and so do virus scanners.
     """
     for wait in (0.05, 0.2, 0.8) if sys.platform == "win32" else ():
         with suppress(PermissionError):
@@ -83,15 +83,15 @@ def _take_rights(temporary: Path, place: Path) -> None:
     try:
         before = place.stat()
     except OSError:
-        temporary.chmod(0o666 & ~_UMASK)  # mkstemp makes private files; ours are ordinary ones
+        temporary.chmod(0o666 & ~_UMASK)  # mkstemp makes private files
         return
-    with suppress(OSError, AttributeError):  # a group that one is not of; Windows
+    with suppress(OSError, AttributeError):  # another group; Windows
         os.chown(temporary, -1, before.st_gid)
     temporary.chmod(stat.S_IMODE(before.st_mode))
 
 
 def _filled(place: Path, temporary: Path) -> bool:
-    """Write a file's content into one with other names, which keeps them; False where one may not."""
+    """Copy a file's content into `place`, which keeps its hard links; False if it is not writable."""
     try:
         file = place.open("r+b")
     except OSError:
@@ -99,7 +99,7 @@ def _filled(place: Path, temporary: Path) -> bool:
     with file, temporary.open("rb") as source:
         size, before = os.fstat(source.fileno()).st_size, os.fstat(file.fileno()).st_size
         try:
-            if size > before and hasattr(os, "posix_fallocate"):  # what has no room leaves the old content
+            if size > before and hasattr(os, "posix_fallocate"):  # a full disk leaves the old content
                 os.posix_fallocate(file.fileno(), 0, size)
         except OSError:
             file.truncate(before)
@@ -110,19 +110,19 @@ def _filled(place: Path, temporary: Path) -> bool:
 
 
 def write_whole(path: Path | str, content: str | bytes) -> None:
-    """Write a file, text as UTF-8, whole or not at all."""
+    """Write a file atomically, text as UTF-8."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def write_json(path: Path, content: object) -> None:
-    """Write a value as a JSON file, whole or not at all."""
+    """Write a value as a JSON file, atomically."""
     write_whole(path, json.dumps(content, indent=1) + "\n")
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Wait until nobody else is in such a block of the same `folder`; without locks all go on at once."""
+    """Hold an exclusive lock on `folder` within the block; systems without file locks do not wait."""
     handle = -1
     if fcntl is not None:
         with suppress(OSError):
@@ -136,7 +136,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _no_room(error: Exception, temporary: Path) -> OSError | None:
-    """Return the system's error where writing `temporary` failed by a full disk, whatever `error` says."""
+    """Return the system's error if writing `temporary` failed for a full disk, whatever `error` is."""
     if isinstance(error, OSError) and error.errno is not None:
         return error if error.errno in NO_ROOM else None
     said = re.search(r"\(os error (\d+)\)", str(error))  # a library in Rust, such as safetensors
@@ -151,11 +151,10 @@ def _no_room(error: Exception, temporary: Path) -> OSError | None:
 
 
 def check_output_file(path: Path | str) -> None:
-    """Raise InputError, in one line, where no file can be written at `path`.
+    """Raise InputError, in one line, if no file can be written at `path`.
 
-    That is a name that the file system does not take, a folder, a place under a file, in the system's own
-    folders, or where one may not write. Folders that are missing will be made; nothing is left behind by the
-    check.
+    The reason may be a name that the file system refuses, a folder of that name, a file in place of a parent
+    folder, a folder of the system, or permissions. Missing folders are no error; the check leaves no files.
     """
     mode = _checked(Path(path))
     if stat.S_ISDIR(mode):
@@ -165,25 +164,25 @@ def check_output_file(path: Path | str) -> None:
 
 
 def check_output_folder(path: Path | str) -> None:
-    """Raise InputError where files cannot be written into a folder, which may be missing yet."""
+    """Raise InputError if files cannot be written into a folder, which need not exist yet."""
     mode = _checked(Path(path))
     if mode and not stat.S_ISDIR(mode):
         raise InputError(f"{shown(path)}: is a file; name a folder")
 
 
 def is_utf8(path: Path | str) -> bool:
-    """Return False for a name of bytes that are no text, which neither a window nor JSON can hold."""
+    """Return False for a path of bytes that are no UTF-8, which neither the window nor JSON can show."""
     return not re.search("[\\ud800-\\udfff]", str(path))
 
 
 def shown(path: Path | str) -> str:
-    """Return a path for a message: printable, and without its middle where it is long."""
+    """Return a path for a message: printable, a long one without its middle."""
     text = str(path).encode("utf-8", "backslashreplace").decode()
     return text if len(text) <= 100 else f"{text[:50]}...{text[-47:]}"
 
 
 def _checked(target: Path) -> int:
-    """Return the mode of what is at `target`, 0 for nothing; InputError where nothing can be written."""
+    """Return the mode of what is at `target`, 0 for nothing; InputError if it cannot be written."""
     try:
         os.fsencode(target)
         str(target).encode()
@@ -191,7 +190,7 @@ def _checked(target: Path) -> int:
         whole = Path(os.path.abspath(target))
         folder = next((above for above in whole.parents if os.path.lexists(above)), Path(whole.anchor))
         for part in whole.relative_to(folder).parts:
-            _mode(folder / part)  # whether the file system takes the name
+            _mode(folder / part)  # raises if the file system refuses the name
             if sys.platform == "win32" and _NOT_OF_WINDOWS.search(part):
                 raise OSError(errno.EINVAL, "no name on Windows")
     except UnicodeEncodeError:
@@ -205,12 +204,12 @@ def _checked(target: Path) -> int:
         raise InputError(f"{shown(target)}: cannot be written ({error.strerror}); choose another") from None
     if not os.path.isdir(folder):
         raise InputError(f"{shown(target)}: {shown(folder)} is a file, not a folder; choose another name")
-    # Where files are none: what is written there is read by the system or by nobody, and is gone afterwards.
+    # Files in these folders are not stored: they control the system or vanish.
     real = Path(os.path.realpath(target))
     system = any(real.is_relative_to(place) for place in ("/proc", "/sys", "/dev"))
     if system and not real.is_relative_to("/dev/shm"):
         raise InputError(f"{shown(target)}: lies in a folder of the system's own; choose another")
-    if os.path.islink(target):  # which writing follows
+    if os.path.islink(target):  # writing follows links
         folder = next((above for above in real.parents if os.path.lexists(above)), folder)
     try:
         with tempfile.TemporaryFile(dir=target if stat.S_ISDIR(mode) else folder):
@@ -223,7 +222,7 @@ def _checked(target: Path) -> int:
 
 
 def _mode(path: Path) -> int:
-    """Return the mode of what is at `path`, 0 for nothing; OSError for a name that cannot be."""
+    """Return the mode of what is at `path`, 0 for nothing; OSError for an impossible name."""
     try:
         return os.stat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):

@@ -1,16 +1,16 @@
 """glTF 2.0 with KHR_gaussian_splatting: .glb (one binary file) and .gltf (JSON; buffers inside or beside).
 
 Gaussians are a primitive of points with the attributes POSITION and, under the extension's prefix, ROTATION
-(unit quaternion xyzw), SCALE (world units, not logarithms), OPACITY (0 to 1) and SH_DEGREE_l_COEF_n. glTF is
-left, up, front where the PLY is right, down, front: half a turn about z, which changes signs alone. Nodes
-place primitives; all Gaussians of the default scene are read, in the order of its nodes. A primitive may hold
-an .spz file instead (KHR_gaussian_splatting_compression_spz and _spz_2).
+(unit quaternion xyzw), SCALE (world units, not logarithms), OPACITY (0 to 1) and SH_DEGREE_l_COEF_n. Axes of
+glTF are left, up, front, those of the PLY right, down, front: half a turn about z, which only changes signs.
+Nodes place primitives; all Gaussians of the default scene are read, in the order of its nodes. A primitive
+may hold an .spz file instead (KHR_gaussian_splatting_compression_spz and _spz_2).
 
-In a file of ours the node stands the scene upright, y up, in metres where the scale is known. Its extras
-say what is needed to take that back, which is done as long as nobody has moved the node.
+In files of this program the node turns the scene upright, y up, and scales it to metres if the scale is
+known. Its extras have what is needed to undo that, which is done unless the node was moved.
 
-Drafts of the extension stored SCALE as logarithms: a file with a negative scale is taken for such a one. What
-of a file is none of this is passed over, which is said.
+Drafts of the extension stored SCALE as logarithms: a negative scale marks such a file. All other content is
+ignored and reported.
 Source: Khronos' public specification of the extension, as ratified in 2026.
 """
 
@@ -56,14 +56,14 @@ POINTS = 0  # mode of a primitive
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
-JSON_LIMIT = 16 << 20  # bytes; ours has 10 kB
+JSON_LIMIT = 16 << 20  # bytes; files of this program have 10 kB
 MOST_NODES = 1 << 16
-SIGNS = np.array([-1, -1, 1], np.float32)  # left up front to right down front, and back
-OWN = "langsplat"  # among the extras of a node
+SIGNS = np.array([-1, -1, 1], np.float32)  # left, up, front to right, down, front, and back
+OWN = "langsplat"  # key in the extras of a node
 SRGB = "srgb_rec709_display"
-HOW = ("ellipse", "cameraDistance", "perspective")  # are Gaussians drawn here: kernel, order, projection
+HOW = ("ellipse", "cameraDistance", "perspective")  # kernel, order and projection of this program
 
-# What is read of the JSON; entries that are not named here are passed over.
+# Entries of the JSON that are read.
 
 Index = Annotated[int, Meta(ge=0, lt=2**40)]
 Number = Annotated[float, Meta(ge=-1e30, le=1e30)]
@@ -120,7 +120,7 @@ class _Node(Struct):
 
 
 class Kept(Struct):
-    """What the extras of a node keep of a scene, beside the node's own matrix as it was written."""
+    """Properties of a scene in the extras of a node, and the node's matrix as it was written."""
 
     matrix: list[Number] | None = None
     origin: tuple[Number, Number, Number] = (0, 0, 0)
@@ -128,7 +128,7 @@ class Kept(Struct):
     antialiased: bool = False
 
     def given(self, scene: Scene) -> Scene:
-        """Return the scene, read without its matrix, with what is kept of it."""
+        """Return the scene, read without the node's matrix, with these properties."""
         metres, origin = self.metres_per_unit, np.array(self.origin)
         return replace(scene, antialiased=self.antialiased, metres_per_unit=metres, origin=origin)
 
@@ -153,17 +153,16 @@ class _Content(Struct, rename="camel"):
     scenes: list[_Scene] = []
 
 
-# "materials" are of meshes; with Gaussians they say what a viewer without the extension draws.
+# Known entries. "materials" are of meshes, or for viewers without the extension.
 ENTRIES = {*_Content.__struct_encode_fields__, *_About.__struct_encode_fields__, "materials"}
 
 
-@np.errstate(all="ignore")  # whatever numbers a file holds: rows that come out unsound are not drawn
+@np.errstate(all="ignore")  # rows of invalid numbers are not drawn
 def read_gltf_scene(path: Path | str) -> Scene:
     """Return all Gaussians of the default scene of a .glb or .gltf file.
 
-    They are drawn antialiased where all come from .spz files that say so. Raises InputError when a file
-    cannot be opened and FormatError when it breaks a rule of the format, needs an extension that is not known
-    here, or holds no Gaussians.
+    `antialiased` is set if all come from .spz files with that flag. Raises InputError if a file cannot be
+    opened and FormatError if it breaks a rule of the format, needs an unknown extension, or has no Gaussians.
     """
     path = Path(path)
     file = _File(path)
@@ -180,10 +179,10 @@ def read_gltf_scene(path: Path | str) -> Scene:
 
 @np.errstate(all="ignore")
 def placed_scene(path: Path, parts: Iterable[tuple[Array, Gaussians]]) -> Scene:
-    """Return the scene of Gaussians along axes as glTF's, each with the (4, 4) matrix of its place there."""
+    """Return the scene of `parts`: Gaussians in glTF's axes, each with a (4, 4) matrix that places them."""
     middle, placed = None, []
     for matrix, gaussians in parts:
-        if middle is None:  # positions are about the first: in the world float32 may be too coarse
+        if middle is None:  # positions are relative to the first: world positions may exceed float32
             middle = matrix[:3, 3].copy()
         try:
             place = similarity(matrix).then(moving(-middle))
@@ -198,7 +197,7 @@ def placed_scene(path: Path, parts: Iterable[tuple[Array, Gaussians]]) -> Scene:
 
 
 def _parts(file: "_File") -> Iterator[tuple[Array, Gaussians]]:
-    """Yield the Gaussians of every primitive, in glTF's axes, and the matrix of its place."""
+    """Yield the Gaussians of every primitive, in glTF's axes, and the matrix that places them."""
     for matrix, primitive in _placed(file):
         if EXTENSION not in primitive.extensions:
             file.bare += 1
@@ -215,7 +214,7 @@ def _parts(file: "_File") -> Iterator[tuple[Array, Gaussians]]:
         )
         if packed is not None:
             data = bytes(file.view(packed)[0])
-            file.room.take(1 << 16)  # the time of small ones counts too
+            file.room.take(1 << 16)  # bounds the number of small ones, too
             inside = decode_spz(data, file.path, file.room, file.told.append)
             gaussians = mirrored(inside.gaussians, SIGNS)
             file.antialiased.add(inside.antialiased)
@@ -226,7 +225,7 @@ def _parts(file: "_File") -> Iterator[tuple[Array, Gaussians]]:
 
 
 def _placed(file: "_File") -> Iterator[tuple[Array, _Primitive]]:
-    """Yield the primitives and the matrix of their place. A node has one parent at most."""
+    """Yield the primitives and the matrices that place them; FormatError if a node has two parents."""
     content = file.content
     roots = content.scenes[content.scene or 0].nodes if content.scenes else range(len(content.nodes))
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
@@ -259,7 +258,7 @@ def _matrix(node: _Node) -> Array:
 
 
 def _gaussians(file: "_File", attributes: dict[str, int]) -> Gaussians:
-    """Gaussians along glTF's axes."""
+    """Return Gaussians in glTF's axes."""
     count = file.content.accessors[attributes["POSITION"]].count
 
     def column(name: str, width: int) -> Array:
@@ -284,19 +283,19 @@ def _gaussians(file: "_File", attributes: dict[str, int]) -> Gaussians:
 
 
 class _File:
-    """The JSON of a glTF file and its buffers, whose every entry is checked when it is asked for."""
+    """The JSON of a glTF file and its buffers; entries are checked when they are read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.told: list[str] = []  # of what is passed over or guessed
-        self.others: set[str] = set()  # attributes, extensions and ways of drawing that are not known
+        self.told: list[str] = []  # lines about what was ignored or guessed
+        self.others: set[str] = set()  # unknown attributes, extensions and ways of drawing
         self.bare = 0  # placed primitives without Gaussians
         self.shown: set[int] = set()  # meshes that nodes place
-        self.antialiased: set[bool] = set()  # what primitives say
-        self.kept: Kept | None = None  # of a scene of ours, where its node is as it was
+        self.antialiased: set[bool] = set()  # flags of primitives
+        self.kept: Kept | None = None  # of a scene of this program whose node was not moved
         text = memoryview(hostile.read_file(path, 2**32))
         self._binary = text[:0]
-        # Numbers as they are stored, which an honest file shows once or a few times; Gaussians packed in it
+        # Allowances for plain numbers, which real files use once or a few times, and for packed Gaussians
         self._shown = hostile.Allowance(path, len(text), 1, hostile.FREE // 4)
         self.room = hostile.Allowance(path, len(text), hostile.SMALL_RATIO)
         self._buffers: dict[int, bytes | memoryview] = {}
@@ -321,7 +320,7 @@ class _File:
         self.told.append(hostile.other_entries(bytes(text), ENTRIES, path))
 
     def losses(self) -> Iterator[str]:
-        """Yield what of the file was passed over or guessed, once its Gaussians are read."""
+        """Yield lines about what was ignored or guessed, after the Gaussians were read."""
         yield from dict.fromkeys(self.told)
         yield unread("", self.others)
         if self.bare:
@@ -346,7 +345,7 @@ class _File:
         stride = stride or row
         if not row <= stride <= max(row, 252) or offset + stride * (count - 1) + row > len(data):
             raise malformed(self.path, f"truncated: {name} of {count} Gaussians does not fit its buffer")
-        self._shown.take(max(count * row, 512))  # the time of small ones counts too
+        self._shown.take(max(count * row, 512))  # bounds the number of small ones, too
         shape, strides = (count, width), (stride, dtype.itemsize)
         values: Array = np.ndarray(shape, dtype, data, offset, strides).astype(np.float32)
         if about.normalized and dtype.kind in "iu":
@@ -354,7 +353,7 @@ class _File:
         return values
 
     def view(self, index: int) -> tuple[memoryview, int]:
-        """Return the bytes of a buffer view and its stride, 0 where rows follow each other."""
+        """Return the bytes of a buffer view and its stride, 0 for contiguous rows."""
         about = self.content.buffer_views[index]
         data = memoryview(self._buffer(about.buffer))[about.byte_offset :][: about.byte_length]
         if len(data) < about.byte_length:
@@ -384,26 +383,26 @@ class _File:
 def write_gltf(path: Path | str, scene: Scene) -> None:
     """Write a .glb, or a .gltf with its buffer inside, atomically; rows keep their order.
 
-    Positions and colours are exact, scales, quaternions (normalised) and opacities to float32. COLOR_0 shows
-    points of the base colour, as light, in programs that do not know the extension. A row that cannot be
-    drawn is written with opacity 0. Raises InputError for more than a .glb can hold, 4 GiB.
+    Positions and colours are exact; scales, quaternions (normalised) and opacities are rounded to float32.
+    COLOR_0 is the linear base colour of points, for programs without the extension. A row that cannot be
+    drawn is written with opacity 0. Raises InputError beyond the 4 GiB of a .glb.
     """
     file, gaussians = GltfWriter(EXTENSION), scene.gaussians
     if len(gaussians):
-        says = {"kernel": "ellipse", "colorSpace": SRGB}
-        says |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
         columns = attributes_of(gaussians).items()
         attributes = {name: file.add(values, name == "POSITION") for name, values in columns}
-        primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: says}}
+        splatting = dict(zip(("kernel", "sortingMethod", "projection"), HOW, strict=True))
+        extensions = {EXTENSION: splatting | {"colorSpace": SRGB}}
+        primitive = {"attributes": attributes, "mode": POINTS, "extensions": extensions}
         file.add_mesh(primitive, **node_of(scene))
     file.write(Path(path))
 
 
 def node_of(scene: Scene) -> dict[str, Any]:
-    """Return the entries of the node of what lies in a scene, with the `SIGNS` of glTF, about its origin.
+    """Return the entries of the node of a scene, whose content is in glTF's axes relative to its origin.
 
-    Its matrix turns the scene's up to y, and makes metres of units where the scale is known; extras keep
-    what this program needs to take that back.
+    Its matrix turns the scene's up to y, and scales to metres if the scale is known; its extras have what is
+    needed to undo that.
     """
     turn = turning(SIGNS * scene.up(), AXES["y"])
     there = turn.then(moving(turned_origin(turn.rotation * SIGNS, scene.origin)))
@@ -415,7 +414,7 @@ def node_of(scene: Scene) -> dict[str, Any]:
 
 
 class GltfWriter:
-    """A glTF file that is made: its nodes, each with a mesh, and their one buffer."""
+    """A glTF file under construction: nodes with a mesh each, and one buffer."""
 
     def __init__(self, extension: str) -> None:
         self._content: dict[str, Any] = {
@@ -430,7 +429,7 @@ class GltfWriter:
     def add(self, values: Array, bounded: bool = False) -> int:
         """Append (N,) or (N, k) values, N > 0, and return the index of their accessor.
 
-        Small integers are fractions of their largest; `bounded` states least and greatest values.
+        Integers of less than 4 bytes are marked as normalised; bounded: with least and greatest values.
         """
         block = np.ascontiguousarray(values)
         views, accessors = (self._content.setdefault(key, []) for key in ("bufferViews", "accessors"))
@@ -478,7 +477,7 @@ class GltfWriter:
 
 
 def attributes_of(gaussians: Gaussians) -> dict[str, Array]:
-    """Attribute -> (N, ...) values along glTF's axes; rows that cannot be drawn are harmless."""
+    """Return attribute -> (N, ...) values in glTF's axes; rows that cannot be drawn get opacity 0."""
     valid = gaussians.valid()
     keep = valid[:, None]
     turned = mirrored(gaussians, SIGNS)

@@ -1,7 +1,6 @@
-"""Files that nobody vouches for: arrays, JSON, archives and images.
+"""Readers of untrusted files: arrays, JSON, archives and images.
 
-Whatever is wrong with one is a single InputError or FormatError, and no memory is taken on the word of a
-header.
+Any fault is a single InputError or FormatError, and no memory is allocated for what only a header claims.
 """
 
 import io
@@ -38,43 +37,43 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS
 
 T = TypeVar("T")
-CONTROL = re.compile(r"[\0-\x08\x0e-\x1a\x1c-\x1f]")  # characters that no text has
+CONTROL = re.compile(r"[\0-\x08\x0e-\x1a\x1c-\x1f]")  # characters that are in no text
 COMMA = re.compile(r"(?<![\w.,])[-+]?\d+,\d+(?![\w,])")
 
-# ---- memory: what a file decodes to is counted against the bytes that it has, before it is held ----
+# ---- memory: decoded sizes are checked against the size of the file before allocation ----
 
 FREE = 48 << 20  # bytes that any file may decode to
-# Bytes in memory for each of the file: arrays as they are, or of 8 bits widened to 32; and rows of Gaussians
-# whose formats are made to be small. Honest files of these have 8 to 20; a deflated hole has 1000.
+# Bytes in memory per byte of the file: for plain arrays (8 bits may be widened to 32), and for compressed
+# formats of Gaussians, where real files have 8 to 20 and deflated zeros 1000.
 PLAIN_RATIO, SMALL_RATIO = 4, 32
 
 
 class Allowance:
-    """Budget of what one file may still decode to; it becomes less as its parts are read."""
+    """Number of bytes that one file may still decode to."""
 
     def __init__(self, path: object, size: int, ratio: int = PLAIN_RATIO, free: int = FREE) -> None:
-        """path: for messages; size: of the file, bytes as they lie on the disk."""
+        """path: for messages; size: of the file on disk, bytes."""
         self._path, self._size, self.left = path, size, free + ratio * size  # left: bytes
 
     def take(self, size: int) -> None:
-        """Count `size` bytes before they are held; FormatError where the file is too small for them."""
+        """Count `size` bytes before they are allocated; FormatError if the file is too small for them."""
         self.left -= size
         if self.left < 0:
             what = f"its {self._size} bytes unfold to far more than files of this kind do"
             raise malformed(self._path, f"truncated, or made to exhaust memory: {what}")
 
     def take_gaussians(self, count: int, sh_degree: int) -> None:
-        """Count whole rows of Gaussians, as they are once decoded."""
+        """Count the decoded rows of Gaussians."""
         self.take(4 * count * (11 + 3 * SH_COUNTS[sh_degree]))
 
 
-# ---- .npy and .npz: plain numbers or texts, read without pickles and without belief in their headers ----
+# ---- .npy and .npz: plain numbers or texts, read without pickles, with checked headers ----
 
 
 def write_npy(path: Path, array: Array, behind: bytes = b"") -> None:
-    """Write an array of numbers, and what NumPy passes over `behind` it, whole or not at all.
+    """Write an array of numbers atomically, with bytes `behind` it that NumPy does not read.
 
-    `np.save` hands the numbers to C's library, and where the disk takes all but the end nobody is told.
+    `np.save` writes through C's library and does not report a disk that is full just before the end.
     """
     whole = np.asarray(array, order="C")
     header = np.lib.format.header_data_from_array_1_0(whole)
@@ -85,7 +84,7 @@ def write_npy(path: Path, array: Array, behind: bytes = b"") -> None:
 
 
 def read_npy(path: Path) -> Array:
-    """Return the array of numbers in a .npy file; InputError where it cannot be opened, else FormatError."""
+    """Return the array of numbers in a .npy file; InputError if it cannot be opened, else FormatError."""
     file, size = open_for_reading(path)
     with file:
         return _parse(file, size, str(path))
@@ -103,13 +102,13 @@ def read_npz(path: Path, free: int = FREE) -> dict[str, Array]:
 
 
 def _parse(file: BinaryIO, size: int, name: str, whole: bytes | None = None) -> Array:
-    """`numpy.load` of at most `size` bytes of `file`; name: for messages; whole: its content in memory."""
+    """Return the array in `size` bytes of `file`; name: for messages; whole: its content, if in memory."""
     form = np.lib.format
     try:
-        if form.read_magic(file) != (1, 0):  # as NumPy writes all but records of thousands of columns
+        if form.read_magic(file) != (1, 0):  # later versions are for records of thousands of columns
             raise ValueError("version")
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # a header of Python 2, which NumPy mends with a warning
+            warnings.simplefilter("error")  # NumPy repairs headers of Python 2 with a warning
             shape, in_columns, dtype = form.read_array_header_1_0(file)
         plain = (dtype.kind in "iuf" and dtype.itemsize <= 8) or (dtype.kind == "U" and dtype.itemsize > 0)
         if not plain or dtype.subdtype is not None or min(shape, default=0) < 0:
@@ -127,7 +126,7 @@ def _parse(file: BinaryIO, size: int, name: str, whole: bytes | None = None) -> 
     return data.reshape(shape, order="F" if in_columns else "C")
 
 
-# ---- opening a file and JSON, with every way it can fail as one line for the user ----
+# ---- opening a file and JSON, with one line for the user for every way it can fail ----
 
 
 def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
@@ -151,12 +150,12 @@ def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
 
 
 class FromFile(str):
-    """A text that a file states: it may name what is here, and starts no request and expands no `~`."""
+    """A name from a file: it may be a local path, but causes no network request and no expansion of `~`."""
 
 
 def is_plain_name(name: object) -> bool:
-    """Return whether a name in a file is one of a file beside it: a path could lead out of its folder."""
-    fits = isinstance(name, str) and 0 < len(name) < 256  # what file systems have room for
+    """Return True if a name in a file is that of a file beside it: a path could leave the folder."""
+    fits = isinstance(name, str) and 0 < len(name) < 256  # limit of file systems
     return fits and name not in (".", "..") and not set(str(name)) & set("/\\:\0")
 
 
@@ -175,10 +174,10 @@ def read_text(path: Path, limit: int = 64 * 1024 * 1024) -> str:
 
 
 def decode_text(data: bytes, path: Path) -> str:
-    r"""Return the text of a file of any maker, with "\n" at the ends of its lines.
+    r"""Return the text of a file of any program, with "\n" at the ends of lines.
 
-    It is UTF-8, UTF-16 or UTF-32, with a byte order mark or without. What is none of these is read in the
-    code page of Western Windows, which is a guess and reported as one; FormatError for what is no text.
+    It is UTF-8, UTF-16 or UTF-32, with or without a byte order mark. Other bytes are read as Windows-1252,
+    which is reported as a guess; FormatError if they are no text.
     """
     try:
         text = data.decode(json.detect_encoding(data))
@@ -193,7 +192,7 @@ def decode_text(data: bytes, path: Path) -> str:
 
 
 def decode_name(data: bytes) -> str:
-    """Return a text in UTF-8, or else in the code page of Western Windows."""
+    """Return bytes as text, in UTF-8 or else in Windows-1252."""
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -201,7 +200,7 @@ def decode_name(data: bytes) -> str:
 
 
 def decimal_comma(text: object) -> str:
-    """Return what to say behind a complaint about a number that is written with a comma; "" for others."""
+    """Return the hint for a message about a number with a decimal comma; "" for other texts."""
     return "; numbers need a decimal point, not a comma" if COMMA.search(str(text)) else ""
 
 
@@ -211,7 +210,7 @@ def read_json_file(path: Path, limit: int) -> Any:
     with _as_json(path):
         _check_values(data, path)
         text = decode_text(data, path)
-        # an integer of 400 digits has no float, and half a character no window can show
+        # `int` of many digits is slow or too large for a float; half a surrogate pair cannot be shown
         value = json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 20 else float(digits))
         if re.search(r"\\u[dD][89a-fA-F]", text):
             json.dumps(value, ensure_ascii=False).encode()
@@ -219,26 +218,26 @@ def read_json_file(path: Path, limit: int) -> Any:
 
 
 def decode_json(text: bytes, kind: type[T], path: Path) -> T:
-    """Return the value of a JSON text, which has to fit the msgspec structure `kind`; FormatError."""
+    """Return the value of a JSON text as the msgspec structure `kind`; FormatError if it does not fit."""
     with _as_json(path):
         _check_values(text, path)
         return msgspec.json.decode(text.decode(json.detect_encoding(text)), type=kind)
 
 
 def other_entries(text: bytes, known: Collection[str], path: Path) -> str:
-    """Return, for `report_losses`, which entries of a JSON object are none of `known`; FormatError."""
+    """Return, for `report_losses`, the entries of a JSON object that are not in `known`; FormatError."""
     entries = decode_json(text, dict[str, msgspec.Raw], path)
     return unread("entries", (quoted(name, 40) for name in entries if name not in known))
 
 
 def _check_values(text: bytes, path: Path) -> None:
-    """Count the values of a JSON text: a dictionary of three letters takes 240 bytes, a list 64."""
+    """Check the memory of the values of a JSON text: an empty dictionary takes 240 bytes, a list 64."""
     Allowance(path, len(text)).take(40 * text.count(b",") + 240 * text.count(b"{") + 64 * text.count(b"["))
 
 
 @contextmanager
 def _as_json(path: Path) -> Iterator[None]:
-    """Turn what bad syntax, endless nesting and digits, and unfitting values raise into FormatError."""
+    """Turn errors of syntax, of deep nesting, long numbers and unfitting values into FormatError."""
     try:
         yield
     except LangSplatError:
@@ -247,14 +246,14 @@ def _as_json(path: Path) -> Iterator[None]:
         raise malformed(path, f"not readable as JSON ({printable_line(error, 100)})") from None
 
 
-# ---- zip archives, without belief in their directories ----
+# ---- zip archives, with checked directories ----
 #
-# `zipfile` lets through what its decompressors and its own parsing meet in damaged archives (LZMAError,
+# For damaged archives `zipfile` raises whatever its decompressors and its parser raise (LZMAError,
 # IndexError, struct.error, NotImplementedError, zlib.error ...), so every exception here means an unreadable
 # archive. Only stored and deflated members are unpacked: no format that is read here uses other methods.
 
 
-MOST_DIRECTORY = 4 << 20  # bytes, in 40 000 names; zipfile makes objects of ten times the size
+MOST_DIRECTORY = 4 << 20  # bytes, for 40 000 names; zipfile's objects take ten times as much
 
 
 class Archive:
@@ -263,14 +262,14 @@ class Archive:
     def __init__(self, archive: zipfile.ZipFile, path: Path, size: int, free: int) -> None:
         self._archive, self.path, self.size = archive, path, size  # size of the file, bytes
         self.names = archive.namelist()
-        self.deflated = any(info.compress_type for info in archive.infolist())  # some, or packed otherwise
+        self.deflated = any(info.compress_type for info in archive.infolist())  # True if any is compressed
         self._room = Allowance(path, size, free=free)
 
     def read(self, name: str, limit: int) -> bytes:
         """Return the content of a member.
 
-        FormatError where there is none, or where it unfolds to more than `limit` bytes or all that are read
-        together to more than the archive has room for, which is noticed before more are held.
+        FormatError if there is none, if it has more than `limit` bytes, or if all that were read exceed the
+        allowance of the archive; no more than that is unpacked.
         """
         try:
             info = self._archive.getinfo(name)
@@ -289,7 +288,7 @@ class Archive:
 
 @contextmanager
 def opened_archive(path: Path, kind: str, free: int = FREE) -> Iterator[Archive]:
-    """Open an archive; `kind`: for messages, `free`: as of `read_npz`; InputError, inside FormatError."""
+    """Open an archive; kind: for messages; free: as in `read_npz`. InputError; in the block FormatError."""
     file, size = open_for_reading(path)
     with file:
         try:
@@ -298,13 +297,13 @@ def opened_archive(path: Path, kind: str, free: int = FREE) -> Iterator[Archive]
                 yield Archive(archive, path, size, free)
         except LangSplatError:
             raise
-        except Exception as error:  # noqa: BLE001  any at all, see the top of this file
+        except Exception as error:  # noqa: BLE001  any at all, see above
             what = str(error)[:80] or type(error).__name__
             raise malformed(path, f"not a readable {kind} ({what})") from None
 
 
 def _check_directory(file: BinaryIO, size: int) -> None:
-    """Raise ValueError for a directory of so many members that their objects would fill the memory."""
+    """Raise ValueError for a directory of more than `MOST_DIRECTORY` bytes."""
     file.seek(max(0, size - (1 << 16) - 98))
     tail = file.read()
     for signature, form, at in ((b"PK\5\6", "<I", 12), (b"PK\6\6", "<Q", 40)):
@@ -317,29 +316,29 @@ def _check_directory(file: BinaryIO, size: int) -> None:
             raise ValueError(f"a directory of more than {MOST_DIRECTORY} bytes")
 
 
-# ---- images: the one place of the project that hands a file to Pillow ----
+# ---- images: the only place of the project that opens a file with Pillow ----
 #
-# The kind is told by the content, and only the kinds below are tried: others (EPS, WMF, FITS ...) make
-# Pillow start other programs or allocate what a header of a few bytes asks for. The size that the header
-# declares is judged before a pixel is decoded. Pillow lets through whatever its decoders meet in damaged
-# data (IndexError, AssertionError, TypeError, NotImplementedError ...), so here every exception means an
-# unreadable image, and what it says of damaged metadata is silenced: an image is either read or refused.
+# The kind is recognised by the content, and only the kinds below are tried: for others (EPS, WMF, FITS ...)
+# Pillow starts other programs or allocates what a short header asks for. The declared size is checked before
+# a pixel is decoded. For damaged data Pillow raises whatever its decoders raise (IndexError, AssertionError,
+# TypeError, NotImplementedError ...), so every exception here means an unreadable image. Its warnings about
+# damaged metadata are silenced: an image is either read or refused.
 
 warnings.filterwarnings("ignore", module=r"PIL\.")
 logging.getLogger("PIL").setLevel(logging.CRITICAL)
 
-KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF where Pillow has a codec, HEIF with pillow_heif
-# HEIF is named where it cannot be read, too: the message then says why such photographs are left out
+KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF if Pillow has a codec, HEIF with pillow_heif
+# HEIF is included even if it cannot be read: a message then says why such photographs are left out.
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".heic", ".heif")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 HEIF_BRANDS = (b"heic", b"heix", b"mif1", b"hevc", b"heim", b"heis")
-MOST_PIXELS = 178_000_000  # of any image: 0.7 GB once decoded. The largest cameras make 151 million
-MOST_PIXELS_REDUCED = 268_000_000  # of photographs, which are halved as they are read; some phones make 200
-Image.MAX_IMAGE_PIXELS = MOST_PIXELS_REDUCED  # of which Pillow allows twice as many
-# Declared pixels beyond these need a file of a fitting size: photographs keep 2 to 100 pixels a byte, what is
-# made to exhaust memory a million. The decoders of WebP and AVIF hold two more copies of the image.
+MOST_PIXELS = 178_000_000  # of any image: 0.7 GB decoded; the largest cameras have 151 million
+MOST_PIXELS_REDUCED = 268_000_000  # of photographs, which are halved while reading; some phones have 200
+Image.MAX_IMAGE_PIXELS = MOST_PIXELS_REDUCED  # Pillow itself allows twice as many
+# Images with more pixels than these must have a file of a fitting size: photographs have 2 to 100 pixels per
+# byte, hostile files a million. The decoders of WebP and AVIF hold two more copies of the image.
 FREE_PIXELS, FREE_PIXELS_COPIED, PIXELS_PER_BYTE = 16_000_000, 8_000_000, 128
-# What these say is wrong with the file; what others say, such as IndexError, with Pillow's handling of it
+# Errors whose text is about the file; that of others, such as IndexError, is about Pillow's code.
 TELLING = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
@@ -358,11 +357,11 @@ def opened(
     kinds: tuple[str, ...] | None = None,
     most: int = MOST_PIXELS,
 ) -> Iterator[Image.Image]:
-    """Open the image in a file or in bytes, not decoded yet; inside the block it may be.
+    """Open the image in a file or in bytes, for decoding within the block.
 
-    `name` is for messages, by default the path. Raises PictureError for what cannot be opened, is of none of
-    the `kinds` (default: all that are read) or declares more than `most` pixels, and for whatever Pillow
-    raises inside the block.
+    name: for messages, by default the path. Raises PictureError if it cannot be opened, is of none of the
+    `kinds` (default: all that are read) or declares more than `most` pixels, and for any error of Pillow
+    within the block.
     """
     name = name or (str(source) if isinstance(source, Path) else "a picture in memory")
     try:
@@ -376,7 +375,7 @@ def opened(
         try:
             lacking = _lacks_heif(file)
             known = KINDS + ("AVIF",) * bool(features.check("avif")) + ("HEIF",) * ("HEIF" in Image.OPEN)
-            # Image.open looks at the first bytes only to choose the kind; the name's ending plays no part
+            # Image.open chooses the kind by the first bytes, not by the name
             with Image.open(file, formats=kinds or known) as picture:
                 free = FREE_PIXELS_COPIED if picture.format in ("WEBP", "AVIF", "HEIF") else FREE_PIXELS
                 most = min(most, free + PIXELS_PER_BYTE * size)
@@ -391,7 +390,7 @@ def opened(
                 raise PictureError(name, f"HEIC needs pillow-heif: {remedy('pillow_heif')}") from None
             read = ", ".join(kinds or known)
             raise PictureError(name, f"the content is none of {read}, or damaged") from None
-        except Exception as error:  # noqa: BLE001  any at all, see the top of this file
+        except Exception as error:  # noqa: BLE001  any at all, see above
             text = printable_line(error, 80)
             telling = text and isinstance(error, TELLING)
             reason = text if telling else f"damaged: {text or type(error).__name__}"
@@ -399,12 +398,12 @@ def opened(
 
 
 def is_video(path: Path) -> bool:
-    """Return whether a file's name ends as a video's."""
+    """Return True if a file has the suffix of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
 def _lacks_heif(file: BinaryIO) -> bool:
-    """Register the codec of HEIF for a file of that kind; True where there is none."""
+    """Register the codec of HEIF for a file of that kind; True if there is none."""
     head = file.read(12)
     file.seek(0)
     if head[4:8] != b"ftyp" or head[8:] not in HEIF_BRANDS or "HEIF" in Image.OPEN:

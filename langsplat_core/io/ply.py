@@ -1,20 +1,19 @@
-"""PLY files: tables in any encoding, clouds of points, and 3D Gaussian scenes in two layouts.
+"""PLY files: tables in any encoding, point clouds, and 3D Gaussian scenes in two layouts.
 
-Our own in place of plyfile, which takes six times as long for a large scene and three times the memory
-(`python -m tests.benchmarks scale --only load`): rows are streamed into the arrays that are kept.
+Rows are streamed into the final arrays; plyfile takes six times as long for a large scene and three times the
+memory (`python -m tests.benchmarks scale --only load`).
 
 INRIA's layout is read in all its variants and written in its plain form: one element `vertex`, one row per
 Gaussian, binary little endian, float32, in order ``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2
 rot_0..3``. Opacities are logits, scales natural logarithms, rotations quaternions w x y z. There are 0, 9, 24
 or 45 `f_rest` (SH degree 0 to 3), channel after channel: all coefficients of red, then of green, then of
-blue. Normals are zeros that nobody reads. Of a scene with an origin ``x y z`` are double, positions in the
-world.
+blue. Normals are zeros and not used. In a scene with an origin ``x y z`` are double, positions in the world.
 
-As read: the properties in any order and of any scalar type, any byte order, ascii, LF or CR LF in the
-header, without normals, with further elements (not read, which is said; of a binary file, lists only behind
-the vertices) and properties (kept as `Scene.extras`). Rows are kept as they are, NaN included; doubles, but
-of positions, are rounded to float32. Of comments in the header two kinds mean something; of several of a kind
-the last one counts:
+Reading accepts properties in any order and of any scalar type, any byte order, ascii, LF or CR LF in the
+header, files without normals, further elements (ignored and reported; in binary files with lists only after
+the vertices) and further properties (kept as `Scene.extras`). Rows are kept as they are, NaN included;
+doubles other than positions are rounded to float32. Two kinds of header comments are read; the last one of a
+kind counts:
 
     metres_per_unit 0.25        length of the world's unit; no positive number: unknown
     SplatRenderMode: mip        trained with Mip-Splatting's compensation: Brush, splat-transform, gsplat
@@ -49,10 +48,10 @@ from langsplat_core.scene.transform import C0
 # ---- tables ----
 
 HEADER_LIMIT = 64 * 1024  # bytes; a real header of 62 properties takes about 1.5 KiB
-LINE_LIMIT = 1 << 20  # bytes, of a row of an ascii file: as many numbers as a header declares take a fifth
+LINE_LIMIT = 1 << 20  # bytes of a row in an ascii file, five times what the longest header allows
 NAME_LIMIT = 64  # characters; the longest of known programs has 17
-CHUNK_ROWS = 2048  # about 0.5 MB of a degree-3 scene: the columns are then picked out of the cache
-CLOUDCOMPARE = "scalar_"  # before names of properties in files of CloudCompare's
+CHUNK_ROWS = 2048  # about 0.5 MB of a degree-3 scene, which fits the cache
+CLOUDCOMPARE = "scalar_"  # prefix of properties in files of CloudCompare
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 TYPE_NAMES = {  # NumPy code -> names, the first of which is written
     "i1": ("char", "int8"), "u1": ("uchar", "uint8"), "i2": ("short", "int16"), "u2": ("ushort", "uint16"),
@@ -68,18 +67,17 @@ class PlyElement:
     name: str
     count: int  # rows
     numbers: dict[str, str] = field(default_factory=dict)  # property -> NumPy code without byte order
-    has_lists: bool = False  # among its properties, so that its rows differ in length
+    has_lists: bool = False  # True if properties are lists, so that rows differ in length
 
     def row(self, byte_order: str) -> np.dtype[np.void]:
-        """Return the type of a binary row, where there are no lists."""
+        """Return the type of a binary row of an element without lists."""
         return np.dtype([(name, byte_order + code) for name, code in self.numbers.items()])
 
 
 class PlyFile:
     """An open PLY file.
 
-    Every size is checked against the file before anything is allocated, so that a header which claims 10^12
-    rows costs nothing. All methods raise FormatError.
+    Every size is checked against the file before memory is allocated. All methods raise FormatError.
     """
 
     def __init__(self, file: BinaryIO, size: int, path: Path) -> None:
@@ -87,7 +85,7 @@ class PlyFile:
         self.path = path
         self.comments: list[str] = []
         self.elements: dict[str, PlyElement] = {}
-        self._file, self._size, self._beyond = file, size, 0  # beyond: numbers that do not fit their types
+        self._file, self._size, self._beyond = file, size, 0  # _beyond: numbers that do not fit their types
         head = file.read(HEADER_LIMIT)
         if head[:4] not in (b"ply\n", b"ply\r"):
             raise malformed(path, "is not a PLY file (it does not begin with the line 'ply')")
@@ -117,7 +115,7 @@ class PlyFile:
                 self.comments.append(line.removeprefix(keyword).strip())
             case ["format", name, *_] if name in BYTE_ORDERS:
                 self._format = name
-            # isdecimal refuses signs, and twenty digits are far beyond any file (int() of a million is slow)
+            # isdecimal refuses signs; int() of a million digits is slow
             case ["element", name, count] if (
                 is_name(name) and name not in self.elements and count.isdecimal() and len(count) <= 20
             ):
@@ -147,8 +145,8 @@ class PlyFile:
     def read(self, element: PlyElement, *groups: tuple[Sequence[str], DTypeLike]) -> list[Array]:
         """Return a (rows, names) table for each group of properties, of the type given with it.
 
-        Beside the tables only a chunk a thread is held. A number beyond its type becomes infinite or, in an
-        integer, arbitrary. FormatError for an element without these properties, or with lists.
+        Besides the tables only one chunk per thread is in memory. A number beyond its type becomes infinite
+        or, as an integer, arbitrary. FormatError for an element without these properties, or with lists.
         """
         absent = [name for names, _ in groups for name in names if name not in element.numbers]
         if absent or element.has_lists:
@@ -168,7 +166,7 @@ class PlyFile:
                     return
                 kinds = {rows.dtype[name] for name in order}
                 kind = kinds.pop() if len(kinds) == 1 else None
-                with np.errstate(over="ignore", invalid="ignore"):  # which holds for the calling thread only
+                with np.errstate(over="ignore", invalid="ignore"):  # per thread
                     for (names, _dtype), picked, table in zip(groups, indices, tables, strict=True):
                         part = table[start : start + len(rows)]
                         if kind is not None and kind == part.dtype:  # half the time per number
@@ -179,19 +177,19 @@ class PlyFile:
                         for index, name in enumerate(names):
                             part[:, index] = rows[name]
 
-        # Two, which NumPy lets run at once: one core does not use the whole bandwidth of the memory.
+        # NumPy releases the interpreter lock; one thread does not use the whole memory bandwidth.
         with ThreadPoolExecutor(2) as pool:
             list(pool.map(work, range(2)))
         return tables
 
     def losses(self, read: Collection[str]) -> Iterator[str]:
-        """Yield what of the file is passed over; read: names of the elements that are not."""
+        """Yield lines about ignored parts of the file; read: names of the elements that were read."""
         others = (each for each in self.elements.values() if each.count and each.name not in read)
         yield unread("elements", (f"{each.name} ({each.count} rows)" for each in others))
         if self._beyond:
             yield f"{self._beyond} numbers do not fit the types of their properties"
         if self.byte_order and any(each.has_lists for each in self.elements.values()):
-            return  # where the last row ends only walking them tells
+            return  # the end of the last row is not known without reading the lists
         self._seek(None)
         left = (
             self._size - self._file.tell()
@@ -202,11 +200,11 @@ class PlyFile:
             yield f"{left} {'bytes' if self.byte_order else 'lines'} behind the last row not read"
 
     def _seek(self, wanted: PlyElement | None) -> None:
-        """Go to the first row of `wanted`, which the file has room for; None: behind the last row of all."""
+        """Seek the first row of `wanted`, whose rows must fit the file; None: the end of all rows."""
         self._file.seek(self.header_size)
         for element in self.elements.values():
             left, least = self._size - self._file.tell(), element.row(self.byte_order).itemsize
-            if not self.byte_order:  # a character and a separator a number; the file's last needs none
+            if not self.byte_order:  # a character and a separator per number, except for the last one
                 left, least = left + 1, 2 * max(len(element.numbers), 1)
             if element.count * least > left:
                 needs = f"{element.count} rows of element {element.name} need {element.count * least} bytes"
@@ -224,7 +222,7 @@ class PlyFile:
                 self._file.seek(element.count * least, 1)
 
     def _lines(self) -> Iterator[bytes]:
-        """Yield the lines that follow, none of which is the rest of a file without ends of lines."""
+        """Yield the following lines; FormatError for one of `LINE_LIMIT` bytes."""
         while line := self._file.readline(LINE_LIMIT):
             if len(line) == LINE_LIMIT:
                 raise malformed(self.path, f"has a line of {LINE_LIMIT} bytes or more")
@@ -248,7 +246,7 @@ class PlyFile:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # "input contained no data": reported below
                 rows = np.loadtxt(self._lines(), comments=None, max_rows=count, ndmin=2, encoding="latin-1")
-        except ValueError as error:  # NumPy tells its own options too
+        except ValueError as error:  # whose text also has NumPy's options
             what = f"unreadable row near {start} of {element.name}: {printable_line(error, 80)}"
             raise malformed(self.path, what) from None
         if rows.shape != (count, len(element.numbers)):
@@ -265,14 +263,14 @@ class PlyFile:
 
 @contextmanager
 def open_ply(path: Path) -> Iterator[PlyFile]:
-    """Open a PLY file. Raises InputError where it cannot be opened, FormatError where it breaks a rule."""
+    """Open a PLY file. Raises InputError if it cannot be opened, FormatError if it breaks a rule."""
     file, size = open_for_reading(path)
     with file:
         yield PlyFile(file, size, path)
 
 
 def is_name(word: str) -> bool:
-    """Return whether an element or property may be called so: names are shown in messages, in one line."""
+    """Return True if a word may be the name of an element or property: printable and short."""
     return word.isprintable() and word.split() == [word] and len(word) <= NAME_LIMIT
 
 
@@ -304,7 +302,7 @@ def write_table(
             file.write(corners.tobytes())
 
 
-# ---- coloured points, as structure from motion and scanners write them ----
+# ---- point clouds of structure from motion and scanners ----
 
 CHANNELS = ("red", "green", "blue")
 GREY = 128  # of points without colours
@@ -313,15 +311,15 @@ GREY = 128  # of points without colours
 def read_cloud(path: Path) -> tuple[Array, Array]:
     """Return (M, 3) float64 positions and (M, 3) uint8 colours of the element `vertex`.
 
-    A position may be infinite or NaN. Colours are whole numbers from 0 to 255, or floats from 0 to 1; what
-    lies beyond is clipped, and for want of colours grey is taken; either is reported. Raises InputError when
-    the file cannot be opened and FormatError when it breaks a rule of the format.
+    A position may be infinite or NaN. Colours are whole numbers from 0 to 255, or floats from 0 to 1; others
+    are clipped, points without colours are grey, and both is reported. Raises InputError if the file cannot
+    be opened and FormatError if it breaks a rule of the format.
     """
     with open_ply(path) as ply:
         vertex = ply.vertex
         coloured = all(channel in vertex.numbers for channel in CHANNELS)
         points, shades = ply.read(vertex, (POSITION, "f8"), (CHANNELS * coloured, "f8"))
-        told = list(ply.losses(ply.elements))  # of a mesh the faces play no part
+        told = list(ply.losses(ply.elements))  # faces of a mesh are no loss
     if not coloured:
         shades = np.full(points.shape, GREY)
         told.append("its points have no colours, and grey is taken")
@@ -346,16 +344,16 @@ METRES = "metres_per_unit"
 
 
 def read_ply(path: Path | str) -> Gaussians:
-    """Return the Gaussians of a 3DGS PLY file where they lie in the world; raises as `read_ply_scene`."""
+    """Return the Gaussians of a 3DGS PLY file in world coordinates; raises as `read_ply_scene`."""
     return read_ply_scene(path).world_gaussians()
 
 
 def read_ply_scene(path: Path | str) -> Scene:
-    """Return the Gaussians of a 3DGS PLY file, plain or compressed, and what else the file tells of them.
+    """Return the scene in a 3DGS PLY file, plain or compressed.
 
-    `extras` are the scalar properties of a plain file that are none of the layout, in its order, each of
-    its own type. What is passed over is reported. Raises InputError when the file cannot be opened and
-    FormatError when it breaks a rule of the format or holds no Gaussians.
+    `extras` are the scalar properties of a plain file that are not in the layout, in order, each in its own
+    type. Ignored content is reported. Raises InputError if the file cannot be opened and FormatError if it
+    breaks a rule of the format or has no Gaussians.
     """
     extras, told = dict[str, Array](), list[str]()
     with open_ply(Path(path)) as ply:
@@ -401,14 +399,14 @@ def _read_plain(ply: PlyFile, vertex: PlyElement, tell: Tell) -> tuple[Gaussians
 
 
 def write_ply(path: Path | str, content: Scene | Gaussians) -> None:
-    """Write Gaussians in the plain INRIA form, and what else of a scene a PLY holds, atomically.
+    """Write Gaussians, or a scene without language field and cameras, as a plain INRIA PLY, atomically.
 
-    Extras become properties behind those of the layout, where readers that do not know them pass over them.
-    Raises InputError for names and types that no PLY can hold.
+    Extras become properties after those of the layout, which other readers ignore. Raises InputError for
+    names and types that no PLY can hold.
     """
     scene = Scene(content) if isinstance(content, Gaussians) else content
     gaussians = scene.gaussians
-    comments = ["SplatRenderMode: mip"] if scene.antialiased else []  # the commonest spelling of four
+    comments = ["SplatRenderMode: mip"] if scene.antialiased else []  # the most common of several spellings
     if scene.metres_per_unit is not None:
         comments.append(f"{METRES} {float(scene.metres_per_unit)!r}")
     sh, means = gaussians.sh, gaussians.means if not scene.origin.any() else scene.in_world(gaussians.means)
@@ -430,7 +428,7 @@ def write_ply(path: Path | str, content: Scene | Gaussians) -> None:
 
 
 def _said(comments: Sequence[str], tell: Tell) -> tuple[bool, float | None]:
-    """Return whether to draw antialiased, and metres per unit where that is a positive number."""
+    """Return whether comments say antialiased, and metres per unit if that is a positive number."""
     marks, lengths = list[bool](), list[float]()
     for comment in comments:
         match comment.replace(":", " ").split():
@@ -458,7 +456,7 @@ def _said(comments: Sequence[str], tell: Tell) -> tuple[bool, float | None]:
 
 
 def write_metres(path: Path | str, metres_per_unit: float) -> None:
-    """Say in the header of the PLY `path` how long its unit is; all else stays as it is, byte for byte.
+    """Write metres per unit into the header of the PLY `path`; all other bytes stay as they are.
 
     Raises InputError for another kind of file and a length that is not positive, FormatError for a header
     that breaks the rules.
@@ -486,9 +484,9 @@ def write_metres(path: Path | str, metres_per_unit: float) -> None:
 #
 #     packed_position   x 11 bits, y 10, z 11, from the top, as fractions between the chunk's bounds
 #     packed_scale      likewise, of the scales' logarithms
-#     packed_rotation   2 bits: which of w x y z is largest and left out (it is positive); then the other
-#                       three in 10 bits each, as fractions of [-sqrt(1/2), sqrt(1/2)]
-#     packed_color      red, green, blue, opacity in 8 bits each; the opacity is not a logit here
+#     packed_rotation   2 bits: index in w x y z of the largest, which is omitted (it is positive); then the
+#                       other three in 10 bits each, as fractions of [-sqrt(1/2), sqrt(1/2)]
+#     packed_color      red, green, blue, opacity (not a logit) in 8 bits each
 #
 # `sh`, optional: `f_rest_*` in 8 bits each over [-4, 4], channel after channel. Opacities of 0 and 1 become
 # logits of -infinity and +infinity.
@@ -502,7 +500,7 @@ _BOUNDS = [
     for part, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb"))
 ]
 
-# Code c stands for the middle of its 1/256 interval, but the two ends are exact (-4 and 4).
+# Code c is the middle of its 1/256 interval, except that both ends are exact (-4 and 4).
 _SH_VALUES = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
 _SH_VALUES[[0, 255]] = -4, 4
 
@@ -535,7 +533,7 @@ def _read_compressed(ply: PlyFile, vertex: PlyElement, tell: Tell) -> tuple[Gaus
         return least * (1 - fractions) + greatest * fractions
 
     three, rgba = _fractions(rotation, 2, 10, 10, 10)[:, 1:], _fractions(colour, 8, 8, 8, 8)
-    with np.errstate(invalid="ignore", over="ignore"):  # infinite bounds make rows that are dropped later
+    with np.errstate(invalid="ignore", over="ignore"):  # rows with infinite bounds are dropped later
         rgb = between(bounds[2], rgba[:, :3]) if coloured else rgba[:, :3]
         base = ((rgb - 0.5) / C0)[:, None]
         means, origin = about_origin(between(bounds[0], _fractions(position, 11, 10, 11)))
@@ -550,7 +548,7 @@ def _read_compressed(ply: PlyFile, vertex: PlyElement, tell: Tell) -> tuple[Gaus
 
 
 def _codes(ply: PlyFile, element: PlyElement, names: Sequence[str], kind: str) -> Array:
-    """(rows, names) whole numbers, which the file must hold as such."""
+    """Return (rows, names) whole numbers; FormatError if they are of another type than `kind`."""
     others = [name for name in names if element.numbers.get(name, kind) != kind]
     if others:
         raise malformed(ply.path, f"{others[0]!r} is not of the type {TYPE_NAMES[kind][0]}")
@@ -558,6 +556,6 @@ def _codes(ply: PlyFile, element: PlyElement, names: Sequence[str], kind: str) -
 
 
 def _fractions(packed: Array, *bits: int) -> Array:
-    """Unpack (N,) uint32 into (N, fields) fractions in [0, 1]; bits of each field, the first on top."""
+    """Return the (N, fields) fractions in [0, 1] in (N,) uint32; bits: of each field, from the top."""
     most = 2 ** np.array(bits) - 1
     return (packed[:, None] >> 32 - np.cumsum(bits) & most) / most

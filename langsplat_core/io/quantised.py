@@ -1,4 +1,4 @@
-"""Codes that the small formats of scenes share, and the simplest of these: antimatter15's .splat.
+"""Quantisation shared by the small scene formats, and the simplest of them: antimatter15's .splat.
 
 A .splat is 32 bytes per Gaussian and nothing else:
 
@@ -7,9 +7,9 @@ A .splat is 32 bytes per Gaussian and nothing else:
     colour     4 uint8: red, green, blue and opacity, as fractions of 255
     rotation   4 uint8: w x y z as (value - 128) / 128
 
-Little endian, no header, no spherical harmonics beyond the base colour. Writers in the wild order the rows
-by size times opacity, so that a viewer can show the first part; here the order is kept, because the
-language field goes by rows. Source of the layout: antimatter15/splat; the code here is our own.
+Little endian, no header, no spherical harmonics beyond the base colour. Other writers sort the rows by size
+times opacity, so that a viewer can show the first part; here the order is kept, because the language field
+is stored by rows. Source of the layout: antimatter15/splat; the code here is our own.
 """
 
 from dataclasses import replace
@@ -24,19 +24,19 @@ from langsplat_core.io.hostile import open_for_reading
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import C0
 
-# Components beside the largest, by its index
+# Indices of the other components, by the index of the largest.
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-# Axes in which each spherical harmonic is odd
+# Axes in which each spherical harmonic is odd.
 _ODD = ["", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x"]
 
 
 def to_bytes(values: Array) -> Array:
-    """Round numbers and clip them to uint8."""
+    """Return numbers rounded and clipped to uint8."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def check_steps(path: Path, gaussians: Gaussians, steps: Array) -> None:
-    """Raise InputError where (N,) `steps` of positions, world units, are larger than most Gaussians."""
+    """Raise InputError if (N,) `steps` of positions, world units, are larger than most Gaussians."""
     if len(gaussians) == 0:
         return
     sizes = gaussians.log_scales.max(axis=1).astype(np.float64)  # logarithm of the longest axis
@@ -53,8 +53,8 @@ def check_steps(path: Path, gaussians: Gaussians, steps: Array) -> None:
 def smallest_three(three: Array, largest: Array, tell: Tell) -> Array:
     """Return (N, 4) unit quaternions from their (N, 3) components other than the largest.
 
-    largest: (N,) index of that one, which is positive; tell: is told of codes of longer quaternions, by more
-    than 8 bits a component round.
+    largest: (N,) index of the largest component, which is positive; tell: gets a line about components that
+    are too long for a unit quaternion, beyond rounding to 8 bits.
     """
     out = np.empty((len(three), 4))
     left = 1 - (three**2).sum(1)
@@ -66,7 +66,7 @@ def smallest_three(three: Array, largest: Array, tell: Tell) -> Array:
 
 
 def without_largest(quats: Array) -> tuple[Array, Array]:
-    """Return (N, 3) components and (N,) index for `smallest_three`, of (N, 4) quaternions of any length."""
+    """Return (N, 3) components and (N,) index for `smallest_three` of (N, 4) quaternions of any length."""
     turns = unit(quats.astype(np.float64), 1e-30)
     largest = np.abs(turns).argmax(axis=1)
     turns *= np.where(np.take_along_axis(turns, largest[:, None], 1) < 0, -1, 1)
@@ -74,7 +74,7 @@ def without_largest(quats: Array) -> tuple[Array, Array]:
 
 
 def mirrored(gaussians: Gaussians, signs: Array) -> Gaussians:
-    """Return the Gaussians along axes that have the (3,) `signs`, 1 or -1; turns about the others reverse."""
+    """Return the Gaussians in axes that are reversed where (3,) `signs` is -1; other signs are 1."""
     x, y, z = signs = signs.astype(np.float32)
     odd = np.array([[axis in axes for axis in "xyz"] for axes in _ODD[: gaussians.sh.shape[1]]])
     with np.errstate(invalid="ignore"):
@@ -88,15 +88,15 @@ def mirrored(gaussians: Gaussians, signs: Array) -> Gaussians:
 
 # ---- .splat ----
 
-_HUGE = 1e12  # world units that no Gaussian of a real scene has
+_HUGE = 1e12  # world units, beyond any real scene
 _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
 
 
 def read_splat_scene(path: Path | str) -> Scene:
     """Return the Gaussians of a .splat file, of SH degree 0, as a scene.
 
-    A file cut off between two Gaussians cannot be told from a whole one. Raises InputError when the file
-    cannot be opened and FormatError when it is no such file.
+    A file that is cut off between two Gaussians cannot be recognised. Raises InputError if the file cannot be
+    opened and FormatError if it is no .splat.
     """
     path = Path(path)
     file, size = open_for_reading(path)
@@ -105,7 +105,7 @@ def read_splat_scene(path: Path | str) -> Scene:
             what = f"{size} bytes are not a whole number of Gaussians of {_RECORD.itemsize}"
             raise malformed(path, what, "it is truncated or no .splat: copy it again")
         rows = np.frombuffer(file.read(size), _RECORD)
-    # Nothing else in the file tells it from noise, whose floats are negative, not finite or enormous.
+    # The only check against other files, whose floats are often negative, not finite or huge.
     with np.errstate(invalid="ignore", divide="ignore"):
         sound = (np.abs(rows["position"]) < _HUGE).all(1) & (rows["scale"] >= 0).all(1)
         sound &= (rows["scale"] < _HUGE).all(1)
@@ -126,7 +126,7 @@ def read_splat_scene(path: Path | str) -> Scene:
 def write_splat(path: Path | str, scene: Scene) -> None:
     """Write the Gaussians in their order, atomically, without their view dependence.
 
-    Colours and opacities are rounded to 1/255 (colours beyond 0..1 are cut off), rotations to 1/128 per
+    Colours and opacities are rounded to 1/255 (colours are clipped to 0..1), rotations to 1/128 per
     component; positions and scales stay exact. A row that cannot be drawn is written with opacity 0.
     """
     gaussians, valid = scene.gaussians, scene.gaussians.valid()

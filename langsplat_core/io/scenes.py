@@ -1,11 +1,10 @@
-"""Scenes on disk: their formats, and their companions.
+"""Scenes on disk: formats and companion files.
 
-`formats()` is the one table that the loader, `langsplat convert`, file dialogs, the desktop entry and the
-tests of round trips and damaged files read. A scene is `scene.ply` with, beside it,
-`scene.langsplat.safetensors` and `scene.cameras.json`, either of which may be absent. The same companions are
-looked for beside a compressed PLY or a SOG folder. Those of the other formats keep its suffix,
-`scene.spz.langsplat.safetensors`: the sidecar knows the rounded positions of that file, so that it could not
-serve a `scene.ply` in the same folder.
+`formats()` is the table behind the loader, `langsplat convert`, file dialogs, the desktop entry and the tests
+of round trips and damaged files. A scene is `scene.ply` with the optional companions
+`scene.langsplat.safetensors` and `scene.cameras.json` beside it. A compressed PLY and a SOG folder have
+companions of the same names. Those of other formats keep the suffix, `scene.spz.langsplat.safetensors`: the
+sidecar belongs to the rounded positions of that file and not to those of a `scene.ply` in the same folder.
 """
 
 import logging
@@ -38,8 +37,8 @@ from langsplat_core.scene import LEVELS, Gaussians, LanguageField, Scene, about_
 
 log = logging.getLogger("langsplat")
 
-# What a scene may have and a format no room for: each is said in a line. Where there is none for the origin a
-# companion keeps it and metres per unit. How numbers are rounded is said where a person converts a scene.
+# Parts of a scene that a format may lack: each loss is reported in a line. A companion keeps the origin and
+# metres per unit for formats without an origin. `langsplat convert` reports how numbers are rounded.
 PARTS: Mapping[str, Callable[[Scene], object]] = MappingProxyType({
     "view dependence": lambda scene: scene.gaussians.sh[:, 1:].any(),
     "antialiasing": lambda scene: scene.antialiased,
@@ -49,7 +48,7 @@ PARTS: Mapping[str, Callable[[Scene], object]] = MappingProxyType({
     "taught words": lambda scene: scene.language is not None and scene.language.taught,
 })  # fmt: skip
 LOSSES = ("precision", "view dependence", "antialiasing", "extra properties", "origin")
-ORIGIN_SUFFIX = ".origin.json"  # of the companion with the origin and scale for formats without room for them
+ORIGIN_SUFFIX = ".origin.json"  # of the companion with origin and scale, for formats without an origin
 
 
 Reader = Callable[[Path], Scene]
@@ -60,13 +59,13 @@ Writer = Callable[[Path, Scene], None]
 class SceneFormat:
     """A format of scenes: one row of `formats()`."""
 
-    suffix: str  # of its files, lower case; its name for people too
+    suffix: str  # of its files, lower case; also its name in messages
     read: Reader
     write: Writer | None = None  # None: read only
-    loses: tuple[str, ...] = ()  # what a written file cannot hold, of `LOSSES` or `PARTS`
-    rounds: str = ""  # numbers, and to what, for people
+    loses: tuple[str, ...] = ()  # what its files cannot hold, of `LOSSES` or `PARTS`
+    rounds: str = ""  # description of how numbers are rounded
     own_companions: bool = False  # companions keep the suffix: `a.spz.langsplat.safetensors`
-    folder_file: str = ""  # a folder with this file in it is a scene too, and so is the file
+    folder_file: str = ""  # this file, or a folder that has it, is a scene of the format too
     mime: str = "model/x-gaussian-splat"
 
 
@@ -90,7 +89,7 @@ CORE_FORMATS = (
 
 
 def formats() -> tuple[SceneFormat, ...]:
-    """Return the formats of scenes, the project's own and then those of extensions."""
+    """Return all scene formats: the core's, then those of extensions."""
     return (*CORE_FORMATS, *registry.parts("formats").values())
 
 
@@ -100,8 +99,8 @@ def writable_suffixes() -> tuple[str, ...]:
 
 
 def format_of(path: Path) -> SceneFormat | None:
-    """Return the format of `path` by its name or, of a folder, by the file in it; None for no scene."""
-    folder = os.path.isdir(path)  # which a name too long is not
+    """Return the format of `path` by its name or, for a folder, by the file in it; None if it is no scene."""
+    folder = os.path.isdir(path)  # False for a name that is too long, where `Path.is_dir` raises
     for row in formats():
         if not folder and path.suffix.lower() == row.suffix:
             return row
@@ -114,20 +113,20 @@ def format_of(path: Path) -> SceneFormat | None:
 
 
 class PlacedOrigin(Struct):
-    """What the companion of a file without room for them keeps."""
+    """Content of the companion with origin and scale."""
 
     origin: tuple[camera_files.Coordinate, camera_files.Coordinate, camera_files.Coordinate]
     metres_per_unit: Annotated[float, Meta(gt=0, le=1e12)] | None = None
 
 
 def load_scene(path: Path | str, read: Reader | None = None) -> Scene:
-    """Return a scene with its language field and cameras, where they lie beside it.
+    """Return a scene with its language field and cameras, if they are beside it.
 
     Cameras are `<scene>.cameras.json`, or for a PLY in the folder structure of the INRIA code
     (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. A companion that is unusable or
-    made for other Gaussians is left out, with the reason in `Scene.unread`. Raises InputError for what cannot
-    be opened or is of no supported kind, FormatError for what breaks the rules of its format. `read` takes
-    the place of the reader of its format.
+    belongs to other Gaussians is left out, with the reason in `Scene.unread`. Raises InputError for a file
+    that cannot be opened or is of no supported kind, FormatError for one that breaks the rules of its format.
+    read: in place of the format's reader.
     """
     scene = load_without_language(path, read)
     sidecar = companion_path(path, language_files.SUFFIX)
@@ -144,7 +143,7 @@ def load_scene(path: Path | str, read: Reader | None = None) -> Scene:
 
 
 def load_without_language(path: Path | str, read: Reader | None = None) -> Scene:
-    """Return a scene as `load_scene` does, but without the language field, which is not even looked at."""
+    """Return a scene as `load_scene` does, without reading its language field."""
     path = Path(path)
     scene, cameras = replace(_read(path, read), path=path), _cameras_path(path)
     if not os.path.exists(cameras):
@@ -158,7 +157,7 @@ def load_without_language(path: Path | str, read: Reader | None = None) -> Scene
 
 
 def _read(path: Path, read: Reader | None = None) -> Scene:
-    """Read the scene's own file; say what of it cannot be drawn."""
+    """Return the content of the scene's own file, and report rows that cannot be drawn."""
     if not os.path.exists(path):
         raise InputError(f"{path}: no such file; check the spelling and the folder")
     row = format_of(path)
@@ -176,9 +175,9 @@ def _read(path: Path, read: Reader | None = None) -> Scene:
 
 
 def _about_origin(path: Path, scene: Scene) -> Scene:
-    """Return the scene as read, with the origin that its companion names, or that it needs.
+    """Return the scene with the origin that its companion names, or else that its positions need.
 
-    Logs a warning where positions were rounded to float32 far from zero before they were written.
+    Reports positions that were rounded to float32 far from zero before they were written.
     """
     try:
         named = read_origin(path)
@@ -207,19 +206,19 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
 
 
 def read_origin(path: Path) -> PlacedOrigin | None:
-    """Return the origin that the companion of a file names; None without one. InputError if damaged."""
+    """Return the content of a file's origin companion; None without one. InputError if it is damaged."""
     beside = companion_path(path, ORIGIN_SUFFIX)
     return decode_json(read_file(beside, 1 << 16), PlacedOrigin, beside) if os.path.exists(beside) else None
 
 
 def write_origin(path: Path, origin: Array, metres_per_unit: float | None = None) -> None:
-    """Write an origin (3,) and scale as the companion `path` of a file whose format has no room for them."""
+    """Write an origin (3,) and scale as the companion `path` of a file in a format without an origin."""
     scale = {} if metres_per_unit is None else {"metres_per_unit": metres_per_unit}
     write_json(path, {"origin": origin.tolist(), **scale})
 
 
 def warn_of_undrawable(path: Path, gaussians: Gaussians) -> None:
-    """Say how many of the Gaussians that were read from `path` cannot be drawn, and why."""
+    """Report how many of the Gaussians that were read from `path` cannot be drawn, and why."""
     if reasons := gaussians.invalid_rows():
         share = f"{sum(reasons.values())} of the {len(gaussians)} Gaussians"
         report_loss("%s: %s cannot be drawn (%s); is the file damaged?", path, share, ", ".join(reasons))
@@ -229,9 +228,9 @@ def warn_of_undrawable(path: Path, gaussians: Gaussians) -> None:
 
 
 def check_writable(path: Path | str, *sources: Path) -> SceneFormat:
-    """Raise InputError unless `save_scene` can write a scene of this name and its companions there.
+    """Raise InputError unless `save_scene` can write a scene and its companions at `path`.
 
-    None of them may be a file of the scenes `sources`.
+    None of these files may belong to the scenes `sources`.
     """
     path = Path(path)
     for row in formats():
@@ -244,7 +243,7 @@ def check_writable(path: Path | str, *sources: Path) -> SceneFormat:
 
 
 def check_keeps(out: Path, *sources: Path) -> None:
-    """Raise InputError where writing `out`, or a companion of it, would replace a file of `sources`."""
+    """Raise InputError if writing `out`, or a companion of it, would replace a file of `sources`."""
     read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
     companions = _companions(out) if out.suffix.lower() in writable_suffixes() else ()
     for path in (out, *companions):
@@ -254,7 +253,7 @@ def check_keeps(out: Path, *sources: Path) -> None:
 
 
 def report_left_out(path: Path, scene: Scene, kind: str, loses: Sequence[str], keeper: str) -> None:
-    """Report what files of a `kind` have no room for, each in a line, and what the file `keeper` keeps."""
+    """Report each part of a scene that files of a `kind` lose, and what the companion `keeper` keeps."""
     kept = [f"the origin {' '.join(f'{value:.10g}' for value in scene.origin)}"] if scene.origin.any() else []
     if "metres per unit" not in loses and scene.metres_per_unit is not None:
         kept.append(f"{scene.metres_per_unit:g} metres per unit")
@@ -266,14 +265,14 @@ def report_left_out(path: Path, scene: Scene, kind: str, loses: Sequence[str], k
 
 
 def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer | None = None) -> None:
-    """Write `scene` in the format of its name, with its companions; those it lacks are removed, and named.
+    """Write `scene` in the format of its name, with its companions; old ones it lacks are removed and named.
 
-    Only the PLY keeps everything: see `SceneFormat.loses`. All formats keep the rows' order. All files are
-    first written whole under temporary names. Then the old companions are removed, the scene's file renamed
-    into place, and last the new companions. Interrupted anywhere, there is the old scene or the new one,
-    perhaps without companions, but never a scene beside companions of another. A scene with companions that
-    could not be read is not written: that would remove them. Raises InputError then, and as `check_writable`.
-    `tell`: say what the format has no room for, see `report_left_out`. `write` takes the place of its writer.
+    Only the PLY keeps everything: see `SceneFormat.loses`. All formats keep the order of rows. All files are
+    first written under temporary names. Then the old companions are removed, the scene's file is renamed into
+    place, and last the new companions. An interruption leaves the old scene or the new one, perhaps without
+    companions, but never with companions of another scene. Raises InputError as `check_writable`, and for a
+    scene with companions that could not be read, which would be removed. tell: report what the format loses,
+    see `report_left_out`. write: in place of the format's writer.
     """
     path = Path(path)
     if scene.unread:
@@ -288,7 +287,7 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer 
         if new is None and os.path.exists(file):
             report_loss("%s: removes %s of the scene that was there", shown(path), shown(Path(file.name)))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as lock, ExitStack() as renames:  # made in the reverse order of these lines
+    with ExitStack() as lock, ExitStack() as renames:  # renames happen in the reverse order of these lines
         if scene.cameras:
             in_world = tuple(camera.moved(scene.origin) for camera in scene.cameras)
             camera_files.write_cameras(renames.enter_context(atomic_path(cameras)), in_world)
@@ -299,12 +298,12 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer 
         new_file = renames.enter_context(atomic_path(path))
         write(new_file, scene)
         if scene.language is not None and new_sidecar is not None:
-            # The sidecar belongs to the positions as a reader finds them: rounded, or about another origin.
+            # The sidecar belongs to the positions as they are read back: rounded, or with another origin.
             again = row.read(new_file) if "precision" in row.loses or scene.origin.any() else scene
             if beside:
                 again = replace(again, origin=scene.origin)
             language_files.write_language(new_sidecar, scene.language, again.gaussians.means, again.origin)
-        # Locked, else the files of two who write one scene at once could end up side by side.
+        # Locked, else two processes that write one scene could mix their files.
         lock.enter_context(locked(path.parent))
         for companion in (sidecar, cameras, origin):
             companion.unlink(missing_ok=True)
@@ -314,16 +313,16 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer 
 
 
 def companion_path(scene: Path | str, suffix: str) -> Path:
-    """Return where the companion of a scene that ends in `suffix` lies: `a/b.ply` -> `a/b<suffix>`.
+    """Return the path of the companion of a scene that ends in `suffix`: `a/b.ply` -> `a/b<suffix>`.
 
     A SOG folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .sog or
-    .splat -> `a/b.spz<suffix>` and so on. Of a symbolic link it is the one beside the file that the link
-    leads to, where only that is there.
+    .splat -> `a/b.spz<suffix>` and so on. For a symbolic link it is the companion of the target, if only that
+    exists.
     """
     scene = Path(scene)
     if any(scene.name == row.folder_file for row in formats()):
         scene = scene.parent
-    row = None if os.path.isdir(scene) else format_of(scene)  # which a name too long is not
+    row = None if os.path.isdir(scene) else format_of(scene)
     if row is None:
         scene = Path(os.path.abspath(scene))  # "." has no name of its own
     beside = scene.with_name((scene.stem if row and not row.own_companions else scene.name) + suffix)
@@ -333,10 +332,10 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
 
 
 def scene_files(path: Path | str) -> tuple[Path, ...]:
-    """Return the files that `load_scene` reads, there or not: the scene's, language field, cameras."""
+    """Return the files that `load_scene` reads if they exist: scene, language field, cameras, origin."""
     path = Path(path)
     own: tuple[Path, ...] = (path,)
-    if os.path.isdir(path) or path.name == META_NAME:  # which a name too long is not
+    if os.path.isdir(path) or path.name == META_NAME:
         folder = path if os.path.isdir(path) else path.parent
         own = (folder / META_NAME, *sorted(folder.glob("*.webp")))
     sidecar, _, origin = _companions(path)
@@ -345,7 +344,7 @@ def scene_files(path: Path | str) -> tuple[Path, ...]:
 
 
 def _companions(path: Path) -> tuple[Path, Path, Path]:
-    """Sidecar, cameras and origin of a scene."""
+    """Return the paths of sidecar, cameras and origin of a scene."""
     suffixes = (language_files.SUFFIX, camera_files.SUFFIX, ORIGIN_SUFFIX)
     sidecar, cameras, origin = (companion_path(path, suffix) for suffix in suffixes)
     return sidecar, cameras, origin
@@ -359,41 +358,41 @@ def _cameras_path(scene: Path) -> Path:
     return beside
 
 
-# ---- scenes of other programs that are no single file: what an extension adds to `langsplat convert` ----
+# ---- scenes of several files of other programs: parts of extensions for `langsplat convert` ----
 
 
 @dataclass(frozen=True)
 class ImportRequest:
-    """Files that another method has of one scene, and what they do not say themselves."""
+    """Files of another method for one scene, with settings that they do not contain."""
 
     paths: tuple[Path, ...]
     encoder: str | None  # hub id or folder of the text encoder of the vectors; None: the method's own
-    levels: tuple[str, ...]  # of the files with features, in their order; empty: files and folders tell
-    phrases: tuple[str, ...]  # are stored encoded
+    levels: tuple[str, ...]  # of the feature files, in order; empty: from names of files and folders
+    phrases: tuple[str, ...]  # to encode and store
     codec: CodecConfig  # for whole vectors
 
 
 @dataclass(frozen=True)
 class Importer:
-    """A reader of files that another method has of a scene."""
+    """A reader of scenes in files of another method."""
 
-    suffixes: tuple[str, ...]  # lower case, of files that no format of scenes has
+    suffixes: tuple[str, ...]  # lower case, of files in no scene format
     read: Callable[[ImportRequest, Progress], tuple[Scene, tuple[str, ...]]]  # with lines to print
 
 
 @dataclass(frozen=True)
 class Exporter:
-    """A writer of files for another program: a word of `langsplat convert --to`."""
+    """A writer of files for another program: a value of `langsplat convert --to`."""
 
     write: Callable[[Scene, Path, Progress], tuple[str, ...]]  # into a folder; returns lines to print
-    loses: tuple[str, ...] = ()  # as of `SceneFormat`
+    loses: tuple[str, ...] = ()  # as in `SceneFormat`
 
 
-# Scenes in numbers: the health of their rows and where their bytes go.
+# Figures of a scene.
 
 
 def summarise(scene: Scene) -> dict[str, Any]:
-    """Return every figure of a scene of any size, an empty one included, ready for JSON."""
+    """Return the figures of a scene, which may be empty, ready for JSON."""
     gaussians = scene.gaussians
     valid = gaussians.valid()
     means = gaussians.means[valid] if valid.any() else np.zeros((1, 3))
@@ -402,7 +401,7 @@ def summarise(scene: Scene) -> dict[str, Any]:
         "invalid": gaussians.invalid_rows(),  # reason -> rows, each under its first
         "invalid_rows": int((~valid).sum()),
         "bounds": scene.in_world(np.quantile(means, [0.01, 0.99], axis=0)).tolist(),  # in the world
-        "origin": scene.origin.tolist(),  # what the means in memory are relative to, in the world
+        "origin": scene.origin.tolist(),  # of the means in memory, in the world
         "sh_degree": gaussians.sh_degree,
         "antialiased": scene.antialiased,
         "metres_per_unit": scene.metres_per_unit,
@@ -440,8 +439,8 @@ def _language(field: LanguageField) -> dict[str, Any]:
         "vector_dim": field.codec.vector_dim,
         "phrases": len(field.phrasebook),
         "taught": [word.name for word in field.taught],
-        "observed": dict(zip(LEVELS, shares.tolist(), strict=True)),  # share of the Gaussians with a meaning
-        "nodes": nodes,  # of the tree, at each level; None: the scene keeps no tree
-        "calibrated": field.calibration is not None,  # whether answers come with a probability
+        "observed": dict(zip(LEVELS, shares.tolist(), strict=True)),  # share of the Gaussians with a feature
+        "nodes": nodes,  # of the tree, at each level; None without a tree
+        "calibrated": field.calibration is not None,  # answers have probabilities
         "bytes": _bytes(field),  # latents, confidences and leaves of the tree
     }

@@ -6,21 +6,21 @@ executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and 
     tensor           type     shape      meaning
     codes            uint16   (3, N)     number of the codeword at subpart, part, whole: of a codebook
     latents          float    (3, N, d)  instead, of another codec; zero where never observed
-    confidence       float    (3, N)     total blending weight of the observations, >= 0; 0 for no meaning
+    confidence       float    (3, N)     total blending weight of the observations, >= 0; 0 for no feature
     tree.leaves      uint16   (N,)       smallest node that a Gaussian is in, 65535 for none; uint32 and
-                                         4294967295 where there are more nodes. No tensor of a tree where
-                                         the scene has none
+                                         4294967295 if there are more nodes. All tensors of a tree are
+                                         absent without one
     tree.parents     uint32   (K,)       node that each is part of, a later one; 4294967295 for none
     tree.levels      uint8    (K,)       0, 1, 2: subpart, part, whole
-    tree.votes       uint16   (K, 2)     photographs with a mask of just this node; those without one
+    tree.votes       uint16   (K, 2)     photographs with a mask of exactly this node; those without one
     positions        uint64   (N,)       of the Gaussians that the field belongs to, see `pack_positions`
     corners          float32  (2, 3)     of the box of these positions
     canonical        float    (4, D)     unit text vectors of "object", "things", "stuff", "texture"
     everyday         float    (V, D)     unit text vectors of phrases most of which name nothing in the scene;
-                                         absent where the encoder knows too few
-    phrasebook       float    (P, D)     unit text vectors of `phrases`; absent when P = 0
+                                         absent if the encoder knows too few
+    phrasebook       float    (P, D)     unit text vectors of `phrases`; absent if P = 0
     taught           float    (T, D)     examples of the taught words, one word after the other: unit vectors,
-                                         see `scene.TaughtWord`; absent where none was taught
+                                         see `scene.TaughtWord`; absent without taught words
     taught.rivals    float    (T,)       of each example, in [0, 1]
     codec.*          float               of a codebook vectors (K, D) and colours (K, 3); basis (d, D) of a
                                          linear codec; of an autoencoder
@@ -36,23 +36,23 @@ executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and 
     gaussians        N, decimal
     means_blake2b    BLAKE2b-128 of the means of the scene, as float32 little endian, hexadecimal
     phrases          JSON list of the P phrases
-    temperature      of the softmax that reads this encoder's cosines, decimal
-    found            relevancy from which a phrase counts as present, decimal
-    odds             JSON: a list of numbers for each `PlattScaling` of `scene.Calibration`; absent where
-                     there is none ("calibration" of older files is of another scale, and is not read)
-    origin           JSON: three numbers, where the positions are relative to, see `Scene`; absent for zero
-    taught           JSON: of each taught word a list of its name, its level (0, 1, 2) and the number of its
-                     examples; absent where there are none
+    temperature      of the softmax over this encoder's cosines, decimal
+    found            least relevancy of a phrase that is found, decimal
+    odds             JSON: a list of numbers for each `PlattScaling` of `scene.Calibration`; absent without
+                     one ("calibration" of older files is on another scale, and is not read)
+    origin           JSON: three numbers, the origin of the positions, see `Scene`; absent for zero
+    taught           JSON: for each taught word a list of its name, its level (0, 1, 2) and the number of its
+                     examples; absent without taught words
 
 A user's own words are a file of this kind too: `taught`, `taught.rivals` and `canonical`, with the metadata
 format "langsplat words", version "1", encoder and taught.
 
-"float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
-like the one in memory. The PLY stays a plain file that other programs edit; the checksum notices it, and the
-positions let `rematch_language` carry the field over to an edited PLY.
+"float" is float16 if that represents every number of the tensor exactly, else float32: a saved scene answers
+exactly like the one in memory. The PLY is a plain file that other programs may edit; the checksum detects it,
+and the positions let `rematch_language` carry the field over to an edited PLY.
 
-Older versions are read too: version 2 has no tree but `things`, which are not read; in version 1 everything
-is float32, with `means` (N, 3) in place of positions and corners, no temperature and no found.
+Older versions are read too: version 2 has `things` in place of a tree, which are not read; in version 1
+everything is float32, with `means` (N, 3) in place of positions and corners, no temperature and no found.
 """
 
 import hashlib
@@ -82,7 +82,7 @@ from langsplat_core.scene.language import CANONICAL_PHRASES, MOST_SHOWN, PlattSc
 
 SUFFIX = ".langsplat.safetensors"
 CODEC = "codec."
-# Formats: name in the metadata, versions that are read, the last of which is written, and what it is in words
+# Formats: name in the metadata; versions that are read, of which the last is written; name for messages
 _Format = tuple[str, tuple[str, ...], str]
 FIELD: _Format = ("langsplat", ("1", "2", "3"), "a language field")
 WORDS: _Format = ("langsplat words", ("1",), "taught words")
@@ -108,7 +108,7 @@ _KINDS = {  # types of tensors that hold no floating-point numbers
     "tree.levels": ("U8",),
     "tree.votes": ("U16",),
 }
-# Largest numbers: of a vector whose length is about 1 no number is 10.
+# Largest numbers of tensors; by default 10, as components of unit vectors are at most 1.
 _MOST = {"confidence": 1e12, "latents": 1e3, "corners": math.inf}
 
 
@@ -117,13 +117,13 @@ class Stored:
     """Content of a sidecar."""
 
     field: LanguageField
-    means: Array  # (N, 3) positions of the Gaussians it was made for, in the world; NaN for those not finite
+    means: Array  # (N, 3) positions in the world of the Gaussians it belongs to; NaN if not finite
     precision: float  # of these positions, world units
     checksum: str  # of the means of the scene
 
 
 def read_stored(path: Path) -> Stored:
-    """Return everything in the sidecar `path`; InputError where it cannot be opened, else FormatError."""
+    """Return the content of the sidecar `path`; InputError if it cannot be opened, else FormatError."""
     with _faults(path):
         tensors, about = _read(path, FIELD)
         if about["levels"] != ",".join(LEVELS):
@@ -148,7 +148,7 @@ _STATED = {*_PARSED, "format", "version", "encoder", "levels", "codec", "means_b
 
 
 def _passed_over(field: LanguageField, tensors: dict[str, Array], about: dict[str, Any]) -> Iterator[str]:
-    """Yield, for `report_losses`, what of a field is passed over or guessed."""
+    """Yield, for `report_losses`, parts of a field that are ignored or guessed."""
     read = {*_ALWAYS, "latents" if field.codec.blends else "codes"}
     read.update(CODEC + name for name in field.codec.tensors())
     read.update(name for name in _KINDS if name.startswith("tree.") and field.tree is not None)
@@ -164,7 +164,7 @@ def _passed_over(field: LanguageField, tensors: dict[str, Array], about: dict[st
 
 @contextmanager
 def _faults(path: Path) -> Iterator[None]:
-    """Turn what missing and unfitting tensors raise where they are put together into FormatError."""
+    """Turn errors of missing and unfitting tensors into FormatError."""
     try:
         yield
     except KeyError as missing:
@@ -176,7 +176,7 @@ def _faults(path: Path) -> Iterator[None]:
 
 
 def _read(path: Path, kind: _Format) -> tuple[dict[str, Array], dict[str, Any]]:
-    """Tensors of a file of this kind, floats as float32, and metadata."""
+    """Return the tensors of a file of this kind, floats as float32, and its metadata."""
     open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
     name, versions, what = kind
     tensors = {}
@@ -200,12 +200,12 @@ def _read(path: Path, kind: _Format) -> tuple[dict[str, Array], dict[str, Any]]:
 
 
 def _bounded(name: str, tensor: Array) -> Array:
-    """Return a tensor of numbers that the layout above has room for, and that do not overflow when used."""
+    """Return a tensor after a check that its numbers are finite and do not overflow in use; ValueError."""
     if name == "means":  # as they were in the PLY
         return tensor
     if not np.isfinite(tensor).all():
         raise ValueError(f"tensor {quoted(name)} holds numbers that are not finite")
-    layers = name.startswith((f"{CODEC}encoder.", f"{CODEC}decoder."))  # which the codec bounds itself
+    layers = name.startswith((f"{CODEC}encoder.", f"{CODEC}decoder."))  # bounded by the codec itself
     largest, most = np.abs(tensor).max(initial=0), math.inf if layers else _MOST.get(name, 10.0)
     if largest > most:
         raise ValueError(f"tensor {quoted(name)} holds {largest:g}; expected numbers up to {most:g}")
@@ -257,7 +257,7 @@ def _taught(tensors: dict[str, Array], about: dict[str, Any]) -> tuple[TaughtWor
 
 
 def _taught_parts(words: Sequence[TaughtWord]) -> tuple[dict[str, Array], dict[str, str]]:
-    """Tensors and metadata of taught words; nothing for none."""
+    """Return the tensors and metadata of taught words; both empty without words."""
     if not words:
         return {}, {}
     stated = [[word.name, word.level, len(word.vectors)] for word in words]
@@ -267,7 +267,7 @@ def _taught_parts(words: Sequence[TaughtWord]) -> tuple[dict[str, Array], dict[s
 
 
 def _signed(numbers: Array) -> Array:
-    """Numbers as int32, the largest of their type as NO_NODE."""
+    """Return numbers as int32, with NO_NODE for the largest of their type."""
     none = np.iinfo(numbers.dtype).max
     return np.where(numbers == none, NO_NODE, numbers.astype(np.int64)).astype(np.int32)
 
@@ -277,9 +277,9 @@ def _unsigned(numbers: Array, kind: DTypeLike) -> Array:
 
 
 def _save(path: Path | str, kind: _Format, tensors: dict[str, Array], about: dict[str, str]) -> None:
-    """Write a safetensors file, atomically: the same, byte for byte, whenever its content is.
+    """Write a safetensors file, atomically; equal content gives equal bytes.
 
-    The library writes the metadata in an order of its own, another one each time; here they are sorted.
+    The library writes the metadata in random order, so they are sorted here.
     """
     about = {"format": kind[0], "version": kind[1][-1], **about}
     with atomic_path(path) as temporary:
@@ -289,13 +289,13 @@ def _save(path: Path | str, kind: _Format, tensors: dict[str, Array], about: dic
             (size,) = struct.unpack("<Q", file.read(8))
             header = json.loads(file.read(size)) | {"__metadata__": dict(sorted(about.items()))}
             text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-            if len(text) <= size:  # always, unless the library begins to write JSON in another way
+            if len(text) <= size:  # unless a later library formats JSON differently
                 file.seek(8)
                 file.write(text.ljust(size))
 
 
 def means_checksum(means: Array) -> str:
-    """Return the BLAKE2b-128 of (N, 3) float32 positions, which notices any edit and reordering."""
+    """Return the BLAKE2b-128 of (N, 3) float32 positions, which changes with any edit and reordering."""
     data = np.ascontiguousarray(means, dtype="<f4")
     return hashlib.blake2b(data.tobytes(), digest_size=16).hexdigest()
 
@@ -347,12 +347,12 @@ class Words:
     """Taught words of one encoder."""
 
     encoder_id: str
-    canonical: Array  # (4, D) float32 unit text vectors of its canonical phrases, by which it is recognised
+    canonical: Array  # (4, D) float32 unit text vectors of its canonical phrases, which identify it
     words: tuple[TaughtWord, ...]
 
 
 def write_words(path: Path | str, words: Words) -> None:
-    """Write taught words as a file of a user's own, atomically."""
+    """Write taught words as a user's file, atomically."""
     taught, stated = _taught_parts(words.words)
     _save(path, WORDS, {"canonical": words.canonical, **taught}, {"encoder": words.encoder_id, **stated})
 
@@ -372,7 +372,7 @@ def read_words(path: Path | str) -> Words:
 
 
 def _narrow(tensor: Array) -> Array:
-    """Floats as float16 where that loses nothing."""
+    """Return floats as float16 if that is exact."""
     if tensor.dtype != np.float32:
         return tensor
     with np.errstate(over="ignore"):
@@ -383,9 +383,9 @@ def _narrow(tensor: Array) -> Array:
 def read_language(path: Path | str, means: Array, origin: Array = NO_ORIGIN) -> LanguageField:
     """Return the field in the sidecar `path`, which must belong to the Gaussians at `means` (N, 3) float32.
 
-    origin: (3,), of their scene; sidecars of before there were any have the checksum of positions in the
-    world. Raises InputError when it cannot be opened and FormatError when it breaks a rule of the layout or
-    was made for other Gaussians.
+    origin: (3,), of their scene; sidecars from before origins existed have the checksum of positions in the
+    world. Raises InputError if it cannot be opened and FormatError if it breaks a rule of the layout or
+    belongs to other Gaussians.
     """
     path = Path(path)
     stored = read_stored(path)
@@ -400,42 +400,41 @@ def read_language(path: Path | str, means: Array, origin: Array = NO_ORIGIN) -> 
 def rematch_language(sidecar: Path | str, new_means: Array) -> LanguageField:
     """Return the field in `sidecar`, carried over to Gaussians at `new_means` (N, 3) by nearest position.
 
-    new_means: in the world, float64 where that is far from zero.
-    Partners lie no farther apart than the old Gaussians from their nearest neighbours, in the median, so that
-    positions may have been rounded (a compressed PLY does) but what was added or moved far gets no meaning.
-    A Gaussian without a partner has confidence 0 and zero latents.
+    new_means: in the world, float64 far from zero. A match is at most as far as the median distance of an old
+    Gaussian to its nearest neighbour: rounding is allowed (as in a compressed PLY), but Gaussians that were
+    added or moved far get no feature, which is confidence 0 and zero latents.
     """
     stored = read_stored(Path(sidecar))
     field, old_rows = stored.field, np.flatnonzero(np.isfinite(stored.means).all(1))
-    partner = np.full(len(new_means), -1)  # the row that is padded
+    match = np.full(len(new_means), -1)  # -1: the padded row
     if len(old_rows):
         points = scipy.spatial.cKDTree(stored.means[old_rows])
         spacing = points.query(points.data[:: max(1, len(old_rows) // 10_000)], k=2)[0][:, 1]
-        spacing[~np.isfinite(spacing)] = 0  # there is no second one
+        spacing[~np.isfinite(spacing)] = 0  # there is only one
         new_rows = np.flatnonzero(np.isfinite(new_means).all(1))
         distance, nearest = points.query(new_means[new_rows])
         found = distance <= np.median(spacing) + stored.precision
-        partner[new_rows[found]] = old_rows[nearest[found]]
+        match[new_rows[found]] = old_rows[nearest[found]]
     tree = field.tree
     if tree is not None:
         tree = replace(tree, leaves=np.pad(tree.leaves, (0, 1), constant_values=NO_NODE))
     latents = np.pad(field.latents, ((0, 0), (0, 1), (0, 0)))
     confidence = np.pad(field.confidence, ((0, 0), (0, 1)))
-    return replace(field, latents=latents, confidence=confidence, tree=tree).take(partner)
+    return replace(field, latents=latents, confidence=confidence, tree=tree).take(match)
 
 
-# ---- positions in 8 bytes: 21 bits an axis, between the corners of their box ----
+# ---- positions in 8 bytes: 21 bits per axis, between the corners of their box ----
 #
-# They tell which Gaussian was which after a PLY was edited; a 2 millionth of the box is closer than that
-# needs, also where a few floaters make the box a thousand times larger than what is looked at.
+# They identify Gaussians after a PLY was edited. A 2 millionth of the box is precise enough, even if a few
+# floaters make the box a thousand times larger than the scene.
 
 _SHIFTS = np.array([0, 21, 42], np.uint64)
 _STEPS = 2**21 - 1
-_NOWHERE = np.uint64(2**64 - 1)  # of a position that is not finite
+_NOWHERE = np.uint64(2**64 - 1)  # for a position that is not finite
 
 
 def pack_positions(means: Array) -> tuple[Array, Array]:
-    """Return (N, 3) float32 positions as (N,) uint64, and the (2, 3) float32 corners of what is finite."""
+    """Return (N, 3) float32 positions as (N,) uint64, and the (2, 3) float32 corners of finite ones."""
     finite = np.isfinite(means).all(1)
     packed = np.full(len(means), _NOWHERE)
     if not finite.any():
@@ -456,6 +455,6 @@ def unpack_positions(packed: Array, corners: Array) -> tuple[Array, float]:
 
 
 def _box(corners: Array) -> tuple[Array, Array]:
-    """Lower corner and extent, float64; an axis without extent gets 1."""
+    """Return lower corner and extent, float64; the extent of a flat axis is 1."""
     low, high = corners.astype(np.float64)
     return low, np.where(high > low, high - low, 1.0)

@@ -6,15 +6,15 @@ by row, belongs to Gaussian i:
     means[0], means[1]   low and high bytes of 16-bit fractions between `mins` and `maxs`, of
                          sign(x) log(1 + |x|) per axis
     quats                the three smaller of w x y z as fractions of [-sqrt(1/2), sqrt(1/2)]; alpha - 252
-                         says which one is left out (it is positive)
+                         is the index of the omitted one, the largest (it is positive)
     scales               indices into `codebook` of log scales
     sh0                  rgb: indices into `codebook` of f_dc; alpha: opacity (not a logit)
     shN, optional        files[1]: 16-bit number of a palette entry; files[0]: the palette, 64 entries a
                          row, one pixel per coefficient, rgb: indices into `codebook`
 
 Opacities of 0 and 1 become logits of -infinity and +infinity. `model: "antialiased"`, in older files
-`antialias: true`, says that the Gaussians were trained with Mip-Splatting's compensation. Pixels behind the
-last Gaussian are black; others, and what the file holds beside all this, are passed over, which is said.
+`antialias: true`, says that the Gaussians were trained with Mip-Splatting's compensation. Pixels after the
+last Gaussian are black. Other pixels there, and all other content of the file, are ignored and reported.
 Source: PlayCanvas' public specification.
 """
 
@@ -37,15 +37,15 @@ from langsplat_core.io.quantised import check_steps, smallest_three, to_bytes, w
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
 META_NAME = "meta.json"
-META_LIMIT = 1024 * 1024  # bytes; a real one has three codebooks, 15 kB
-PALETTE_ROW, PALETTE_ROWS = 64, 1024  # entries a row, most rows
+META_LIMIT = 1024 * 1024  # bytes; a real file has three codebooks, 15 kB
+PALETTE_ROW, PALETTE_ROWS = 64, 1024  # entries per row, and most rows
 IMAGE_LIMIT = 1 << 30  # bytes of one image file
 SLACK_PIXELS = 65536
 
 Fetch = Callable[[str, int], bytes]  # (file name, most bytes) -> content
 
 
-# What is read of `meta.json`.
+# Entries of `meta.json` that are read.
 
 Number = Annotated[float, Meta(ge=-1e30, le=1e30)]
 Whole = Annotated[int, Meta(ge=0, le=2**32)]
@@ -96,8 +96,8 @@ ENTRIES = {*_Meta.__struct_encode_fields__, "version", "asset"}
 def read_sog_scene(path: Path | str) -> Scene:
     """Return the Gaussians of a SOG folder, its `meta.json` or a `.sog` file.
 
-    The scene says whether they are to be drawn antialiased. Raises InputError when a file cannot be opened
-    and FormatError when it breaks a rule of the format.
+    `antialiased` is set as in the file. Raises InputError if a file cannot be opened and FormatError if it
+    breaks a rule of the format.
     """
     path = Path(path)
     if path.is_dir():
@@ -107,13 +107,13 @@ def read_sog_scene(path: Path | str) -> Scene:
         images = [file.name for file in path.parent.glob("*.webp")]
         return _decode(lambda name, limit: hostile.read_file(path.parent / name, limit), path, size, images)
     with hostile.opened_archive(path, "SOG archive") as archive:
-        # The images are compressed already, so a member far larger than its archive is a trap.
+        # The images are compressed already, so a member far larger than its archive is hostile.
         most, about = 16 * archive.size + META_LIMIT, (path / META_NAME, archive.size, archive.names)
         return _decode(lambda name, limit: archive.read(name, min(limit, most)), *about)
 
 
 def _decode(fetch: Fetch, meta_path: Path, size: int, files: Iterable[str]) -> Scene:
-    """Decode the scene, of `size` bytes, whose `files` `fetch` finds by the last part of `meta_path`."""
+    """Return the scene in `files` of `size` bytes together, of which `fetch` returns the content by name."""
     text = fetch(meta_path.name, META_LIMIT)
     version = hostile.decode_json(text, _Versioned, meta_path).version
     if version != 2:
@@ -153,7 +153,7 @@ def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
         if entry.max(initial=0) >= len(palette):
             raise malformed(planes.path, f"a label of 'shN' is beyond the {len(palette)} of its palette")
         rest = np.array(meta.higher.codebook, np.float32)[palette[entry]]
-    with np.errstate(over="ignore"):  # overflow to infinity makes rows that are dropped later
+    with np.errstate(over="ignore"):  # rows that overflow to infinity are dropped later
         means = np.sign(logs) * np.expm1(np.abs(logs))
     return Gaussians(
         means=means,
@@ -169,13 +169,13 @@ def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
 
 
 class _Planes:
-    """The images, each checked before it is decoded."""
+    """The images of a scene, each checked before it is decoded."""
 
     def __init__(self, fetch: Fetch, path: Path, count: int) -> None:
         self.path, self.count, self._fetch = path, count, fetch
         self.read = {path.name}  # names of files
-        self.told: list[str] = []  # of what was guessed
-        self.beyond = 0  # pixels behind the last Gaussian that are not black
+        self.told: list[str] = []  # lines about what was guessed
+        self.beyond = 0  # pixels after the last Gaussian that are not black
 
     def of_gaussians(self, name: str) -> Array:
         """Return the (N, 4) uint8 rgba of an image."""
@@ -193,7 +193,7 @@ class _Planes:
         return pixels[:rows].reshape(rows * PALETTE_ROW, coefficients, 4)[:entries, :, :3]
 
     def _image(self, name: str, suits: Callable[[int, int], bool]) -> Array:
-        """Return (H, W, 4) uint8; `suits` judges (width, height) before anything is decoded."""
+        """Return (H, W, 4) uint8; suits: whether (width, height) is allowed, checked before decoding."""
         if not hostile.is_plain_name(name):
             raise malformed(self.path, f"{quoted(name)} is no plain file name")
         self.read.add(name)
@@ -203,25 +203,25 @@ class _Planes:
             if not suits(*image.size):
                 size = f"{image.width}x{image.height}"
                 raise malformed(what, f"{size} pixels do not suit {self.count} Gaussians")
-            # A lossless image of full opacity is stored without alpha: convert makes it 255 again.
+            # Lossless images of full opacity are stored without alpha; `convert` restores 255.
             return np.asarray(image.convert("RGBA"))
 
 
 # Writing: one `.sog` file, rows in their order.
 
 CODES = 256  # entries of a codebook
-ROUNDS = 30  # of Lloyd's algorithm for one
-HALVINGS = 16  # that make the palette of higher coefficients, of 65536 entries at most
+ROUNDS = 30  # of Lloyd's algorithm
+HALVINGS = 16  # of median cut, for a palette of 65536 entries at most
 
 
 def write_sog(path: Path | str, scene: Scene) -> None:
     """Write a bundled .sog, atomically; rows keep their order.
 
     Positions are rounded to 1/65535 of the scene's extent in sign(x) log(1 + |x|), quaternions and opacities
-    to 1/255; scales, colours and higher coefficients to the nearest of 256 values each, chosen for the
-    scene; with more than 65536 Gaussians the higher coefficients of several are one entry of a palette. A row
-    that cannot be drawn is written with opacity 0. Raises InputError where the steps of positions are larger
-    than most Gaussians.
+    to 1/255; scales, colours and higher coefficients to the nearest of 256 values each, fitted to the scene.
+    With more than 65536 Gaussians several share the higher coefficients of a palette entry. A row that cannot
+    be drawn is written with opacity 0. Raises InputError if the steps of positions are larger than most
+    Gaussians.
     """
     gaussians = scene.gaussians
     valid, count = gaussians.valid(), len(gaussians)
@@ -289,12 +289,12 @@ def write_sog(path: Path | str, scene: Scene) -> None:
 
 
 def _coded(values: Array, counts: Array) -> tuple[Array, Array]:
-    """Return (N, C) uint8 codes and their (256,) rising values: Lloyd's algorithm over rows that count."""
+    """Return (N, C) uint8 codes and their (256,) rising values: Lloyd's algorithm over rows of `counts`."""
     known = np.sort(values[counts].ravel())
     if len(known) == 0:
         return np.zeros(values.shape, np.uint8), np.zeros(CODES)
     sums = np.concatenate([[0.0], np.cumsum(known)])
-    # Half of the first values by how many there are, half evenly over their range: tails count too.
+    # Initial values: half at quantiles, half evenly over the range, for the tails.
     even = np.linspace(known[0], known[-1], CODES // 2)
     book = np.sort(np.concatenate([np.quantile(known, np.linspace(0, 1, CODES - len(even))), even]))
     for _ in range(ROUNDS):
@@ -306,10 +306,10 @@ def _coded(values: Array, counts: Array) -> tuple[Array, Array]:
 
 
 def _palette(values: Array, counts: Array) -> tuple[Array, Array]:
-    """Return the (N,) number of a palette entry, and (P, D) entries.
+    """Return the (N,) palette entry of each row, and the (P, D) entries.
 
-    Every row that counts has its own while there is room; else entries are the means of groups that are
-    halved where they vary most (median cut).
+    Up to 65536 rows of `counts` have an entry each; else entries are means of groups by median cut, along
+    the axis of largest variance.
     """
     rows = values[counts]
     own = np.zeros(len(rows), np.int64)

@@ -1,13 +1,13 @@
-"""The .spz file of Niantic: its container, one block of bytes per attribute, and quantised Gaussians in it.
+"""Niantic's .spz: the container, with one block of bytes per attribute, and the quantised Gaussians in it.
 
 Versions 1 to 3 are one gzip stream (a few tools write it without gzip) of a 16-byte header and the blocks
 in the order of `_Header.widths`. Version 4 is a header of 32 bytes, extension records up to the byte that the
 header names, a table of (compressed, whole) sizes as uint64, and one Zstandard frame per block. In
-versions 2 and 3 extension records lie behind the last block. A record is a uint32 type, a uint32 length
-and so many bytes; the only one that is read is the axes' (SPZ_ADOBE_coordinate_system), an index into
-LDB RDB LUB RUB LDF RDF LUF RUF (left or right, down or up, back or forward), from 1; z up, from 9, is not
-read. Without it a file should be RUB (x to the right, y up, z backwards), but splat-transform, gsply and
-Niantic's ply_to_spz leave a PLY's RDF as it is.
+versions 2 and 3 extension records follow the last block. A record is a uint32 type, a uint32 length and that
+number of bytes. Only the record of the axes is read (SPZ_ADOBE_coordinate_system): an index into
+LDB RDB LUB RUB LDF RDF LUF RUF (left or right, down or up, back or forward), from 1; axes with z up, from 9,
+are not supported. Without this record a file should be RUB (x to the right, y up, z backwards), but
+splat-transform, gsply and Niantic's ply_to_spz keep a PLY's RDF.
 
 Source of the layout: README, extensions and loader of nianticlabs/spz; the code here is our own.
 """
@@ -36,7 +36,7 @@ MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 ANTIALIASED, EXTENDED = 0x1, 0x2  # flags
 AXES_RECORD, AXES = 0xADBE0003, {"rub": 4, "rdf": 6}
 SPZ_SH_COUNTS = (1, 4, 9, 16, 25)  # of degree 0 to 4, the base colour included
-SLACK = 1024 * 1024  # bytes of records behind the Gaussians
+SLACK = 1024 * 1024  # bytes, at most, of records after the Gaussians
 _HEADER = struct.Struct("<4sIIBBBB")
 
 
@@ -66,9 +66,9 @@ class _Header:
 
 
 def _read(file: BinaryIO, size: int, path: Path, room: Allowance, axes: int, tell: Tell) -> tuple[Scene, int]:
-    """Return the scene of a file of `size` bytes, and the axes, 1 to 8, that it names, 0 for none.
+    """Return the scene in a file of `size` bytes, and the axes, 1 to 8, that it names, 0 for none.
 
-    What it can honestly hold is known before anything is unpacked. axes: of a file that does not say.
+    Sizes are checked before anything is unpacked. axes: of a file that does not name them.
     """
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
@@ -76,7 +76,7 @@ def _read(file: BinaryIO, size: int, path: Path, room: Allowance, axes: int, tel
     try:
         start = stream.read(_HEADER.size)
         if len(start) < _HEADER.size or not start.startswith(MAGIC):
-            what = f"neither it nor what is zipped begins with {MAGIC.decode()}"
+            what = f"neither it nor its unzipped content begins with {MAGIC.decode()}"
             raise malformed(path, f"not an .spz file: {what}")
         header = _Header(*_HEADER.unpack(start))
         if not 1 <= header.version <= 4 or header.sh_degree >= len(SPZ_SH_COUNTS):
@@ -90,7 +90,7 @@ def _read(file: BinaryIO, size: int, path: Path, room: Allowance, axes: int, tel
             raise malformed(path, f"truncated: {header.count} Gaussians need {sum(sizes)} bytes of {size}")
         else:
             blocks = [stream.read(size) for size in sizes]
-            records = stream.read(SLACK + 1)  # to the end, where gzip checks its sum
+            records = stream.read(SLACK + 1)  # to the end, where gzip checks its checksum
     except (OSError, EOFError, zlib.error) as error:
         raise malformed(path, f"not a whole gzip stream ({str(error)[:80]})", "fetch it again") from None
     if [*map(len, blocks)] != sizes or len(records) > SLACK:
@@ -108,7 +108,7 @@ def _read(file: BinaryIO, size: int, path: Path, room: Allowance, axes: int, tel
 def _read_streams(
     file: BinaryIO, size: int, header: _Header, wholes: list[int], path: Path, tell: Tell
 ) -> tuple[list[bytes], bytes]:
-    """Read version 4 behind its first 16 bytes: blocks of `wholes` bytes, and records."""
+    """Return blocks of `wholes` bytes, and records, of version 4 after its first 16 bytes."""
     content = file.read(size)
     (table_at,) = struct.unpack_from("<I", content.ljust(4))
     records, table = content[16 : table_at - 16], content[max(table_at - 16, 16) :][: 16 * header.streams]
@@ -116,7 +116,7 @@ def _read_streams(
     if table_at < 32 or len(table) < 16 * header.streams:
         raise malformed(path, f"truncated: its table at byte {table_at} of {size}")
     entries = np.frombuffer(table, "<u8").reshape(-1, 2).tolist()
-    stored = [whole for whole in wholes if whole]  # blocks without a byte have no stream
+    stored = [whole for whole in wholes if whole]  # empty blocks have no stream
     if [whole for _, whole in entries if whole] != stored:
         raise malformed(path, f"the sizes in its table are not those of {header.count} Gaussians")
     end = at + sum(zipped for zipped, _ in entries)
@@ -133,8 +133,8 @@ def _read_streams(
 
 
 def _unpacked(data: bytes, size: int, path: Path) -> bytes:
-    """Return the content of a Zstandard frame; never more than a byte beyond `size` is unpacked."""
-    import zstandard  # needed by version 4 alone
+    """Return the content of a Zstandard frame; at most `size` + 1 bytes are unpacked."""
+    import zstandard  # only for version 4
 
     try:
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as reader:
@@ -144,7 +144,7 @@ def _unpacked(data: bytes, size: int, path: Path) -> bytes:
 
 
 def _axes(records: bytes, path: Path, tell: Tell) -> int:
-    """Return the axes that the first such extension record names, 0 without; old layouts end the search."""
+    """Return the axes that an extension record names, 0 without one; an incomplete record ends the search."""
     at, axes, others = 0, 0, set[str]()
     while at + 8 <= len(records):
         kind, length = struct.unpack_from("<II", records, at)
@@ -165,32 +165,32 @@ def _axes(records: bytes, path: Path, tell: Tell) -> int:
 
 # ---- quantised Gaussians, about ten times smaller than the PLY ----
 #
-#     positions   three 24-bit fixed-point numbers; the header says how many bits are behind the point
+#     positions   three 24-bit fixed-point numbers, with the header's number of fractional bits
 #                 (version 1: three float16)
 #     alphas      opacity in 8 bits
 #     colours     0.5 + 0.15 f_dc in 8 bits each
 #     scales      16 (logarithm + 10) in 8 bits each
-#     rotations   from version 3 on: 2 bits for which of x y z w is largest and left out (it is positive),
-#                 and a sign and 9 bits of magnitude over sqrt(1/2) for each of the others; before: x y z in 8
-#                 bits over [-1, 1] each (w is positive)
+#     rotations   from version 3 on: 2 bits for the index in x y z w of the largest, which is omitted (it is
+#                 positive), and a sign and 9 bits of magnitude over sqrt(1/2) for each of the others; before:
+#                 x y z in 8 bits over [-1, 1] each (w is positive)
 #     sh          128 + 128 times the coefficient, red green blue of one coefficient after the other
 #
-# What is read are versions 1 to 4; degree 4, which nothing here can draw, is left out, and that is said.
+# Versions 1 to 4 are read; coefficients of degree 4, which nothing here draws, are dropped and reported.
 #
-# Version 3 is written unless told otherwise. Its rotations are exact to 0.1 degrees where those of version 2
-# err by up to a degree. What reads the newer version 4, which differs in the container alone, reads 3 too,
-# but for PlayCanvas's engine, and many that read 3 do not know 4. Both hold the record of the axes.
+# Version 3 is written by default. Its rotations are exact to 0.1 degrees; those of version 2 err by up to a
+# degree. Version 4 differs only in the container. Programs that read it also read 3, except PlayCanvas's
+# engine, and many read only 3. Both have the record of the axes.
 
 COLOUR_SCALE = 0.15
 SMALLEST, LARGEST = -10, 255 / 16 - 10  # logarithms of sizes
-FRACTIONAL_BITS = 12  # what other writers use: steps of 1/4096, up to 2048
+FRACTIONAL_BITS = 12  # as in other writers: steps of 1/4096, up to 2048
 
 
 def read_spz_scene(path: Path | str, axes: str = "", note: Tell = lambda line: None) -> Scene:
-    """Return the scene of a .spz file; InputError where it cannot be opened, else FormatError.
+    """Return the scene of a .spz file; InputError if it cannot be opened, else FormatError.
 
-    axes: of `AXES`, of a file that does not say; "" takes it for RUB, and says where it looks upside down so.
-    note: is told what was taken for granted.
+    axes: in `AXES`, of a file that does not name them; "" stands for RUB, with a warning if the scene is then
+    upside down. note: gets a line about axes that were assumed.
     """
     path = Path(path)
     file, size = open_for_reading(path)
@@ -208,21 +208,21 @@ def read_spz_scene(path: Path | str, axes: str = "", note: Tell = lambda line: N
 
 
 def decode_spz(data: bytes, path: Path, room: Allowance, tell: Tell) -> Scene:
-    """Return the scene of an .spz file in memory, along the axes of the PLY.
+    """Return the scene of an .spz file in memory, in the axes of the PLY.
 
-    path: for messages; room: of the file that it is a part of. Raises FormatError.
+    path: for messages; room: of the file that contains it. Raises FormatError.
     """
     return _read(io.BytesIO(data), len(data), path, room, AXES["rub"], tell)[0]
 
 
 def _floor_is_above(path: Path, scene: Scene) -> bool:
-    """Return whether a height near the top has twice the level surface of any near the bottom.
+    """Return True if a height near the top has twice the horizontal surface of any near the bottom.
 
-    Up is as cameras beside the file have it, or those of its .ply. In real scenes the right way up the floor
-    has 3 to 200 times what any height near the top has.
+    Up is that of the cameras beside the file, or beside a .ply of its name. In real scenes in the right
+    orientation the floor has 3 to 200 times the surface of any height near the top.
     """
     for beside in (path.with_suffix(SUFFIX), path.with_name(path.name + SUFFIX)):
-        with suppress(InputError):  # told of by who needs them
+        with suppress(InputError):  # reported when the scene's cameras are read
             scene = replace(scene, cameras=read_cameras(beside)) if beside.exists() else scene
     count, up = len(scene.gaussians), scene.up()
     some = scene.gaussians.take(np.arange(0, count, count // 20_000 + 1))
@@ -238,7 +238,7 @@ def _floor_is_above(path: Path, scene: Scene) -> bool:
 
 
 def _scene(header: _Header, blocks: dict[str, Array], axes: int, tell: Tell) -> Scene:
-    """blocks: attribute -> (N, bytes of one Gaussian) uint8."""
+    """Return the scene in `blocks`: attribute -> (N, bytes of one Gaussian) uint8."""
     degree = min(header.sh_degree, 3)
     if degree < header.sh_degree:
         tell(f"its spherical harmonics of degree {header.sh_degree} are cut to {degree}")
@@ -257,19 +257,19 @@ def _scene(header: _Header, blocks: dict[str, Array], axes: int, tell: Tell) -> 
 
 
 def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub") -> None:
-    """Write .spz version 3 or 4 along axes of `AXES`, which it records, atomically; rows keep their order.
+    """Write .spz version 3 or 4 in axes of `AXES`, which it records, atomically; rows keep their order.
 
-    Positions are rounded to 1/4096 world unit, or finer where the Gaussians are smaller than that; scales
-    to 1/16 in the logarithm, within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1 (other
-    writers round them to 1/16 and 1/8, for still smaller files); colours and opacities to 1/255. A row that
-    cannot be drawn is written with opacity 0, and sizes that are cut are warned of. Raises InputError for a
-    scene so large that 24 bits cannot tell its positions apart, or whose sizes it cannot say.
+    Positions are rounded to 1/4096 world unit, or finer for smaller Gaussians; scales to 1/16 in the
+    logarithm, within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1 (other writers round them to 1/16
+    and 1/8, for smaller files); colours and opacities to 1/255. A row that cannot be drawn is written with
+    opacity 0; sizes beyond the range are cut and reported. Raises InputError for a scene too large for 24
+    bits per coordinate, or if most sizes are beyond the range.
     """
     gaussians, valid = scene.gaussians, scene.gaussians.valid()
-    drawn = mirrored(gaussians.take(valid), _signs_to_rdf(AXES[axes]))  # its own inverse
+    drawn = mirrored(gaussians.take(valid), _signs_to_rdf(AXES[axes]))  # the map is its own inverse
     bits = _fractional_bits(drawn, Path(path))
     sizes = drawn.log_scales.max(axis=1, initial=-np.inf)
-    cut = (sizes > LARGEST + 0.1) | (sizes < SMALLEST - 0.1)  # tenths are rounding
+    cut = (sizes > LARGEST + 0.1) | (sizes < SMALLEST - 0.1)  # 0.1 is within rounding
     if 2 * np.count_nonzero(cut) > len(sizes):
         what = f"sizes around {np.exp(np.median(sizes)):.2g} are beyond .spz, 4.5e-5 to 380"
         raise InputError(f"{path}: {what} world units; write .ply or .sog")
@@ -295,7 +295,7 @@ def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub
     streams = 0 if version == 3 else len(blocks)
     head = _HEADER.pack(MAGIC, version, len(valid), gaussians.sh_degree, bits, flags, streams)
     record = struct.pack("<III", AXES_RECORD, 4, AXES[axes])
-    if version == 3:  # without a time: the same scene, the same bytes
+    if version == 3:  # without a time, so that equal scenes give equal bytes
         content = gzip.compress(b"".join([head, *blocks, record]), mtime=0)
     else:
         import zstandard
@@ -308,7 +308,7 @@ def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub
 
 
 def _fractional_bits(drawn: Gaussians, path: Path) -> int:
-    """Bits behind the point: as many as other writers use, more for a small scene, fewer for a large one."""
+    """Return the fractional bits of positions: `FRACTIONAL_BITS`, more in small scenes, fewer in large."""
     if len(drawn) == 0:
         return FRACTIONAL_BITS
     reach = max(float(np.abs(drawn.means).max()), 1e-30)
@@ -317,18 +317,18 @@ def _fractional_bits(drawn: Gaussians, path: Path) -> int:
     least = int(np.ceil(-size / np.log(2))) if np.isfinite(size) else 0  # a step of its size
     if most < FRACTIONAL_BITS:
         check_steps(path, drawn, np.full(len(drawn), 2.0**-most))
-    if most < 0:  # however large the Gaussians are: there are no steps of more than a unit
+    if most < 0:  # steps of more than a unit do not exist, however large the Gaussians are
         raise InputError(f"{path}: positions up to {reach:.3g} are beyond the 24 bits of .spz; write .ply")
-    # The median Gaussian keeps its place to a sixteenth of its size. 24 bits hold the scene, and beyond
-    # 30 bits behind the point other readers overflow.
+    # The median Gaussian's position is exact to a sixteenth of its size. 24 bits hold the scene; with more
+    # than 30 fractional bits other readers overflow.
     return max(0, min(most, max(FRACTIONAL_BITS, least + 4), 30))
 
 
 def _positions(header: _Header, data: Array) -> Array:
-    """Return (N, 3) positions along the axes of the file."""
+    """Return (N, 3) positions in the axes of the file."""
     if header.version == 1:
         return np.ascontiguousarray(data).view("<f2").astype(np.float32)
-    # 24 bits each: with a byte of zeros below them they are 256 times as much, in 32
+    # 24 bits each, padded below to int32, which multiplies them by 256
     codes = np.pad(data.reshape(len(data), 3, 3), ((0, 0), (0, 0), (1, 0))).view("<i4")[..., 0] >> 8
     return codes / 2.0**header.fractional_bits
 
@@ -336,7 +336,7 @@ def _positions(header: _Header, data: Array) -> Array:
 def _rotations(header: _Header, data: Array, tell: Tell) -> Array:
     """Return (N, 4) unit quaternions w x y z."""
     if header.version < 3:
-        return smallest_three(data / 127.5 - 1, np.zeros(len(data), np.intp), tell)  # all but w
+        return smallest_three(data / 127.5 - 1, np.zeros(len(data), np.intp), tell)  # w is omitted
     words = np.ascontiguousarray(data).view("<u4")[:, 0]
     three = np.stack([words >> shift & 1023 for shift in (20, 10, 0)], axis=1)
     magnitudes = (three & 511) / 511 * np.sqrt(0.5)
@@ -345,7 +345,7 @@ def _rotations(header: _Header, data: Array, tell: Tell) -> Array:
 
 
 def _rotation_codes(quats_wxyz: Array) -> Array:
-    """Pack (N, 4) quaternions of any length into the (N, 4) bytes of version 3."""
+    """Return the (N, 4) bytes of version 3 for (N, 4) quaternions of any length."""
     three, largest = without_largest(quats_wxyz[:, [1, 2, 3, 0]])
     codes = np.rint(np.abs(three) * np.sqrt(2) * 511).clip(0, 511).astype(np.uint32)
     codes |= (three < 0) * np.uint32(512)
@@ -354,6 +354,6 @@ def _rotation_codes(quats_wxyz: Array) -> Array:
 
 
 def _signs_to_rdf(axes: int) -> Array:
-    """Return (3,) 1 or -1 from `axes` (less 1: bits of right, up, front) to right, down, front of the PLY."""
+    """Return (3,) signs from `axes` (axes - 1 has bits right, up, front) to right, down, front of the PLY."""
     right, up, front = (axes - 1 >> bit & 1 for bit in range(3))
     return np.array([1 if right else -1, -1 if up else 1, 1 if front else -1])
