@@ -20,15 +20,16 @@ from langsplat_core.scene import Gaussians
 
 # Paths that are typed.
 
-MOST_OFFERED = 8
+MOST_OFFERED = 1000
 
 
 def completions(typed: str, folder: Path, suffixes: tuple[str, ...] = ()) -> list[str]:
-    """Return the first folders, and files with these suffixes, whose paths go on from what was typed."""
-    found = glob(f"{escape(os.path.join(folder, os.path.expanduser(typed)))}*")  # no hidden ones
+    """Return the folder above, and the first folders, and files with these suffixes, that begin as typed."""
+    begun = os.path.join(folder, os.path.expanduser(typed))
+    above, found = os.path.dirname(os.path.dirname(begun)), glob(f"{escape(begun)}*")  # no hidden ones
     paths = ((path, os.path.isdir(path)) for path in sorted(found) if is_utf8(Path(path)))
     offered = (path + os.sep * is_dir for path, is_dir in paths if is_dir or path.lower().endswith(suffixes))
-    return list(islice(offered, MOST_OFFERED))
+    return [os.path.join(above, ""), *islice(offered, MOST_OFFERED)]
 
 
 # A scene's files that change while it is shown. A thread of its own looks about once a second, so that the

@@ -122,8 +122,7 @@ def write_film(out: Path, count: int, fps: float, draw: Draw) -> None:
     Raises InputError where PyAV fails, OSError where nothing can be written, and what
     `draw` does; a file is then as it was before.
     """
-    write = _write_folder if is_folder(out) else _write_video
-    write(out, count, fps, draw)
+    (_write_folder if is_folder(out) else _write_video)(out, count, fps, draw)
 
 
 def _write_folder(out: Path, count: int, fps: float, draw: Draw) -> None:

@@ -314,6 +314,7 @@ class ViewerState(SceneState):
     show_start: bool = False  # the start page, in place of panels and scene
     show_palette: bool = False
     resets_panels: bool = False  # at the next frame
+    unfolds: bool = False  # the search, once the three levels are left
     choice: FileChoice | None = None  # what a dialog asks for, while one is open
     extension_panels: dict[str, Any] = field(default_factory=dict)  # title -> what an extension's panel keeps
     preferences: Preferences = field(default_factory=Preferences)

@@ -240,8 +240,11 @@ class Window:
         self.viewer.surface = self._canvas
         self.viewer.worker.wake = self.viewer.recorder.wake = self.viewer.watch.wake = glfw.post_empty_event
         self.viewer.watch.start()
-        imgui.get_io().config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
-        imgui.get_io().config_flags |= imgui.ConfigFlags_.nav_enable_keyboard
+        io = imgui.get_io()
+        io.config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
+        io.config_debug_highlight_id_conflicts = False  # tests look for them
+        io.config_drag_click_to_input_text = True  # numbers are dragged, or clicked and typed
+        io.config_flags |= imgui.ConfigFlags_.nav_enable_keyboard
         glfw.set_drop_callback(glfw_window_hello_imgui(), lambda _, paths: self.drop(paths))  # type: ignore[arg-type,misc]
         settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
         if self._path is None:

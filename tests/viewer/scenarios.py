@@ -356,6 +356,31 @@ def drag_the_crop_box(s: Any) -> None:
     assert 0 < inside.sum() < len(means)
 
 
+def use_the_mouse_alone(s: Any) -> None:
+    """A threshold goes back, numbers are dragged, dialogs lead to folders, a small window shows the scene."""
+    wide = s.state.size[0]
+    s.search("mug")
+    s.open_panel("Search", frames=3)
+    s.click("//Search/Threshold, scores, place")
+    queries.set_cut(s.viewer, "mug", 0.6)
+    s.click("//Search/Auto##cut")
+    assert s.state.session.queries[0].cut is None
+    s.open_panel("Transform", frames=2)
+    x, y = s.ctx.item_info("//**/Scale").rect_full.get_center()
+    s.drag((x, y), (x + 60, y))
+    assert s.state.edit_form.scale > 1.05
+    (s.folder / "within").mkdir()
+    s.menu("File", "Open a scene ...")
+    for name in ("within\\/", ".. (the folder above)", "plain.ply", "Open"):
+        s.click(f"//**/{name}")
+    s.shows("plain.ply")
+    glfw.set_window_size(glfw_window_hello_imgui(), 400, 300)
+    s.until(lambda: 200 < s.state.size[0] < 400)
+    assert s.ctx.item_info("//**/Train one ...").rect_full.max.x < scene_area().corners[1].x
+    glfw.set_window_size(glfw_window_hello_imgui(), 1040, 620)
+    s.until(lambda: s.state.size[0] == wide)
+
+
 def compare_two_scenes(s: Any) -> None:
     """Right of the line another scene is drawn by the same camera; without the line it is gone."""
     viewer, area = s.viewer, scene_area()

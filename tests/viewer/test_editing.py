@@ -341,6 +341,14 @@ def test_export_size_is_said_before_it_is_written(viewer, tmp_path, suffix):
     assert unit == "MB"
 
 
+def test_folder_to_export_to_has_a_free_name(opened):
+    opened.state.export_form = form_of(opened, "map for a robot")
+    saving.choose_export(opened)
+    assert (opened.state.choice.kind, opened.state.choice.start.name) == ("save", "blobs-map-001")
+    said = saving.export_size(opened, form_of(opened, "scene", suffix=".splat"))
+    assert said == "About 0.012 MB"  # and not 0.0
+
+
 @pytest.mark.parametrize(
     ("title", "name", "what"),
     [("web page", "a.html", "opens in any browser"), ("scene", "a.spz", "240 Gaussians")],

@@ -162,11 +162,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_typed_path_is_completed_by_folders_and_scenes(folder):
     kinds = (".ply", ".spz")
-    assert completions("", folder, kinds) == [f"{folder}/{name}" for name in ("A.SPZ", "a.ply", "all/")]
-    assert completions("all/../a.", folder, kinds) == [f"{folder}/all/../a.ply"]
-    assert completions(f"{folder}/al", Path("/gone"), kinds) == [f"{folder}/all/"]
+    above, *offered = completions("", folder, kinds)
+    assert (above, offered) == (f"{folder.parent}/", [f"{folder}/{n}" for n in ("A.SPZ", "a.ply", "all/")])
+    assert completions("all/../a.", folder, kinds)[1:] == [f"{folder}/all/../a.ply"]
+    assert completions(f"{folder}/al", Path("/gone"), kinds) == [above, f"{folder}/all/"]
+    assert completions("/", folder, kinds)[0] == "/"
     for typed in ("b", "gone/", "a.ply/", "[a]", "x" * 5000):
-        assert completions(typed, folder, kinds) == []
+        assert completions(typed, folder, kinds)[1:] == []
 
 
 @pytest.mark.parametrize("typed", [" blobs.ply ", "all/../blobs.ply"])

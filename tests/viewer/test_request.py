@@ -185,6 +185,7 @@ def test_the_second_pane_is_what_the_display_would_show_alone(opened):
 
 def test_three_levels_of_latents_or_of_answers(opened):
     settings.toggle_levels(opened)
+    assert "Search" not in opened.state.preferences.panels
     labels = [pane.label for pane in opened.state.panes()]
     assert labels == ["Latent, subpart", "Latent, part", "Latent, whole"]
     opened.state.size = (200, 90)
@@ -200,6 +201,7 @@ def test_three_levels_of_latents_or_of_answers(opened):
     assert len({pane.ranges for pane in panes}) == 1  # they share one scale
     settings.toggle_levels(opened)
     assert [pane.label for pane in opened.state.panes()] == ["Segmentation"]
+    assert "Search" in opened.state.preferences.panels
 
 
 def test_without_a_field_levels_and_latents_are_refused(viewer):

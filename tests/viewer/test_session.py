@@ -530,8 +530,8 @@ def test_notes_are_pinned_edited_and_removed(opened):
 
 
 @pytest.mark.parametrize("leave", [saving.save_project_and_leave, saving.end])
-def test_unsaved_notes_are_asked_about_before_closing(opened, tmp_path, leave):
-    """Keyframes, too, and those of a scene that was left."""
+def test_unsaved_notes_are_asked_about_before_closing(opened, tmp_path, leave, capsys):
+    """Keyframes, too, and those of a scene that was left; the terminal names the file."""
     settings.pin_at(opened, 0.5, 0.5)
     assert not saving.may_close(opened)
     settings.escape(opened)
@@ -545,6 +545,7 @@ def test_unsaved_notes_are_asked_about_before_closing(opened, tmp_path, leave):
     leave(opened, tmp_path)
     assert opened.state.may_close
     assert len(read_project(tmp_path / "blobs-001.langsplat").session.keyframes) == 1
+    assert "blobs-001.langsplat" in capsys.readouterr().err
     assert saving.may_close(opened)
 
 

@@ -365,7 +365,7 @@ def without_field(s: Session) -> None:
     assert not s.ctx.item_exists("//**/##phrase")
     (s.folder / "images").mkdir()
     (s.folder / "images" / "1.jpg").touch()
-    s.click("//**/Train a language field ...")
+    s.click("//**/Train one ...")
     form = s.state.training_form
     assert (form.gaussians, form.dataset) == (str(s.folder / "plain.ply"), str(s.folder))
     assert s.ctx.item_exists("//**/##Gaussians")

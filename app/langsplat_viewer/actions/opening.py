@@ -169,10 +169,10 @@ def _prepare_search(viewer: Viewer) -> None:
 # Visits: a scene that was shown before is restored as it was left.
 
 
-def return_to(viewer: Viewer, visit: SceneState) -> None:
-    """Restore the scene that was just opened as it was left; its queries are asked anew."""
+def return_to(viewer: Viewer, visit: SceneState | None) -> None:
+    """Restore the scene that was just opened as it was left, if it was; its queries are asked anew."""
     state = viewer.state
-    if state.scene is None:
+    if state.scene is None or visit is None:
         return
     offset, opening = visit.origin - state.origin, visit.opening_camera  # a changed file may have another
     state.view = state.view if visit.view is None else visit.view.moved(offset)
@@ -230,12 +230,7 @@ def switch_scene(viewer: Viewer, path: Path) -> None:
     state = viewer.state
     if state.path is not None and path == state.path.absolute() and state.opening is None:
         return
-
-    def back(viewer: Viewer) -> None:
-        if path in viewer.visits:
-            return_to(viewer, viewer.visits[path])
-
-    open_scene(viewer, path, back)
+    open_scene(viewer, path, lambda viewer: return_to(viewer, viewer.visits.get(path)))
 
 
 def step_scene(viewer: Viewer, by: int) -> None:
@@ -414,7 +409,6 @@ def look_at_training(viewer: Viewer) -> None:
     if not written:
         viewer.state.say("there are no Gaussians to look at yet")
         return
-    ((path, _),) = written
 
     def done(preview: Path) -> None:
         if viewer.state.path == preview:  # in place of the checkpoint before
@@ -423,7 +417,7 @@ def look_at_training(viewer: Viewer) -> None:
             open_scene(viewer, preview)
 
     training.previewed = written
-    viewer.run("reading the Gaussians so far", lambda progress: disk.write_preview(path), done)
+    viewer.run("reading the Gaussians so far", lambda progress: disk.write_preview(written[0][0]), done)
 
 
 def watch_training(viewer: Viewer) -> None:

@@ -289,7 +289,7 @@ def export_size(viewer: Viewer, form: ExportForm) -> str:
     size *= (OPTIONS[CELL][1] / form.values.get(CELL, OPTIONS[CELL][1])) ** 2
     if row.beside:
         size += rows.mean() * sum(file.stat().st_size for file in scene_files(path)[1:] if file.exists())
-    return f"{'At most' if row.at_most else 'About'} {size / 1e6:.{0 if size >= 1e7 else 1}f} MB"
+    return f"{'At most' if row.at_most else 'About'} {float(f'{size / 1e6:.2g}'):g} MB"
 
 
 def choose_export(viewer: Viewer) -> None:
@@ -299,8 +299,7 @@ def choose_export(viewer: Viewer) -> None:
         return
     then = partial(run_export, form=form)
     new = _new_file(viewer.state, folder_of(viewer), form.suffix, f"-{form.title.split()[0]}")
-    choice = FileChoice(f"Export: {form.title}", then, "save", (form.suffix,), new)
-    ask_for(viewer, choice if form.suffix else replace(choice, kind="folder", start=new.parent))
+    ask_for(viewer, FileChoice(f"Export: {form.title}", then, "save", (form.suffix,), new))
 
 
 def run_export(viewer: Viewer, out: Path, form: ExportForm) -> None:
@@ -446,6 +445,7 @@ def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str, loses_more: b
 
 def quit_viewer(viewer: Viewer) -> None:
     """Close the window; ask first where something would be lost."""
+    viewer.state.echoes = True  # nobody reads the messages of a window that is gone
     leave(viewer, _close, "the window closes", loses_more=bool(viewer.unsaved()))
 
 

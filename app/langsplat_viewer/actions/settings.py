@@ -78,8 +78,11 @@ def compare(
     needs_field = mode == "levels" or (mode == "wipe" and DISPLAYS[second].needs_field)
     if _can_show(viewer, needs_field):
         viewer.change(split=replace(split, mode=mode, second=second, second_level=level))
-        if mode == "levels":  # whose first columns it would cover
+        if mode == "levels" and split.mode != mode:  # the search would cover its first columns
+            put(viewer.state, unfolds="Search" in (viewer.state.preferences.panels or ("Search",)))
             turn_panel(viewer, "Search", is_open=False)
+        elif mode != "levels" and take(viewer.state, "unfolds"):
+            turn_panel(viewer, "Search", is_open=True)
 
 
 def _toggle_compare(viewer: Viewer, mode: SplitMode) -> None:

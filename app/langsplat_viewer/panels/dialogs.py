@@ -185,7 +185,7 @@ def _end_modal(viewer: Viewer, name: str, cancel: str = "Cancel") -> None:
 
 # Files and folders: by the dialogs of the system, else by a path.
 
-BOX_EM = 34.0
+BOX_EM, MOST_ROWS, ABOVE = 34.0, 8.5, ".. (the folder above)"
 HELPERS = ("zenity", "kdialog", "matedialog", "qarma")  # programs that show dialogs on Linux
 
 
@@ -264,7 +264,7 @@ class FileDialogs:
 
 
 def _path_box(viewer: Viewer, choice: FileChoice) -> None:
-    """Draw a box for a path, and what the disk has that begins so."""
+    """Draw a box for a path, and what the disk has that begins so, and the folder above."""
     saves, drafts = choice.kind == "save", viewer.state.drafts
     folder = choice.start.parent if saves else choice.start
     ui.coloured(ui.elided(f"in {folder}", imgui.get_content_region_avail().x))
@@ -274,9 +274,13 @@ def _path_box(viewer: Viewer, choice: FileChoice) -> None:
     if (typed := ui.kept_box(viewer, "##path", hint, "Save" if saves else "Open")) is not None:
         settings.choose(viewer, typed)
         drafts["##path"] = typed
-    for offer in completions(drafts.get("##path", ""), folder, _offered(choice)):
-        if imgui.selectable(offer, False, imgui.SelectableFlags_.no_auto_close_popups)[0]:
-            drafts["##path"] = offer
+    offers = completions(drafts.get("##path", ""), folder, _offered(choice))
+    if ui.begin_list("offers", MOST_ROWS):
+        for offer in offers[saves:]:  # a name to save under stays when folders are looked through
+            name = Path(offer).name + os.sep * offer.endswith(os.sep) if offer != offers[0] else ABOVE
+            if imgui.selectable(name, False, imgui.SelectableFlags_.no_auto_close_popups)[0]:
+                drafts["##path"] = offer
+    imgui.end_child()
 
 
 # Exports.

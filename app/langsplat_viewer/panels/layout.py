@@ -155,14 +155,16 @@ def draw_inspector(viewer: Viewer) -> None:
                 imgui.dummy(ImVec2(0, imgui.get_style().item_spacing.y))
 
 
-def _widen(scale: float) -> None:
-    """Make the inspector's column as wide as letters want; what is docked by hand stays where it is."""
-    window, width = imgui.internal.find_window_by_name(INSPECTOR), imgui.get_main_viewport().size.x
+def _widen(before: tuple[float, float], now: tuple[float, float]) -> None:
+    """Keep the inspector's column fit for letters and window, (scale, width); by hand up to half of it."""
+    window = imgui.internal.find_window_by_name(INSPECTOR)
     node = None if window is None else window.dock_node
     while node is not None and node.parent_node is not None:
         if node.parent_node.split_axis == imgui.internal.Axis.x:
-            size = ImVec2(_share(scale, width) * width, node.size.y)
-            imgui.internal.dock_builder_set_node_size(node.id_, size)
+            own, most = abs(node.size.x - _share(*before) * before[1]) < 2, node.size.x > now[1] / 2
+            if own or most or before[0] != now[0]:
+                size = ImVec2(_share(*now) * now[1], node.size.y)
+                imgui.internal.dock_builder_set_node_size(node.id_, size)
             return
         node = node.parent_node
 
@@ -171,19 +173,19 @@ class Docks:
     """Keeps the docked windows as the state wants them."""
 
     def __init__(self) -> None:
-        self._scale = 0.0  # of the letters, in the last frame
+        self._fit = 0.0, 0.0  # scale of the letters, and the window's width, in the last frame
         self._shown: list[str] = []  # the windows of the last frame
 
     def apply(self, viewer: Viewer) -> None:
         """Open, hide and raise windows, and make their column as wide as letters want; once per frame."""
         params, state = hello_imgui.get_runner_params(), viewer.state
-        docking, scale = params.docking_params, state.preferences.ui_scale
-        if self._scale not in (0.0, scale):
-            _widen(scale)
-        self._scale = scale
+        docking, now = params.docking_params, (state.preferences.ui_scale, imgui.get_main_viewport().size.x)
+        if self._fit[0] and self._fit != now:
+            _widen(self._fit, now)
+        self._fit = now
         if settings.take(state, "resets_panels"):
             settings.prefer(viewer, panels=None, undocked=())
-            docking.docking_splits = _splits(scale, imgui.get_main_viewport().size.x)
+            docking.docking_splits = _splits(*now)
             docking.layout_reset = True
         settings.prefer(viewer, panels=tuple(opened(state)))
         for window in docking.dockable_windows:

@@ -51,7 +51,8 @@ def _row(viewer: Viewer, row: Outline) -> None:
             opened = imgui.tree_node_ex(f"{label}###row", flags)
         if _chosen("thing"):
             outline.visit(viewer, row.node)
-        _about(row, name)
+        outlined = f"outlined in {row.votes[0]} of {sum(row.votes)} photographs"
+        ui.tip(f"{name}: {row.count:,} Gaussians, {_sides(row)} world units, {outlined}")
         if imgui.begin_popup_context_item("thing"):
             _things_menu(viewer, row.node)
             imgui.end_popup()
@@ -84,11 +85,6 @@ def _chosen(menu: str) -> bool:
                 rows.set_int(place, 1 - rows.get_int(place))
             return True
     return imgui.is_item_clicked() and not imgui.is_item_toggled_open()
-
-
-def _about(row: Outline, name: str) -> None:
-    outlined = f"outlined in {row.votes[0]} of {sum(row.votes)} photographs"
-    ui.tip(f"{name}: {row.count:,} Gaussians, {_sides(row)} world units, {outlined}")
 
 
 def _sides(row: Outline) -> str:

@@ -112,7 +112,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
         queries.set_cut(viewer, query.phrase, value, is_new=not own)
     if own:
         imgui.same_line()
-        if imgui.button("Auto"):
+        if imgui.button("Auto##cut"):  # another is the level
             queries.set_cut(viewer, query.phrase, None)
     ui.coloured(f"{np.count_nonzero(result.members):,} Gaussians")
 
@@ -282,7 +282,7 @@ def draw(viewer: Viewer) -> None:
         return
     if scene is not None and scene.language is None:
         ui.small_wrapped(no_field(scene))
-        if ui.button("Train a language field ...", "From the photographs of this scene; it stays as it is"):
+        if ui.button("Train one ...", "From the photographs of this scene, which stays as it is"):
             opening.train_language(viewer)
         return
     with ui.disabled(scene is None):

@@ -198,7 +198,7 @@ def draw_transform(viewer: Viewer) -> None:
     move = _three("Move", form.move, "World units along x, y and z")
     rotate = _three("Rotate", form.rotate, "Degrees about x, then y, then z, right-handed")
     ui.leave_room("Scale", 12)
-    _, scale = imgui.input_float("Scale", form.scale, 0, 0, "%.5g")
+    _, scale = imgui.drag_float("Scale", form.scale, 0.005, format="%.5g")
     settings.put(state, edit_form=replace(form, move=move, rotate=rotate, scale=scale))
     if ui.button("Apply", "Scale and rotate about the middle of what is transformed, then move"):
         editing.apply_form(viewer)
@@ -218,7 +218,7 @@ def draw_transform(viewer: Viewer) -> None:
 
 def _three(label: str, values: Point, what: str) -> Point:
     ui.leave_room(label, 16)
-    _, (x, y, z) = imgui.input_float3(label, list(values), "%.5g")
+    _, (x, y, z) = imgui.drag_float3(label, list(values), 0.005, format="%.5g")
     ui.tip(what)
     return x, y, z
 

@@ -174,7 +174,7 @@ def draw_record(viewer: Viewer) -> None:
         settings.open_panel(viewer, "Timeline")
     record = viewer.state.record
     imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM))
-    changed, size = imgui.input_int2("Size", list(record.size))
+    changed, size = imgui.drag_int2("Size", list(record.size))
     if changed:
         width, height = (min(max(side, 1), MAX_SIDE) for side in size)
         settings.put(record, size=(width, height))
