@@ -13,7 +13,7 @@ export const cross = (a, b) => [
 export const unit = (a) => a.map((value) => value / (Math.hypot(...a) || 1));
 export const axes = ({ rotation }) => [rotation.slice(0, 3), rotation.slice(3, 6), rotation.slice(6, 9)];
 
-// A vector turned about an axis of length 1, by Rodrigues' formula.
+// A vector rotated about a unit axis, by Rodrigues' formula.
 function turned(vector, axis, angle) {
   const cosine = Math.cos(angle);
   const sine = Math.sin(angle);
@@ -22,14 +22,14 @@ function turned(vector, axis, angle) {
   return vector.map((value, i) => value * cosine + side[i] * sine + axis[i] * along);
 }
 
-// The rotation that looks ahead, with down as near as can be, of the six numbers of both directions.
+// The rotation from six numbers: a direction down, which is made perpendicular, and the direction ahead.
 function upright(directions) {
   const ahead = unit(directions.slice(3));
   const right = unit(cross(directions.slice(0, 3), ahead));
   return [...right, ...cross(ahead, right), ...ahead];
 }
 
-// Pixels of a camera in which a point is seen, and its depth.
+// The position of a point in a camera's image, pixels, and its depth.
 export function project(camera, point) {
   const [x, y, z] = axes(camera).map((axis) => inner(axis, add(point, camera.position, -1)));
   return [(camera.fx * x) / z + camera.cx, (camera.fy * y) / z + camera.cy, z];
@@ -39,15 +39,15 @@ export function project(camera, point) {
 export const cornersOf = (box) =>
   Array.from({ length: 8 }, (_, k) => Array.from(box.slice(3 * k, 3 * k + 3)));
 
-const STEP = 24; // pixels of a drag that a press of an arrow key is worth
+const STEP = 24; // pixels of a drag that equals one press of an arrow key
 const FLIGHT = 700; // ms
 const FLYING = { w: [2, 1], s: [2, -1], a: [0, -1], d: [0, 1] }; // axis of the camera, and direction
-const SPEED = 0.6; // radii a second
-const TURN = 60; // pixels of a drag a second, of the turntable
+const SPEED = 0.6; // radii per second
+const TURN = 60; // speed of the turntable, pixels of a drag per second
 
 export class Controls {
-  // page.moved() is called when the camera has another pose; page.free() has left, top, width and height of what
-  // no panel covers, pixels of CSS.
+  // page.moved() is called when the camera's pose changes; page.free() returns left, top, width and height of the area
+  // without a panel, in CSS pixels.
   constructor(element, page) {
     const { radius, up } = page.meta;
     Object.assign(this, { element, page, radius, up, moving: 0, pointers: new Map() });
@@ -68,8 +68,8 @@ export class Controls {
     addEventListener("blur", () => this.held.clear());
   }
 
-  // The camera that fills the window, at so many pixels for one of CSS: the bookmark's whole image lies in
-  // the middle of what is free.
+  // The camera that fills the window, at `dots` pixels per CSS pixel: the view's whole image is centred in the free
+  // area.
   camera(dots) {
     const { view } = this;
     const [left, top, across, along] = this.page.free().map((length) => length * dots);
@@ -113,7 +113,7 @@ export class Controls {
     }
   }
 
-  // Move by a key that was pressed; returns whether it is one that does.
+  // Move by a key; returns whether the key moves the camera.
   key(event) {
     const arrow = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
     if (arrow) {
@@ -131,14 +131,14 @@ export class Controls {
     return true;
   }
 
-  // Turn the scene on and on, or no longer; returns which.
+  // Start or stop the turntable; returns whether it turns.
   spin() {
     this.spinning = !this.spinning;
     this.run();
     return this.spinning;
   }
 
-  // Move by the time that passes, image by image, while the scene turns or a key is held.
+  // Move in every frame while the turntable is on or a key is held.
   run(last = performance.now()) {
     if (this.running) {
       return;
@@ -166,7 +166,7 @@ export class Controls {
     this.page.moved();
   }
 
-  // Turn around the pivot, `distance` ahead, by a drag in pixels; never over the pole.
+  // Orbit around the pivot, `distance` ahead, by a drag in pixels; never over the pole.
   orbit(dx, dy) {
     this.moving++;
     const { up, view } = this;
@@ -191,7 +191,7 @@ export class Controls {
     this.pose(this.view.rotation, add(aside, down, -dy * perPixel));
   }
 
-  // Come closer to the pivot by a factor; close to it, move it on ahead.
+  // Approach the pivot by a factor; close to it, move the pivot ahead.
   zoom(factor) {
     this.moving++;
     const ahead = axes(this.view)[2];
@@ -208,8 +208,8 @@ export class Controls {
     return add(this.view.position, axes(this.view)[2], this.distance);
   }
 
-  // Go to a view, or to where it was moved: position, direction down, direction ahead, and distance of the
-  // pivot, which else is as far ahead as the middle of the scene.
+  // Fly to a view, or to a pose: position, direction down, direction ahead, and distance of the pivot. For a view the
+  // pivot is as far ahead as the centre of the scene.
   go(view, moved = null) {
     if (moved) {
       const pose = { rotation: upright(moved.slice(3, 9)), position: moved.slice(0, 3) };
@@ -219,7 +219,7 @@ export class Controls {
     this.fly(view, Math.max(-inner(view.position, ahead), 0.3 * this.radius));
   }
 
-  // Look at a box's (8, 3) corners from where the camera stands, as near as they fill half of the view.
+  // Face a box's (8, 3) corners in the present direction, at the distance where they fill half of the view.
   face(corners) {
     const points = cornersOf(corners);
     const middle = points.reduce((sum, point) => add(sum, point, 1 / 8), [0, 0, 0]);
@@ -235,7 +235,7 @@ export class Controls {
     const from = this.view;
     const turn = ++this.moving;
     const begun = performance.now();
-    Object.assign(this, { distance, end: view }); // where it goes, or is
+    Object.assign(this, { distance, end: view }); // end: the pose after the flight
     if (!from || this.calm.matches) {
       this.view = view;
       return this.page.moved();

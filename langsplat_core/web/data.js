@@ -1,4 +1,4 @@
-// The scene inside the page: base64 of a deflated safetensors file, as pipeline/webpage.py packs it.
+// Reads the scene in the page: base64 of a deflated safetensors file, as pipeline/webpage.py packs it.
 
 // [page]
 const HALVES = new Float32Array(65536).map((_, bits) => {
@@ -19,8 +19,8 @@ const KINDS = {
   F64: Float64Array,
 };
 
-// Tensors by name as { values, shape }, half floats as single ones, and the JSON that lies beside them.
-// unpacked(share): called with how much of it is read.
+// Returns tensors by name as { values, shape }, half floats as Float32Array, and the JSON of the metadata.
+// unpacked(share): called with the share that has been read.
 export async function readPage(text, unpacked) {
   const letters = atob(text.trim());
   const packed = new Uint8Array(letters.length);
@@ -57,8 +57,8 @@ export async function readPage(text, unpacked) {
 const CHUNK = 256; // Gaussians that share the range of a column
 const [MEAN, SCALE, QUATERNION, OPACITY, SH] = [0, 3, 6, 10, 11]; // the first column of each property
 
-// The Gaussians as textures take them: `means` (M, 3), relative to the page's origin; `geometry`, three layers
-// of RGBA floats (mean and opacity, scales, unit quaternion) and `sh`, the coefficients four to a texel.
+// Returns the Gaussians in the layout of textures: `means` (M, 3), relative to the page's origin; `geometry`, three
+// layers of RGBA floats (mean and opacity, scales, unit quaternion); and `sh`, four coefficients per texel.
 export function unpackGaussians({ low, high, ranges }, texels) {
   const [[columns, count], [wide], [, chunks]] = [low.shape, high.shape, ranges.shape];
   const value = (column, i) => {

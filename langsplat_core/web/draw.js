@@ -1,12 +1,12 @@
-// The scene drawn with WebGL 2 by the shaders of the OpenGL backend, in three passes: project every Gaussian
-// once for a camera, splat one quad of each back to front, compose the image that is seen.
+// The renderer: WebGL 2 with the shaders of the OpenGL backend, in three passes: project every Gaussian for a
+// camera, splat a quad of each back to front, compose the displayed image.
 
 import { add, inner } from "./camera.js";
 import { unpackGaussians } from "./data.js";
 
 // [page]
-// In a worker: Gaussians ahead of the near plane, back to front by camera z, of equal ones the later first; of a
-// coarse image the large ones alone.
+// In a worker: sorts Gaussians ahead of the near plane back to front by camera z, of equal ones the later first; for
+// a coarse image only the large ones.
 function sortWorker() {
   let means;
   let large;
@@ -28,7 +28,7 @@ function sortWorker() {
       if (!(depth[0] > near && depth[0] <= far) || (coarse && !large[i])) {
         continue;
       }
-      keys[ahead] = ~bits[0]; // bits of positive floats rise with them
+      keys[ahead] = ~bits[0]; // positive floats have the order of their bits
       rows[ahead++] = i;
     }
     let otherKeys = new Uint32Array(ahead);
@@ -53,7 +53,7 @@ function sortWorker() {
   };
 }
 
-// Which Gaussians are of the two fifths that cover most: by opacity, and the area of their faces.
+// Marks the 40 % of the Gaussians that cover most, by opacity times the area of their faces.
 function large(geometry, count, texels) {
   const covered = Float32Array.from({ length: count }, (_, i) => {
     const at = 4 * (texels + i); // its scales
@@ -65,7 +65,7 @@ function large(geometry, count, texels) {
 }
 
 export class Painter {
-  // Throws an Error with a sentence for people where this browser cannot draw the scene.
+  // Throws an Error with a message for the user if this browser cannot draw the scene.
   constructor(canvas, meta, tensors) {
     const options = { antialias: false, alpha: false, powerPreference: "high-performance" };
     const gl = canvas.getContext("webgl2", options);
@@ -150,12 +150,12 @@ export class Painter {
     return { program, uniforms };
   }
 
-  // Use a program with these uniforms; arrays as they lie in memory. Names that it lacks are passed over.
+  // Use a program with these uniforms, arrays in memory order; names that it lacks are ignored.
   use(name, values) {
     const { gl } = this;
     const { program, uniforms } = this.programs[name];
     gl.useProgram(program);
-    const floats = [gl.FLOAT, gl.FLOAT_VEC2, gl.FLOAT_VEC3, gl.FLOAT_VEC4]; // by their number, less one
+    const floats = [gl.FLOAT, gl.FLOAT_VEC2, gl.FLOAT_VEC3, gl.FLOAT_VEC4]; // by length - 1
     for (const [key, value] of Object.entries(values)) {
       if (!uniforms[key]) {
         continue;
@@ -178,7 +178,7 @@ export class Painter {
     });
   }
 
-  // size: width, height, and the number of layers where there are several.
+  // size: width, height, and for an array texture the number of layers.
   texture(format, ...size) {
     const { gl } = this;
     const [kind, storage] = size[2] ? [gl.TEXTURE_2D_ARRAY, "texStorage3D"] : [gl.TEXTURE_2D, "texStorage2D"];
@@ -215,7 +215,7 @@ export class Painter {
     return { framebuffer, textures, width, height };
   }
 
-  // Show up to three layers of values of the Gaussians beside their colours.
+  // Set up to three layers of values of the Gaussians to show besides colours.
   show(layers) {
     const { gl } = this;
     this.values.fill(0);
@@ -228,8 +228,8 @@ export class Painter {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.columns, this.rows, gl.RGBA, gl.FLOAT, this.values);
   }
 
-  // Ask for the draw order of a camera, and of a coarse image; one sort runs at a time, and only the newest request waits. Resolves
-  // when the order of this camera is here (true), or that of a later one (false).
+  // Request the draw order for a camera; coarse: of large Gaussians only. One sort runs at a time, and only the newest
+  // request waits. Resolves to true when the order of this camera has arrived, to false for that of a later one.
   sort(camera, coarse = false) {
     const { near, far } = this.meta.raster;
     const ahead = camera.rotation.slice(6, 9);
@@ -266,7 +266,7 @@ export class Painter {
   }
 
   // Draw into the canvas, which gets the camera's size, or into a part of a framebuffer: { framebuffer, x, y, width,
-  // height }. appearance: { display, map, ranges, dim }.
+  // height }. appearance: { display, map, own, ranges, dim }.
   paint(camera, appearance, target = null) {
     const { width, height } = camera;
     if (!target && (this.canvas.width !== width || this.canvas.height !== height)) {
@@ -289,12 +289,12 @@ export class Painter {
     }
   }
 
-  // Project every Gaussian into three textures: where it is, its shape, its colour.
+  // Project every Gaussian into three textures: position, shape and colour.
   project(camera) {
     const { gl, meta } = this;
     const { width, height } = camera;
     const { raster } = meta;
-    // As raster.protocol.dilation.
+    // As in raster.protocol.dilation.
     const ratio = raster.focal ? (camera.fx * camera.fy) / raster.focal ** 2 : 1;
     const growth = Math.abs(ratio - 1) < 1e-6 ? 1 : Math.min(ratio, 256);
     const fitted = raster.dilation * (raster.antialiased ? Math.max(growth, 1) : growth);
@@ -343,7 +343,7 @@ export class Painter {
     this.pass(this.image, this.quads);
   }
 
-  // Turn blended values into the display that is seen.
+  // Turn blended values into the displayed image.
   compose(target, appearance) {
     const { gl, meta } = this;
     const { picture } = meta;
@@ -370,7 +370,7 @@ export class Painter {
     this.pass(target, null);
   }
 
-  // One triangle over all of a target, or the sorted quads blended over one another.
+  // Draw one triangle that covers a target, or blend the sorted quads.
   pass(target, quads) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
@@ -387,7 +387,7 @@ export class Painter {
     gl.disable(gl.BLEND);
   }
 
-  // (height, width, 4) bytes of what `paint` drew in this very task, its bottom row first, once it is drawn.
+  // The (height, width, 4) bytes of what `paint` drew in this task, bottom row first; waits until it is drawn.
   pixels({ width, height } = this.canvas) {
     const { gl } = this;
     const bytes = new Uint8Array(4 * width * height);

@@ -1,10 +1,10 @@
-// The text half of CLIP, for the words that it was taught: the plain twin of semantics/clip_plain.py.
+// The text half of CLIP for a closed vocabulary: the twin of semantics/clip_plain.py.
 
 import { sigmoid } from "./rule.js";
 import { nearest } from "./words.js";
 
 // [page]
-// What a browser says of a phrase that cannot be asked, the word that is unknown, and a known one like it.
+// Error for a phrase that cannot be searched: message, unknown word, and a known word like it.
 export class PhraseError extends Error {
   constructor(message, word = "", near = "") {
     super(message);
@@ -12,7 +12,7 @@ export class PhraseError extends Error {
   }
 }
 
-// The dot product of `size` numbers of two arrays, from a place in each.
+// The dot product of `size` numbers of two arrays, from an offset in each.
 export function dot(a, firstOfA, b, size, firstOfB = 0) {
   let sum = 0;
   for (let i = 0; i < size; ++i) {
@@ -22,7 +22,7 @@ export function dot(a, firstOfA, b, size, firstOfB = 0) {
 }
 
 export class ClipText {
-  // described: { words, config, begin, end }; weight(name): values of a tensor; dim: numbers of a vector.
+  // described: { words, config, begin, end }; weight(name): values of a tensor; dim: length of vectors.
   constructor(described, weight, dim) {
     Object.assign(this, described);
     this.weight = weight;
@@ -109,7 +109,7 @@ export class ClipText {
     return out;
   }
 
-  // Causal self-attention: each token looks at those before it and at itself.
+  // Causal self-attention: each token attends to itself and to those before it.
   attention(name, states, length) {
     const { width } = this;
     const size = width / this.config.num_attention_heads;

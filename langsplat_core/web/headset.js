@@ -1,20 +1,20 @@
-// The scene in a headset (WebXR): the page's painter, once for each eye. WebXR's room has metres, y up, and at first
-// the eyes at its origin, looking along -z.
+// The scene in a headset (WebXR), drawn by the page's painter once per eye. The room of WebXR is in metres with y up;
+// at the start the eyes are at its origin and look along -z.
 
 import { add, axes, cross, unit } from "./camera.js";
 
 // [page]
-const FLY = 1.5; // metres a second, with a stick pushed to its end
-const TURN_BY = 30; // degrees, once each time the right stick is pushed aside
-const DEAD = 0.2; // of a stick
-const AWAY = 1.5; // metres to what the page's camera turns around, in a scene of unknown size
+const FLY = 1.5; // metres per second at full deflection of a stick
+const TURN_BY = 30; // degrees per push of the right stick to a side
+const DEAD_ZONE = 0.2; // of a stick
+const AWAY = 1.5; // metres to the pivot of the page's camera in a scene of unknown scale
 
 export class Headset {
   constructor(page) {
     Object.assign(this, { page, session: null });
   }
 
-  // Begin where the page's camera is, or end; rejected where the browser or the person refuses.
+  // Start a session at the page's camera, or end it; rejects if the browser or the user refuses.
   async toggle() {
     if (this.session) {
       return this.session.end();
@@ -30,14 +30,14 @@ export class Headset {
     session.updateRenderState({ baseLayer: layer });
     const room = await session.requestReferenceSpace("local");
     const [side, , ahead] = axes(controls.view);
-    const right = unit(add(cross(ahead, meta.up), side, 1e-6)); // of a camera that looks straight down, too
+    const right = unit(add(cross(ahead, meta.up), side, 1e-6)); // also if the camera looks straight down
     const frame = [right, 0, meta.up, 0, cross(right, meta.up), 0, controls.view.position, 1].flat();
     const metres = meta.metres_per_unit ?? AWAY / controls.distance;
-    const toScene = new DOMMatrix(frame).scale3d(1 / metres); // from the room
+    const toScene = new DOMMatrix(frame).scale3d(1 / metres); // from room to scene
     Object.assign(this, { session, layer, toScene, last: null, aside: 0 });
     const next = (now, frame) => {
       session.requestAnimationFrame(next);
-      const pose = frame.getViewerPose(room); // none while the device is not tracked
+      const pose = frame.getViewerPose(room); // null while the device is not tracked
       if (pose) {
         this.draw(pose, now);
       }
@@ -45,11 +45,11 @@ export class Headset {
     session.requestAnimationFrame(next);
   }
 
-  // Fly as the head looks by the left stick, turn around the head by the right one.
+  // Fly in the direction of the head by the left stick, turn about the head by the right one.
   move(head, seconds) {
     for (const { handedness, gamepad } of this.session.inputSources) {
       const stick = gamepad?.axes.slice(-2) ?? [];
-      const [x = 0, y = 0] = stick.map((part) => (Math.abs(part) > DEAD ? part : 0));
+      const [x = 0, y = 0] = stick.map((part) => (Math.abs(part) > DEAD_ZONE ? part : 0));
       if (handedness === "right") {
         const eyes = Array.from(head.slice(12, 15));
         const turned = this.toScene.translate(...eyes).rotate(0, this.aside ? 0 : -TURN_BY * Math.sign(x), 0);
@@ -62,7 +62,7 @@ export class Headset {
     }
   }
 
-  // Rotation and position of a camera with a pose in the room.
+  // Rotation and position in the scene of a camera with a pose in the room.
   camera(pose) {
     const matrix = this.toScene.multiply(new DOMMatrix(pose)).scale(1, -1, -1).toFloat64Array();
     const [right, down, ahead, position] = [0, 4, 8, 12].map((k) => Array.from(matrix.slice(k, k + 3)));

@@ -1,5 +1,5 @@
-// Phrases asked of the scene: looked up or encoded, compared with the codebook, and answered by regions with
-// the fields of Python's QueryResult.
+// Queries: phrases are looked up or encoded, compared with the codebook, and answered by regions, as in Python's
+// query/engine.py and query/compose.py.
 
 import { ClipText, PhraseError, dot } from "./encoder.js";
 import {
@@ -24,9 +24,9 @@ import { Space } from "./space.js";
 import { namedBy, nearest, parse, phraseKey, splitPhrases, thingAndPart, tidy } from "./words.js";
 
 // [page]
-const GRID = { neighbours: 16, most: 64, side: 5 }; // as of query/answers.py, smoothed
+const GRID = { neighbours: 16, most: 64, side: 5 }; // as in `smoothed` of query/answers.py
 
-// Means of values (K) around points, by number and axis, smoothed on a grid that grows with them.
+// Means of (K) values around points, on a grid that grows with them. point(i, axis): a coordinate.
 function smoothed(point, values) {
   const count = values.length;
   const axes = [0, 1, 2];
@@ -64,7 +64,7 @@ function smoothed(point, values) {
 }
 
 export class Language {
-  // meta: what pipeline/webpage.py says of the language field; tensors: { values, shape } by name; places: mean and
+  // meta: the language field's metadata from pipeline/webpage.py; tensors: { values, shape } by name; places: mean and
   // opacity of each Gaussian.
   constructor(meta, tensors, places) {
     Object.assign(this, { meta, places });
@@ -87,8 +87,8 @@ export class Language {
     }
   }
 
-  // Answers to the phrases of a line, in their order, three at most. camera: from where left, right, nearest and
-  // so on are said. PhraseError where one of them cannot be asked.
+  // Answers to the phrases of a line, in order, three at most. camera: viewpoint for left, right, nearest and the
+  // like. Throws PhraseError if one of them cannot be searched.
   answers(line, levelName, camera) {
     const phrases = splitPhrases(line);
     const answers = phrases.slice(0, 3).map((phrase) => {
@@ -105,7 +105,7 @@ export class Language {
     return Object.assign(answers, { left: phrases.slice(3) });
   }
 
-  // A phrase with each taught name in it as one word, by spaces that do not break, the longest first.
+  // A phrase in which the words of each taught name are joined by no-break spaces, the longest name first.
   withNames(phrase) {
     const words = phrase.split(" ");
     for (let at = 0; at < words.length; ++at) {
@@ -119,8 +119,7 @@ export class Language {
     return words.join(" ");
   }
 
-  // The answer to a tree of phrases (words.js, parse): of what is asked for, the regions in whose wholes the
-  // relation holds.
+  // The answer to a tree from `parse`: regions of what is searched for, in wholes for which the relation holds.
   follow({ text, kind, what, anchor, items, count }, levelName, camera, most = 1) {
     if (!kind) {
       return this.ask(text, levelName);
@@ -153,7 +152,7 @@ export class Language {
     return this.restricted(asked, regions, other ?? asked);
   }
 
-  // Some regions by the wholes that they are parts of, or are, the largest first: each with its Gaussians.
+  // Groups of regions by the whole that they are in, the largest first, each with its Gaussians.
   things(regions) {
     const { places } = this;
     const { fewest, speck, visible } = this.meta.space;
@@ -161,7 +160,7 @@ export class Language {
     const found = groups.map((inside) => {
       const within = this.covered(inside);
       const rows = Array.from(within.keys()).filter((row) => within[row] && places[4 * row + 3] >= visible);
-      const size = inside.reduce((sum, region) => sum + this.regions.sizes[region], 0); // of all, drawn or not
+      const size = inside.reduce((sum, region) => sum + this.regions.sizes[region], 0); // in the whole scene
       const points = rows.map((row) => places.subarray(4 * row, 4 * row + 3));
       return { inside, within, rows, points, size };
     });
@@ -170,12 +169,12 @@ export class Language {
     return found.filter(({ points, size }) => points.length && size >= least);
   }
 
-  // The fit from which a region belongs to an answer, if it reached another `share` of the way down.
+  // The least fit of a member of an answer with another factor `share` of the reach.
   reached({ inside, regionFits }, share) {
     return leastFit(this.meta.rule, Math.max(...inside.map((region) => regionFits[region])), share);
   }
 
-  // The number of wholes that an answer has parts of or is, if it reached further down: a count needs as many.
+  // The number of wholes in an answer with the wider reach of `rule.wide`.
   count(answer) {
     const { level, regionFits, inside } = answer;
     const least = this.reached(answer, this.meta.rule.wide);
@@ -183,7 +182,8 @@ export class Language {
     return this.things([...new Set([...inside, ...more])]).length;
   }
 
-  // The answer to a part of a thing, on what answers to it; on what fits a plain name nearly as well, too.
+  // The answer to a part of a thing, within the answer to the thing; for a thing without adjectives, also within
+  // regions that fit it nearly as well.
   part(name, thing, other, levelName) {
     const { rule, levels } = this.meta;
     const own = thing.text && !this.taught.has(phraseKey(thing.text));
@@ -204,14 +204,14 @@ export class Language {
     return this.answer(phrase, decision, mean(asked));
   }
 
-  // As `follow`, but a thing is looked for among wholes, unless it fits none.
+  // As `follow`, but a thing is searched among wholes, unless it fits none.
   thing(tree, levelName, camera, most = 1) {
     const free = levelName === "auto" && !tree.kind && namedBy(tree.text, this.lists) === "thing";
     const whole = this.follow(tree, free ? "whole" : levelName, camera, most);
     return free && whole.peak < this.meta.rule.floor ? this.follow(tree, levelName, camera) : whole;
   }
 
-  // An answer in some regions, or outside of them; nothing is found where `needed` is not.
+  // An answer limited to some regions, or to those outside of them; it is found only if `needed` is found too.
   restricted(answer, regions, needed, outside = false) {
     const { rule } = this.meta;
     const [among, there] = [new Set(regions), this.covered(regions)];
@@ -227,7 +227,7 @@ export class Language {
     return { ...answer, inside, regionFits, best, members, values, even, peak, verdict };
   }
 
-  // The union of answers, found if all are or any is; alternatives that are not found do not count.
+  // The union of answers, found if all or any are found; alternatives not found are left out.
   joined(answers, all) {
     const found = answers.filter(({ verdict }) => all || verdict.found);
     const counting = (found.length ? found : answers).map((one) => this.restricted(one, one.inside, one));
@@ -244,7 +244,7 @@ export class Language {
     return { ...counting[0], inside, regionFits, best, members, values, even, peak, verdict };
   }
 
-  // The answer to a phrase at "auto" or a level's name. PhraseError where it cannot be asked.
+  // The answer to a plain query at "auto" or a level's name. Throws PhraseError if it cannot be searched.
   ask(text, levelName = "auto") {
     const key = phraseKey(text);
     if (!key) {
@@ -278,7 +278,7 @@ export class Language {
     return this.answer(phrase, decision, relevancies);
   }
 
-  // The unit vector of a phrase. PhraseError where this page has none and cannot make one.
+  // The unit vector of a phrase. Throws PhraseError if this page has none and cannot encode it.
   vector(key) {
     if (this.keys.has(key)) {
       const row = this.keys.get(key);
@@ -295,7 +295,7 @@ export class Language {
     return this.encoder.encode(key);
   }
 
-  // Relevancies of the codewords, and 0 behind them for a Gaussian without one.
+  // Relevancies of the codewords, followed by 0 for a Gaussian without one.
   relevancies(vector) {
     const { codebook, zero, rate } = this.tensors;
     const found = new Float32Array(this.codewords + 1);
@@ -316,7 +316,7 @@ export class Language {
     return means.map((mean) => fitOf(this.meta.rule, mean));
   }
 
-  // Relevancies of a thing or part that a phrase names; null where it cannot be asked.
+  // Relevancies of a thing or part that a phrase names; null if it cannot be searched.
   known(name) {
     const key = phraseKey(name);
     if (!key || this.taught.has(key)) {
@@ -342,7 +342,7 @@ export class Language {
     return { ...decision, phrase, peak: scores[level], values, even, members: this.covered(inside) };
   }
 
-  // An answer with what is drawn of its members and said of its best region.
+  // An answer with the smoothed heat of its members, and position and box of its best region.
   drawn(answer) {
     const { places, boxes } = this.tensors;
     const { best, members, peak, values } = answer;
@@ -360,7 +360,7 @@ export class Language {
     };
   }
 
-  // Whether each Gaussian is in one of some regions.
+  // Whether each Gaussian is in one of the given regions.
   covered(regions) {
     const [among, { regions: own }] = [new Set(regions), this.tensors];
     const isIn = (_, row) =>
@@ -368,8 +368,8 @@ export class Language {
     return Uint8Array.from({ length: this.gaussians }, isIn);
   }
 
-  // Values of the Gaussians as display/displays.py has them (heats): of an answer from `base` to 1 by what heat is
-  // of, and 0 for all others; "everywhere" minus the relevancy of each.
+  // Values of the Gaussians as in `heats` of display/displays.py: from `base` to 1 for members of an answer, by the
+  // kind of heat `of`, else 0; for "everywhere" minus the relevancy of each.
   heats(answer, of, base) {
     const { values, even } = answer;
     if (of === "everywhere") {
@@ -384,12 +384,12 @@ export class Language {
     return heats;
   }
 
-  // The least relevancy of what is in an answer.
+  // The threshold of an answer: the least relevancy of its members' regions.
   cut(answer) {
     return answer.rows.reduce((least, row) => Math.min(least, answer.even[row]), answer.peak);
   }
 
-  // Red, green and blue in [0, 1] of the language features at a level; grey where nothing was observed.
+  // Red, green and blue in [0, 1] of the language features at a level; grey without a feature.
   latents(level) {
     const { codes, palette } = this.tensors;
     const own = codes.subarray(level * this.gaussians, (level + 1) * this.gaussians);

@@ -1,4 +1,4 @@
-// The page: the panel, what is shown, and the marks over the image. All text from the scene is set as text.
+// The page: panel, state and overlays. Text from the scene is never set as HTML.
 
 import { readPage } from "./data.js";
 import { PhraseError } from "./encoder.js";
@@ -14,16 +14,16 @@ const element = (tag, text, properties = {}) =>
   Object.assign(document.createElement(tag), { textContent: text }, properties);
 const LEVELS = { auto: "Auto", subpart: "Subpart", part: "Part", whole: "Whole" };
 const DISPLAYS = { rgb: "Colours", relevancy: "Relevancy", segmentation: "Found", latent: "Latent" };
-const OF_ANSWERS = ["relevancy", "segmentation"]; // displays that need one
+const OF_ANSWERS = ["relevancy", "segmentation"]; // displays that need an answer
 const HEATS = { smooth: "Smoothed", own: "Each Gaussian", node: "Each node", everywhere: "Everywhere" };
-const OUTCOMES = { found: "found", "weak match": "weak", "not here": "none" }; // their styles
+const OUTCOMES = { found: "found", "weak match": "weak", "not here": "none" }; // class names of verdicts
 const KEYS = { c: "rgb", r: "relevancy", f: "segmentation", l: "latent" };
 const BUTTONS = { t: "spin", p: "picture", b: "boxes", h: "fold", "[": "before", "]": "after" };
-const SLOW = 60; // ms of an image while the camera moves, above which fewer pixels are drawn until it rests
-const COARSEST = 0.3;
-const REST = 180; // ms
+const SLOW = 60; // ms per frame above which the resolution is reduced while the camera moves
+const COARSEST = 0.3; // least share of the pixels in a row
+const REST = 180; // ms without a change after which the full resolution is drawn
 const MOST_BOXES = 24;
-// Pairs of the corners of a box, which are numbered by three bits, along its twelve edges.
+// Pairs of corners at the twelve edges of a box; corners are numbered by three bits.
 const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((corner) => {
   return [1, 2, 4].filter((bit) => !(corner & bit)).map((bit) => [corner, corner | bit]);
 });
@@ -36,7 +36,7 @@ class Page {
       display: "rgb",
       answers: [],
       share: COARSEST, // of the pixels in a row
-      coarse: true, // large Gaussians alone
+      coarse: true, // only large Gaussians
       moving: true,
       shown: [],
     });
@@ -58,7 +58,7 @@ class Page {
     this.open();
   }
 
-  // Fill the panel by what the scene has.
+  // Fill the panel for this scene.
   fill() {
     this.fillRadios("levels", LEVELS, "auto");
     this.fillRadios("displays", DISPLAYS, "rgb");
@@ -94,11 +94,11 @@ class Page {
     }
     const offered = language ? [...this.language.taught.keys(), ...language.phrases] : [];
     byId("list").append(...offered.map((value) => element("option", "", { value })));
-    byId("examples").append(...examples.map((phrase) => this.asking(phrase, phrase)));
+    byId("examples").append(...examples.map((phrase) => this.searchButton(phrase, phrase)));
   }
 
-  // A button that asks a phrase.
-  asking(text, phrase) {
+  // A button that searches for a phrase.
+  searchButton(text, phrase) {
     return element("button", text, { type: "button", onclick: () => this.search(phrase) });
   }
 
@@ -121,7 +121,7 @@ class Page {
     input.addEventListener("input", (event) => {
       byId("clear").hidden = !input.value;
       if (!event.inputType || event.inputType === "insertReplacementText") {
-        this.search(input.value); // one of the list was chosen
+        this.search(input.value); // an entry of the list was chosen
       }
     });
     input.addEventListener("keydown", ({ key }) => key === "Escape" && this.search(""));
@@ -145,7 +145,7 @@ class Page {
     byId("picture").addEventListener("click", () => this.save());
     byId("spin").addEventListener("click", () => (byId("spin").ariaPressed = String(this.controls.spin())));
     const offer = (offered) => (byId("headset").hidden = !offered);
-    navigator.xr?.isSessionSupported("immersive-vr").then(offer, () => {}); // rejected in a frame without the right
+    navigator.xr?.isSessionSupported("immersive-vr").then(offer, () => {}); // rejects in a frame without permission
     const refused = (problem) => this.update(Object.assign(this, { problem }));
     byId("headset").addEventListener("click", () => this.headset.toggle().catch(refused));
     let { matches: light } = matchMedia("(prefers-color-scheme: light)");
@@ -175,13 +175,13 @@ class Page {
     event.preventDefault();
   }
 
-  // Left, top, width and height of what the panel does not cover: it lies at the left, on phones below.
+  // Left, top, width and height of the area without the panel, which is at the left, on phones at the bottom.
   free() {
     const { right, top } = byId("panel").getBoundingClientRect();
     return right < 0.6 * innerWidth ? [right, 0, innerWidth - right, innerHeight] : [0, 0, innerWidth, top];
   }
 
-  // Fold or unfold all of the panel but its title and the search.
+  // Fold or unfold the panel below its title and search box.
   panel(shown) {
     byId("controls").hidden = !shown;
     byId("fold").ariaExpanded = String(shown);
@@ -189,8 +189,8 @@ class Page {
     this.redraw();
   }
 
-  // What the address says after "#": phrase, level, display, view and, where it is another, the pose; what it
-  // leaves out is as at first.
+  // The state in the address after "#": phrase, level, display, view and, if it was changed, the pose. Defaults are
+  // left out.
   state() {
     const { phrase, level, display, current } = this;
     const { rotation, position } = this.controls.end;
@@ -204,11 +204,11 @@ class Page {
     return `#${new URLSearchParams(told)}`;
   }
 
-  // Say in the address what is shown: as a step that the browser goes back from, or in place of the last one.
+  // Put the state into the address, as a new entry of the browser's history or in place of the last one.
   remember(step) {
     this.address = this.state();
     if (this.address === (location.hash || "#") || location.protocol === "about:") {
-      return; // a page in a notebook has no address of its own
+      return; // a page in a notebook has no own address
     }
     if (step) {
       location.hash = this.address;
@@ -217,7 +217,7 @@ class Page {
     }
   }
 
-  // Show what the address says.
+  // Take the state from the address.
   open() {
     if (location.hash === this.address) {
       return;
@@ -286,7 +286,7 @@ class Page {
     this.remember(true);
   }
 
-  // Bring panel and values of the Gaussians up to date with phrase, level and display.
+  // Update the panel and the values of the Gaussians for phrase, level and display.
   update() {
     const { answers, problem } = this;
     const hot = this.hot();
@@ -315,7 +315,7 @@ class Page {
     said.append(problem?.message ?? (left ? element("small", `Three at a time; not asked: ${left}`) : ""));
     if (problem?.near) {
       const meant = this.phrase.toLowerCase().replace(problem.word, problem.near);
-      said.append(" ", this.asking(`Did you mean “${meant}”?`, meant));
+      said.append(" ", this.searchButton(`Did you mean “${meant}”?`, meant));
     }
     if (this.display === "latent") {
       this.painter.show(this.language.latents(this.level === "auto" ? 2 : levels.indexOf(this.level)));
@@ -326,18 +326,18 @@ class Page {
     this.redraw();
   }
 
-  // Answers that are shown: a weak one half as hot, what is not here not at all.
+  // The answers that have a heat map: found ones and weak matches.
   hot() {
     return this.answers.filter(
       ({ best, verdict }) => best >= 0 && this.meta.picture.strength[verdict.outcome] > 0,
     );
   }
 
-  // A verdict, as the panel has it.
+  // A verdict for the panel.
   said(answer) {
     const { outcome, probability, byChance } = answer.verdict;
     const { levels, guess } = this.meta.language;
-    const share = 100 * Math.max(byChance ?? 0, 0.001); // never none
+    const share = 100 * Math.max(byChance ?? 0, 0.001); // never 0 %
     const chance = byChance === null ? "" : `, by chance ${share.toFixed(share >= 1 ? 0 : 1)} %`;
     const sure = probability === null ? chance : `, ${Math.round(100 * probability)} %`;
     const unit = this.meta.metres_per_unit === 1 ? " m" : "";
@@ -358,7 +358,7 @@ class Page {
     return said;
   }
 
-  // The colours between the ends of the heat, to half of them for a weak match, and a tick at the threshold.
+  // Draw the colour scale of an answer, up to half of it for a weak match, with a tick at the threshold.
   legend({ heat, verdict, ...answer }) {
     const [low, high] = byId("legend").querySelectorAll("span");
     [low.textContent, high.textContent] = heat.map((relevancy) => relevancy.toFixed(2));
@@ -375,8 +375,8 @@ class Page {
     map.fillRect(Math.min(Math.max(tick, 0), 254), 0, 2, 1);
   }
 
-  // What the composing shader is told, as display/displays.py has it: a weak match is half as hot. "not here" shows
-  // what it would without a phrase.
+  // Settings of the composing shader, as in display/displays.py: a weak match is half as hot. Without a heat map
+  // colours are shown.
   appearance() {
     const { display } = this;
     const { picture } = this.meta;
@@ -394,7 +394,7 @@ class Page {
     };
   }
 
-  // Corners of the boxes of an answer, the best first: one for each whole that answers or has parts that do.
+  // Corners of the boxes of an answer, the best first: one for each whole that is or contains a member.
   boxes(answer) {
     if (answer.verdict.outcome === "not here") {
       return [];
@@ -430,7 +430,7 @@ class Page {
       this.asked = 0;
       const began = performance.now();
       this.paint();
-      const early = this.moving && this.controls.moving === 1 && !location.hash; // the picture shows more
+      const early = this.moving && this.controls.moving === 1 && !location.hash; // the still shows more
       byId("still").hidden ||= Boolean(this.painter.drawn) && !early;
       if (this.moving) {
         this.keepUp(began);
@@ -445,7 +445,7 @@ class Page {
     this.draw(print);
   }
 
-  // Save what is seen, with its boxes, as a PNG.
+  // Save the image with its overlays as a PNG.
   async save() {
     const image = element("canvas");
     const scene = byId("scene");
@@ -463,7 +463,8 @@ class Page {
     });
   }
 
-  // Fewer pixels next time where an image took long, and fewer Gaussians where it took very long, until none was asked for twice as long as that.
+  // Reduce the resolution after a slow frame, and draw only large Gaussians after a very slow one. Both end when no
+  // frame was requested for `REST`, or for twice as long as the last frame took.
   keepUp(began) {
     this.painter.pixels({ width: 1, height: 1 }); // waits for the image
     const taken = performance.now() - began;
@@ -480,11 +481,11 @@ class Page {
     this.rest = setTimeout(finish, Math.max(REST, 2 * taken));
   }
 
-  // Boxes over the image, in pixels of the screen.
+  // Draw notes and boxes over the image, in pixels of the screen.
   draw(print) {
     const canvas = byId("marks");
     const { notes } = this.meta;
-    canvas.hidden = !(this.shown.length || notes.length) || !byId("boxes").checked; // a cleared one may stay
+    canvas.hidden = !(this.shown.length || notes.length) || !byId("boxes").checked;
     if (canvas.hidden) {
       return;
     }
@@ -494,7 +495,7 @@ class Page {
     Object.assign(canvas, { width, height }); // which clears it
     const context = canvas.getContext("2d");
     if (print) {
-      context.drawImage(byId("scene"), 0, 0, width, height); // what is clear is printed white
+      context.drawImage(byId("scene"), 0, 0, width, height); // transparent pixels are printed white
     }
     for (const { text, at } of notes) {
       const seen = project(camera, at);
@@ -540,8 +541,8 @@ class Page {
   }
 }
 
-// For scripts: `await langsplat` has `ask(phrase, level)`, an answer without anything shown, and `image(camera,
-// display, phrase)`, the bytes of an image of that camera's size, drawn as soon as its order is known.
+// For scripts: `await langsplat` has `ask(phrase, level)`, an answer that is not shown, and `image(camera, display,
+// phrase)`, the bytes of an image of that camera's size, drawn when its Gaussians are sorted.
 globalThis.langsplat = (async () => {
   const { tensors, meta } = await readPage(byId("data").textContent, (share) => {
     byId("loading").textContent = `Unpacking the scene: ${Math.round(100 * share)} %`;
@@ -557,7 +558,7 @@ globalThis.langsplat = (async () => {
     }
     let sorted = false;
     while (!sorted) {
-      sorted = await page.painter.sort(camera); // the page's own camera may have come between
+      sorted = await page.painter.sort(camera); // false if a later sort for the page's own camera replaced it
     }
     page.painter.paint(camera, page.appearance());
     return page.painter.pixels();

@@ -1,7 +1,7 @@
 // The rule that turns the fits of regions into an answer: the twin of query/rule.py, where the table of numbers
-// (`rule`) comes from and says what each is for.
+// (`rule`) comes from and is explained.
 //
-// Regions are { counts, parents, sizes }: of all levels one after the other, subparts first; `parents` is the
+// Regions are { counts, parents, sizes } of all levels one after the other, subparts first; `parents` has the
 // region of the level above, -1 for none.
 
 // [page]
@@ -18,24 +18,24 @@ export function mean(arrays) {
   return arrays[0].map((_, i) => arrays.reduce((sum, values) => sum + values[i], 0) / arrays.length);
 }
 
-// Fits of regions, each mixed with that of its best part. own: fits of the mean relevancy of each.
+// Fits of regions, each mixed with that of its best part. own: fits of the regions' mean relevancies.
 function regionFits(rule, regions, own) {
   const { parents, sizes } = regions;
-  const telling = (region) => own[region] > rule.nothing && sizes[region] >= rule.smallest;
+  const counts = (region) => own[region] > rule.nothing && sizes[region] >= rule.smallest;
   const best = new Float64Array(own.length).fill(-Infinity);
   for (let region = 0; region < own.length; ++region) {
     const parent = parents[region];
-    if (parent >= 0 && telling(region)) {
+    if (parent >= 0 && counts(region)) {
       best[parent] = Math.max(best[parent], own[region]);
     }
   }
   return own.map((fit, region) => {
-    const part = best[region] === -Infinity && telling(region) ? fit : best[region];
+    const part = best[region] === -Infinity && counts(region) ? fit : best[region];
     return part === -Infinity ? fit : (1 - rule.part_share) * fit + rule.part_share * part;
   });
 }
 
-// Relevancies that fits stand for, 0 for what fits nothing.
+// Relevancies that fits stand for, 0 for regions without a feature.
 export function regionRelevancies(rule, fits) {
   return fits.map((fit) => (fit > rule.nothing ? sigmoid(fit) : 0));
 }
@@ -46,24 +46,24 @@ export function regionsAt({ counts }, level) {
   return Array.from({ length: counts[level] }, (_, i) => first + i);
 }
 
-// The one of some regions that has the largest value, of equal ones the first; -1 of none.
+// The region with the largest value, the first of equal ones; -1 for none.
 export function strongest(some, values) {
   return some.reduce((best, region) => (best < 0 || values[region] > values[best] ? region : best), -1);
 }
 
-// The regions of a level that are no crumbs; all where it has no others.
+// The regions of a level that are no crumbs; all if there are only crumbs.
 function solidAt(rule, regions, level) {
   const every = regionsAt(regions, level);
   const solid = every.filter((region) => regions.sizes[region] >= rule.smallest);
   return solid.length ? solid : every;
 }
 
-// The best relevancy of a level; of crumbs only where it has no more.
+// The best relevancy of a level; crumbs count only if there are no other regions.
 function bestRelevancy(rule, regions, relevancies, level) {
   return Math.max(0, relevancies[strongest(solidAt(rule, regions, level), relevancies)] ?? 0);
 }
 
-// A quantile of numbers, as NumPy's.
+// A quantile of numbers, as in NumPy.
 export function quantile(numbers, share) {
   const sorted = Float64Array.from(numbers).sort();
   const at = share * (sorted.length - 1);
@@ -71,7 +71,7 @@ export function quantile(numbers, share) {
   return below + (at % 1) * (above - below);
 }
 
-// Bars of the best fits of everyday phrases on one thing: of each level, and of the better one of the finer two.
+// Bars of the best fits of everyday phrases on one thing: of each level, and of the better of the two finer ones.
 // chance: fits of each region, by phrase. on: whether each region is on the thing.
 export function barsOn(rule, regions, chance, on) {
   const count = chance.length / regions.sizes.length;
@@ -83,7 +83,7 @@ export function barsOn(rule, regions, chance, on) {
   const finer = best[0].map((fit, phrase) => Math.max(fit, best[1][phrase]));
   return [...best, finer].map((fits) => {
     const [low, median] = [rule.low, 0.5].map((share) => quantile(fits, share));
-    const spread = median - low; // NaN where nothing is on the thing
+    const spread = median - low; // NaN if no region is on the thing
     return Number.isFinite(spread) ? { median, spread } : { median: Infinity, spread: 1 };
   });
 }
@@ -99,7 +99,7 @@ export function isWithin(regions, region, others) {
   return region >= 0 && (others.has(region) || isWithin(regions, regions.parents[region], others));
 }
 
-// Where parts of a thing may be: in and below the wholes that fit it nearly as well as the best one does.
+// Whether parts of a thing may be in each region: in the wholes that fit nearly as well as the best, and below them.
 export function onThings(rule, regions, own) {
   const thing = regionFits(rule, regions, own);
   const level = regions.counts.length - 1;
@@ -108,19 +108,19 @@ export function onThings(rule, regions, own) {
   return Array.from(thing, (_, region) => thing[wholeOf(regions, region)] >= least);
 }
 
-// The fit from which a region belongs to an answer; `share`: of the way that it reaches.
+// The least fit of a member of an answer. share: factor of the reach.
 export function leastFit(rule, best, share = 1) {
   return best - share * Math.min(Math.max(rule.reach * best, rule.nearest), rule.farthest);
 }
 
-// The mean fit of regions, without crumbs and nothing.
+// The mean fit of regions that have a feature and are no crumbs.
 function commonFit(rule, regions, fits) {
-  const heard = fits.filter((fit, region) => fit > rule.nothing && regions.sizes[region] >= rule.smallest);
-  return heard.reduce((sum, fit) => sum + fit, 0) / Math.max(heard.length, 1);
+  const counted = fits.filter((fit, region) => fit > rule.nothing && regions.sizes[region] >= rule.smallest);
+  return counted.reduce((sum, fit) => sum + fit, 0) / Math.max(counted.length, 1);
 }
 
-// Spreads by which the best fits of the levels exceed those from which a phrase is found. level: number, or -1
-// where it is free. bars: of each level, and of the better one of the finer two.
+// Spreads by which the best fits of the levels exceed the threshold. level: number, or -1 for "auto". bars: of each
+// level, and of the better of the two finer ones.
 function excess(rule, fits, named, level, bars) {
   const [whole, finer] = rule.found[named].map((spreads) => spreads ?? Infinity);
   const above = (bar, fit, spreads) => (fit - bar.median) / Math.max(bar.spread, rule.narrowest) - spreads;
@@ -130,10 +130,10 @@ function excess(rule, fits, named, level, bars) {
   return Math.max(above(bars[2], fits[2], whole), above(bars[3], Math.max(fits[0], fits[1]), finer));
 }
 
-const IN_SPREADS = ["chance", "example"]; // ways of reaching a verdict whose margins can be compared
+const IN_SPREADS = ["chance", "example"]; // bases of verdicts whose margins can be compared
 
-// A verdict: `outcome` in words, how it was `reached`, `margin` above what counts as found, `probability`, and the
-// share of phrases for nothing here that fit as well `byChance`.
+// A verdict: `outcome` in words, basis (`reached`), `margin` above the threshold, `probability`, and `byChance`, the
+// share of absent phrases that fit as well.
 export function verdict(rule, found, reached, margin, probability = null) {
   const near = IN_SPREADS.includes(reached) && margin >= rule.weak_excess;
   const weak = probability === null ? near : probability >= rule.weak_probability;
@@ -143,30 +143,29 @@ export function verdict(rule, found, reached, margin, probability = null) {
   return { outcome, found, reached, margin, probability, byChance };
 }
 
-// One verdict of several: the weakest where all are needed, else the strongest; absent: nothing is there.
+// One verdict of several: the weakest if all are needed, else the strongest; absent: the answer has no members.
 export function combined(rule, verdicts, all, absent = false) {
   const score = (name) => (all ? Math.min : Math.max)(...verdicts.map((one) => one[name]));
   const every = (holds) => verdicts.every(holds);
   const [{ reached }] = verdicts;
   const several = every((one) => IN_SPREADS.includes(one.reached)) ? "chance" : "several";
-  const way = every((one) => one.reached === reached) ? reached : several;
+  const basis = every((one) => one.reached === reached) ? reached : several;
   const known = every((one) => one.probability !== null);
   const probability = !known ? null : absent ? 0 : score("probability");
   const found = !absent && (all ? every((one) => one.found) : verdicts.some((one) => one.found));
-  return verdict(rule, found, way, absent ? -Infinity : score("margin"), probability);
+  return verdict(rule, found, basis, absent ? -Infinity : score("margin"), probability);
 }
 
-// The logistic function of a calibration that is for a phrase, or for one with a colour.
+// The logistic function of a calibration for a phrase, or for one with a colour.
 export function scalingOf(calibration, named, coloured = false) {
   const kind = named === "part of a thing" ? "part" : named;
   return calibration?.[coloured ? `coloured_${kind}` : kind];
 }
 
-// The verdict that the best fits of the levels stand for. level: number, or -1 where it is free. common: the
-// phrase's mean fit.
+// The verdict on the best fits of the levels. level: number, or -1 for "auto". common: the phrase's mean fit.
 function judge(rule, fits, named, level, { bars, scaling }, common) {
   if (!scaling) {
-    const share = named === "inside" ? 0 : rule.common_share; // on one thing, bars keep what is in common
+    const share = named === "inside" ? 0 : rule.common_share; // as in `barsOn`
     const evidence = fits.map((fit) => fit - share * common);
     const margin = excess(rule, evidence, named, level, bars);
     return verdict(rule, margin >= 0, "chance", margin);
@@ -179,18 +178,18 @@ function judge(rule, fits, named, level, { bars, scaling }, common) {
   return verdict(rule, shown && probability >= found, "calibration", margin, probability);
 }
 
-// The answer of the whole regions that fit nearly as well as the best one: its level, `scores` and `fits` of
-// all levels, the regions that are `inside`, the `best` one that the place is of (-1: none), and the verdict.
-// evidence: { bars, scaling }. own: of every name of what is sought. on: whether each region is on the thing
-// that it is a part of, if it is.
+// The answer: the regions that fit nearly as well as the best one. Has level, `scores` and `fits` of all levels, the
+// member regions (`inside`), the `best` region, whose position is the answer's (-1: none), and the verdict.
+// evidence: { bars, scaling }. own: fits for every name of what is sought. on: for a part of a thing, whether each
+// region is on the thing.
 export function decide(rule, regions, own, named, level, evidence, on = null) {
   const anywhere = regionFits(rule, regions, own[0]);
   const there = (fits) => (on ? fits.map((fit, region) => (on[region] ? fit : rule.nothing)) : fits);
   const every = there(regionFits(rule, regions, mean(own)));
-  const heard = named === "inside" ? there(anywhere) : anywhere;
+  const judged = named === "inside" ? there(anywhere) : anywhere;
   const bestOf = (relevancies) =>
     regions.counts.map((_, at) => bestRelevancy(rule, regions, relevancies, at));
-  const fits = bestOf(regionRelevancies(rule, heard)).map((score) => fitOf(rule, score));
+  const fits = bestOf(regionRelevancies(rule, judged)).map((score) => fitOf(rule, score));
   const relevancies = regionRelevancies(rule, every);
   const scores = bestOf(relevancies);
   const bests = scores.map((score) => fitOf(rule, score));
@@ -200,7 +199,7 @@ export function decide(rule, regions, own, named, level, evidence, on = null) {
   if (on) {
     given[given.length - 1] = rule.nothing;
   }
-  const chosen = level < 0 ? given.lastIndexOf(Math.max(...given)) : level; // of equal levels the coarsest
+  const chosen = level < 0 ? given.lastIndexOf(Math.max(...given)) : level; // the coarsest of equal levels
   const least = leastFit(rule, bests[chosen]);
   const numbers = regionsAt(regions, chosen);
   const solid = numbers.filter((region) => relevancies[region] > 0 && relevancies[region] <= scores[chosen]);
@@ -211,11 +210,11 @@ export function decide(rule, regions, own, named, level, evidence, on = null) {
     regionFits: every,
     inside: numbers.filter((region) => every[region] >= least),
     best: strongest(solid, relevancies),
-    verdict: judge(rule, fits, named, level, evidence, commonFit(rule, regions, heard)),
+    verdict: judge(rule, fits, named, level, evidence, commonFit(rule, regions, judged)),
   };
 }
 
-// Relevancies at which a heat map of an answer is coldest and hottest. best: the highest of its members.
+// The relevancies at the cold and hot end of an answer's heat map. best: the highest of its members.
 export function heatRange(rule, peak, found, best) {
   const high = Math.max(peak, best);
   if (found && peak < rule.floor + rule.heat_span) {

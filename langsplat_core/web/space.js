@@ -1,10 +1,10 @@
-// How things stand to each other: the twin of query/relations.py, where the numbers (`space`) come from.
+// Spatial relations between instances: the twin of query/relations.py, where the numbers (`space`) come from.
 
 import { add, axes, inner } from "./camera.js";
 import { quantile } from "./rule.js";
 
 // [page]
-// Distances from points to the nearest of others, of none to itself.
+// Distances from points to the nearest of others, without zero distances of a point to itself.
 const distances = (points, others) =>
   points.map((point) => {
     const square = ([x, y, z]) => (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2;
@@ -20,7 +20,7 @@ export class Space {
     Object.assign(this, space, { frame });
   }
 
-  // The body of a thing's points, in those axes.
+  // The body of an instance's points, in these axes.
   body(points) {
     const rows = [0, 3, 6].map((row) => this.frame.slice(row, row + 3));
     const step = Math.max(1, Math.ceil(points.length / this.sample));
@@ -32,7 +32,7 @@ export class Space {
     return { points: own, low, high, centre: add(low, sides, 0.5), size: Math.hypot(...sides) };
   }
 
-  // A body's centre as a camera has it: right, down, ahead.
+  // A body's centre in a camera's axes: right, down, ahead.
   seen({ centre }, camera) {
     const column = (axis) => [0, 3, 6].map((row) => this.frame[row + axis]);
     const place = [0, 1, 2].map((axis) => inner(column(axis), centre));
@@ -57,14 +57,14 @@ export class Space {
     return heights.length > 0 && what.size <= anchor.size && (stands || lies);
   }
 
-  // Whether the middle of one, seen from above, lies within another.
+  // Whether the centre of one body, seen from above, lies within another.
   over({ centre }, { low, high }) {
     return [0, 1].every((k) => between(low[k], centre[k], high[k]));
   }
 
   in(what, anchor) {
     const height = what.high[2] - what.low[2];
-    const rim = add(anchor.high, [0, 0, 0.5 * height]); // it may look out of an open vessel
+    const rim = add(anchor.high, [0, 0, 0.5 * height]); // it may stick out of an open vessel
     const sunk = what.low[2] <= anchor.high[2] - this.sunk * height;
     const inside = what.points.filter((point) => point.every((x, k) => between(anchor.low[k], x, rim[k])));
     const held = sunk && inside.length >= this.held * what.points.length;
@@ -95,7 +95,7 @@ export class Space {
     return ways[kind]();
   }
 
-  // Those of some things that stand so to one of the others; of a superlative the `count` that are most so.
+  // The instances in relation `kind` to one of the anchors; for a superlative the `count` most extreme.
   chosen(kind, some, anchors, camera, count) {
     const bodies = (things) => things.map((thing) => ({ ...thing, ...this.body(thing.points) }));
     const [things, others] = [some, anchors].map(bodies);

@@ -1,12 +1,12 @@
-// Phrases as they are written: the twin of scene/language.py and of query/grammar.py.
+// Tokens and grammar of queries: the twin of scene/language.py and query/grammar.py.
 
 // [page]
 const APOSTROPHES = /[’‘ʼ′＇´`]/gu;
 const CONTROL = /[\p{Cc}\p{Cs}]/gu;
-const MARK = /[\p{P}\p{Z}\p{Cf}]/u; // punctuation, spaces and invisible letters around a word
-const EMPTY = /[\p{Cf}\p{Po}\p{Mn}]/u; // letters that are no word alone
+const MARK = /[\p{P}\p{Z}\p{Cf}]/u; // punctuation, spaces and invisible characters around a word
+const EMPTY = /[\p{Cf}\p{Po}\p{Mn}]/u; // characters that alone are no word
 
-// Words without quotes and punctuation around them, and commas, none at the end.
+// Words without surrounding quotes and punctuation, and commas except at the end.
 export function tokens(text) {
   const plain = text
     .replace(APOSTROPHES, "'")
@@ -22,7 +22,7 @@ export function tokens(text) {
   return found;
 }
 
-// A word without punctuation around it; a possessive's apostrophe stays. "" where it is nothing else.
+// A word without surrounding punctuation, except a possessive's apostrophe; "" if nothing remains.
 function bareWord(word) {
   if (word === "&") {
     return word;
@@ -41,7 +41,7 @@ function bareWord(word) {
   return inner.join("") + (possessive ? "'" : "");
 }
 
-// A phrase as it is shown.
+// A phrase in the form in which it is shown.
 export function tidy(text) {
   return tokens(text)
     .join(" ")
@@ -57,13 +57,13 @@ export function phraseKey(text) {
     .toLowerCase();
 }
 
-// A word in lower case and what it may be the plural of.
+// A word in lower case and its possible singulars.
 function forms(word) {
   const low = word.toLowerCase();
   return [low, low.replace(/s$/, ""), low.replace(/es$/, "")];
 }
 
-// What a phrase names: "thing", "part" or "part of a thing". lists: of Sets of words, by name.
+// The kind of a phrase: "thing", "part" or "part of a thing". lists: Sets of words by name.
 export function namedBy(phrase, { parts, adjectives, articles }) {
   const words = phrase.toLowerCase().split(" ");
   if (!forms(words.pop()).some((form) => parts.has(form))) {
@@ -72,46 +72,46 @@ export function namedBy(phrase, { parts, adjectives, articles }) {
   return words.every((word) => adjectives.has(word) || articles.has(word)) ? "part" : "part of a thing";
 }
 
-// The thing that a phrase names a part of, and the part: "red mug" and "handle"; else "".
+// Thing and part of a "part of a thing": "red mug" and "handle" of "red mug handle"; else "".
 export function thingAndPart(phrase, lists) {
   const words = namedBy(phrase, lists) === "part of a thing" ? phrase.split(" ") : [""];
   return [words.slice(0, -1).join(" "), words[words.length - 1]];
 }
 
 const AND = / (?:and|&|as well as) /iu;
-// Before what is looked for, where that is asked in a sentence: "where is the mug".
+// Beginnings of questions: "where is the mug".
 const QUESTION = /^(?:(?:where|which)(?:'s| is| are)|(?:is|are) there|find(?: me)?|show me|look for) (?=.)/iu;
 const OR = / or /iu;
 const EXCLUDE = /,? (?:(?:but|and) )?(?:not|without|except|other than) /iu;
 const SEPARATE = /[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)/iu;
 
-// Whether words name a thing: more than stop words and descriptions.
+// Whether words name a thing: not only stop words and adjectives.
 function names(text, { stop_words: stops, adjectives, also_nouns: nouns }) {
   const words = text.toLowerCase().split(" ").filter(Boolean);
   return words.some((word) => !stops.has(word) && !adjectives.has(word)) || nouns.has(words.at(-1));
 }
 
-// The phrases of a line; "" where it has no word.
+// The phrases of a line; "" if it has no word.
 export function splitPhrases(line) {
   const phrases = line.split(SEPARATE).map(tidy).filter(Boolean);
   return phrases.length ? phrases : [""];
 }
 
-// A text between joints, or whole where one side would name nothing.
-function named(text, joint, lists) {
-  const sides = text.split(joint);
+// A text split at separators, or undivided if one side would name nothing.
+function sidesOf(text, separator, lists) {
+  const sides = text.split(separator);
   return sides.every((side) => names(side, lists)) ? sides : [text];
 }
 
-// What a phrase asks for: { text }, { kind, what, anchor } of such, of a count { count, what }, of several { kind,
-// items }. The rules, in their order and by their names, are those of query/grammar.py.
+// The tree of a phrase: { text }, { kind, what, anchor }, { kind: "counted", count, what } or, for several, { kind,
+// items }. The rules are those of query/grammar.py.
 export function parse(text, lists) {
   const group = (kind, items) => (items.length > 1 ? { kind, items } : items[0]);
   const one = (side) => clause(side, lists);
-  const both = (side) => group("both", named(side, AND, lists).map(one));
-  const either = (side) => group("either", named(side, OR, lists).map(both));
+  const both = (side) => group("both", sidesOf(side, AND, lists).map(one));
+  const either = (side) => group("either", sidesOf(side, OR, lists).map(both));
   const isPart = (tree) => tree.text && namedBy(tree.text, lists) !== "thing";
-  const [what, ...others] = named(text.replace(QUESTION, ""), EXCLUDE, lists).map(either);
+  const [what, ...others] = sidesOf(text.replace(QUESTION, ""), EXCLUDE, lists).map(either);
   const own = what.text && !isPart(what); // "mug without handle"
   const ofIt = (tree) => (own && isPart(tree) ? { kind: "inside", what: tree, anchor: what } : tree);
   return others.length ? { kind: "without", what, anchor: group("either", others.map(ofIt)) } : what;
@@ -148,7 +148,7 @@ function clause(text, lists) {
   return related(bare, lists);
 }
 
-// A tree with what is asked for in the singular.
+// A tree with the searched noun in the singular.
 function oneOf(tree, lists) {
   if (tree.kind) {
     return { ...tree, what: oneOf(tree.what, lists) };
@@ -195,7 +195,7 @@ function thing(text, lists) {
   return whole ? inside({ text: part }, { text: whole }) : { text: bare };
 }
 
-// Letters to insert, delete, replace or swap with the next, to make a word another.
+// Edit distance: letters to insert, delete, replace or swap with the next.
 function distance(a, b) {
   let [before, row] = [[], Array.from({ length: b.length + 1 }, (_, j) => j)];
   for (let i = 1; i <= a.length; ++i) {
@@ -209,7 +209,7 @@ function distance(a, b) {
   return row[b.length];
 }
 
-// The known word that is written most like another one; "" where none is like it.
+// The known word that is spelt most like another word; "" if none is close.
 export function nearest(word, known) {
   let [best, least] = ["", word.length / 3 + 1];
   for (const other of known) {
