@@ -6,11 +6,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Keep torch to one thread.
+    """Limit torch to one thread.
 
-    Torch's own threads wait by spinning and so take the cores from the rasterizer's; what torch does on the
-    CPU here (loss, Adam, small layers) is little. With two cores training is a third faster, on a busy
-    machine far more.
+    Threads of torch wait by spinning and take cores from the rasterizer, while torch has little to compute on
+    the CPU here (Adam, small layers). With two cores training is a third faster, on a busy machine far more.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""Fitting codecs to the CLIP vectors of one scene, and what they cost: errors of the relevancy of phrases."""
+"""Fitting of codecs to the CLIP vectors of one scene, with their errors in the relevancy of phrases."""
 
 import logging
 from collections.abc import Callable
@@ -25,7 +25,7 @@ log = logging.getLogger("langsplat")
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """The phrases that errors are measured with, and against which relevancy is read."""
+    """The phrases and the scale with which errors of relevancy are measured."""
 
     phrases: Array  # (Q, D) float32 unit text vectors
     scale: Scale
@@ -37,7 +37,7 @@ class Vocabulary:
 
 
 def everyday_vocabulary(encoder: PhraseEncoder, phrases: tuple[str, ...] = ()) -> Vocabulary:
-    """Return the vocabulary of `phrases` and everyday ones in the vectors of `encoder`."""
+    """Return the vocabulary of `phrases` and everyday phrases, encoded by `encoder`."""
     texts = list(dict.fromkeys([*phrases, *everyday_phrases(encoder.unknown_words)]))
     canonical = encoder.encode_texts(list(CANONICAL_PHRASES))
     scale = Scale(canonical, everyday_vectors(encoder), encoder.temperature)
@@ -45,7 +45,7 @@ def everyday_vocabulary(encoder: PhraseEncoder, phrases: tuple[str, ...] = ()) -
 
 
 def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> tuple[float, float]:
-    """Return mean and 99 % quantile of the change of relevancy by (M, D) unit `made`; 0 where M = 0."""
+    """Return mean and 99 % quantile of the absolute difference of relevancy of two (M, D); 0 if M = 0."""
     if not len(vectors):
         return 0.0, 0.0
     errors = np.empty((len(vectors), len(vocabulary.phrases)), np.float32)
@@ -56,15 +56,15 @@ def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> tupl
 
 @dataclass(frozen=True)
 class CodecReport:
-    """Losses of a codec on vectors that it was not fitted to."""
+    """Errors of a codec on vectors that it was not fitted to."""
 
-    cosine: float  # mean, of a vector with what the codec makes of it
+    cosine: float  # mean, of a vector with its reconstruction
     error_mean: float  # of relevancy, see `relevancy_error`
     error_p99: float
 
 
 def codec_report(codec: Codec, vectors: Array, vocabulary: Vocabulary) -> CodecReport:
-    """Report on (M, D) float32 unit vectors."""
+    """Return the errors of a codec on (M, D) float32 unit vectors."""
     made = codec.decode(codec.encode(vectors))
     cosine = float((made * vectors).sum(1).mean()) if len(vectors) else 1.0
     return CodecReport(cosine, *relevancy_error(made, vectors, vocabulary))
@@ -77,10 +77,10 @@ def fit_codec(
     progress: Progress = silent,
     further: Array | None = None,
 ) -> Codec:
-    """Fit a codec to (M, D) float32 unit CLIP vectors, so that phrases of the `vocabulary` find the same.
+    """Return a codec fitted to (M, D) float32 unit CLIP vectors, for the phrases of the `vocabulary`.
 
     Deterministic for a given seed on one machine. Raises InputError for settings out of range. further: (M',
-    D) vectors that are not kept, but help a kind that interpolates between what it has seen.
+    D) additional vectors for codecs that interpolate, or if there are no others.
     """
     check_settings(config, "--codec.")
     if further is not None and (codecs.KINDS[config.kind].blends or len(vectors) == 0):
@@ -89,8 +89,8 @@ def fit_codec(
         return fit_codebook(vectors, config, vocabulary, progress)
     if config.kind == "autoencoder":
         return train_autoencoder(vectors, config, progress)
-    # The leading right singular vectors, the best basis by least squares; through the D x D Gram matrix: D is
-    # 512, M may be a million. float64 keeps its squared condition usable.
+    # The leading right singular vectors are the best basis by least squares. They are those of the D x D Gram
+    # matrix, as D is 512 and M may be a million; float64 for its squared condition number.
     wide = np.asarray(vectors, np.float64)
     _, axes = np.linalg.eigh(wide.T @ wide)
     return codecs.LinearCodec(np.ascontiguousarray(axes[:, ::-1][:, : config.latent_dim].T, np.float32))
@@ -103,12 +103,12 @@ DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)  # each with ReLU
 
 
 def train_autoencoder(vectors: Array, config: CodecConfig, progress: Progress = silent) -> AutoencoderCodec:
-    """Train the autoencoder of (M, D) unit vectors, with latents of length 1.
+    """Return an autoencoder trained on (M, D) unit vectors, with latents of length 1.
 
-    By the paper's loss, L1 plus cosine distance, and Adam with a cosine schedule on random batches. Progress
-    shows the batch's mean cosine. Deterministic for a given seed on one machine.
+    The loss is the paper's, L1 plus cosine distance, minimised by Adam with a cosine schedule on random
+    batches. Progress shows the batch's mean cosine. Deterministic for a given seed on one machine.
     """
-    import torch  # seconds that other kinds need not pay
+    import torch  # takes seconds; other codecs do not need it
     from torch import nn
 
     torch.manual_seed(config.seed)
@@ -143,7 +143,7 @@ def train_autoencoder(vectors: Array, config: CodecConfig, progress: Progress = 
 
 
 def _settle_statistics(encoder: Any, data: Any) -> None:
-    """Recompute batch statistics with final weights: running averages lag, most of few vectors' error."""
+    """Recompute batch statistics with the final weights, since running averages lag."""
     import torch
 
     for module in encoder:
@@ -158,21 +158,20 @@ def _settle_statistics(encoder: Any, data: Any) -> None:
 
 
 def folded_layers(network: Any) -> codecs.Layers:
-    """Return (out, in) weights and biases of a torch `Sequential`, batch normalisations folded in."""
+    """Return (out, in) weights and biases of a torch `Sequential` with folded batch normalisations."""
     return codecs.folded({name: t.double().numpy() for name, t in m.state_dict().items()} for m in network)
 
 
-# A scene's own codebook: as many codewords as its language features need, and not more.
+# A scene's own codebook, of as many codewords as its language features need.
 
 
 def fit_codebook(
     vectors: Array, config: CodecConfig, vocabulary: Vocabulary, progress: Progress = silent
 ) -> CodebookCodec:
-    """Fit a codebook to (M, D) float32 unit vectors.
+    """Return a codebook fitted to (M, D) float32 unit vectors.
 
-    It has `config.size` codewords, or, where that is 0, is the smallest that keeps the mean relevancy error
-    on vectors it was not fitted to within `config.max_relevancy_error`. Codewords are float16 numbers, so
-    that a file can hold them as such.
+    It has `config.size` codewords or, if that is 0, about the fewest whose mean relevancy error on vectors it
+    was not fitted to is within `config.max_relevancy_error`. Codewords are rounded to float16, as in files.
     """
     order = np.random.default_rng(config.seed).permutation(len(vectors))
     fitted = judged = vectors
@@ -181,7 +180,7 @@ def fit_codebook(
     generator = np.random.default_rng(config.seed)
 
     def grow(size: int, start: Array | None) -> Array:
-        doubled = 1 << (size - 1).bit_length()  # sizes between two powers of 2 come after the larger one
+        doubled = 1 << (size - 1).bit_length()  # sizes between powers of 2 are tried after the larger one
         progress("codebook", 0.1 + 0.6 * min(doubled / 2_048, 1), f"{size} codewords")
         return rounded(spherical_kmeans(fitted, size, 8 if start is None else 4, start, generator))
 
@@ -192,7 +191,7 @@ def fit_codebook(
     if config.size:
         codewords = grow(config.size, None)
     else:
-        # With fewer than four vectors per codeword, a codebook is a copy.
+        # A codebook with fewer than four vectors per codeword would be a copy.
         most = max(min(len(fitted) // 4, 65_535), 1)
         codewords = _smallest(grow, error, most, config.max_relevancy_error)
     progress("colours of the codewords", 0.8)
@@ -210,7 +209,7 @@ def codebook_of(vectors: Array, usage: Array) -> CodebookCodec:
 def _smallest(
     grow: Callable[[int, Array | None], Array], error_of: Callable[[Array], float], most: int, budget: float
 ) -> Array:
-    """Smallest codebook within `budget`: sizes are doubled, then the last interval is halved twice."""
+    """Return a small codebook within `budget`: the size is doubled, then the last interval bisected twice."""
     size, smaller = min(64, most), None
     while True:
         codewords = grow(size, smaller)
@@ -238,17 +237,16 @@ def rounded(numbers: Array) -> Array:
     return numbers.astype(np.float16).astype(np.float32)
 
 
-# Spherical k-means: few unit vectors that many lie close to (Dhillon and Modha 2001). scikit-learn's knows
-# neither the sphere nor a growing codebook.
+# Spherical k-means (Dhillon and Modha 2001). scikit-learn's is not spherical and cannot grow a codebook.
 
 CHUNK = 8_192  # vectors compared with all centres at a time
-STEP = 8  # one in so many centres is added, or given up, at a time
+STEP = 8  # one in so many centres is added or removed at a time
 
 
 def nearest_centres(vectors: Array, centres: Array, gains: bool = False) -> tuple[Array, Array, Array]:
     """Return the (M,) int64 nearest of (K, D) unit centres, and its (M,) float32 cosine with each vector.
 
-    And if `gains` are asked for, (M,) float32, by how much less the cosine with the next is.
+    The third array has the (M,) float32 differences to the cosine with the next centre, or 0 without `gains`.
     """
     nearest, cosines = np.empty(len(vectors), np.int64), np.empty(len(vectors), np.float32)
     gain = np.zeros(len(vectors), np.float32)
@@ -271,10 +269,9 @@ def spherical_kmeans(
 ) -> Array:
     """Return at most `count` unit centres (K, D) float32 of (M, D) float32 unit vectors.
 
-    Begins at `start` (K' <= count centres) and adds vectors that these fit badly, drawn by their distance: a
-    quarter more than asked for, of which those are given up again, round by round, that would be missed
-    least. That finds the gaps which plain k-means leaves where two clusters share a centre. Fewer than
-    `count` come back where fewer different vectors are there.
+    Begins with `start` (K' <= count centres) and adds vectors that fit badly, drawn by their distance, and a
+    quarter more of them than needed. The least useful ones are removed round by round, which splits clusters
+    that share a centre in plain k-means. There are fewer than `count` if fewer vectors are distinct.
     """
     generator = generator or np.random.default_rng(0)
     centres = np.zeros((0, vectors.shape[1]), np.float32) if start is None else start
@@ -291,21 +288,21 @@ def spherical_kmeans(
 
 
 def _worth_keeping(vectors: Array, centres: Array, size: int) -> tuple[Array, Array]:
-    """Return (M,) nearest centre of each vector, and (K,) bool: those that serve some and are missed.
+    """Return the (M,) nearest centre of each vector, and (K,) bool: the centres that are kept.
 
-    Where there are more than `size`. Only one in `STEP` goes at a time, because of two that are alike neither
-    is missed.
+    Unused centres are not kept, nor, above `size`, the least useful ones, one in `STEP` at a time, as either
+    of two similar centres seems useless while the other is there.
     """
     nearest, _, gain = nearest_centres(vectors, centres, gains=True)
-    missed = np.bincount(nearest, gain, len(centres))  # by how much the sum of cosines would fall
-    spare = min(max(len(missed) - size, 0), 1 + len(missed) // STEP)
+    use = np.bincount(nearest, gain, len(centres))  # by how much the sum of cosines would fall without it
+    spare = min(max(len(use) - size, 0), 1 + len(use) // STEP)
     kept = np.bincount(nearest, minlength=len(centres)) > 0
-    kept[np.argsort(missed, kind="stable")[:spare]] = False
+    kept[np.argsort(use, kind="stable")[:spare]] = False
     return nearest, kept
 
 
 def _grown(vectors: Array, centres: Array, count: int, generator: np.random.Generator) -> Array:
-    """`centres` and badly fitted vectors, few at a time: one gap is not filled ten times."""
+    """Return `centres` with badly fitted vectors, added few at a time, so that one gap is filled once."""
     distance = np.full(len(vectors), 2, np.float32)
     new = centres if len(centres) else vectors[_badly_fitted(distance, 1, generator)]
     while True:
@@ -318,7 +315,7 @@ def _grown(vectors: Array, centres: Array, count: int, generator: np.random.Gene
 
 
 def _badly_fitted(distance: Array, count: int, generator: np.random.Generator) -> Array:
-    """Up to `count` rows, drawn without repetition in proportion to (M,) distances; none that fit."""
+    """Return up to `count` rows, drawn without repetition in proportion to (M,) distances, if not about 0."""
     weights = np.where(distance > 1e-5, distance, 0).astype(np.float64)
     possible = int((weights > 0).sum())
     if possible == 0:
@@ -332,18 +329,17 @@ def _means(vectors: Array, nearest: Array, count: int) -> Array:
     return unit(scipy.sparse.csr_matrix(entries, (count, len(vectors))) @ vectors)
 
 
-# Colours of codewords by which neighbouring things are told apart.
+# Colours of codewords that distinguish neighbouring instances.
 
-FEWEST_LINKS = 10  # between the surfaces of two nodes that are neighbours
-LEAST = 30  # Gaussians of a node that has a say
+FEWEST_LINKS = 10  # least links between two neighbouring nodes
+LEAST = 30  # least Gaussians of a node that counts
 
 
 def contrasting_colours(field: LanguageField, tree: Tree, surface: Surface) -> Array | None:
-    """Return (K, 3) float32 colours in [0, 1] of a codebook's words, the same for all levels and views.
+    """Return (K, 3) float32 colours in [0, 1] of codewords, for all levels; None without neighbouring nodes.
 
-    None where nothing lies beside anything else. The axes are those along which the mean vectors of
-    neighbouring nodes, at all levels, differ the most. Along each, words are ranked, so that all of it is
-    used: a node has as much say in that as another, however large it is.
+    The three axes are those along which the mean vectors of neighbouring nodes, at all levels, differ most. A
+    colour is the rank of a codeword along each, weighted so that nodes of any size count equally.
     """
     vectors = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None]).astype(np.float64)
     ends = np.stack([surface.rows[end] for end in surface.ends])
@@ -354,8 +350,8 @@ def contrasting_colours(field: LanguageField, tree: Tree, surface: Surface) -> A
         names, number, sizes = np.unique(node[counted], return_inverse=True, return_counts=True)
         if len(names) == 0:
             continue
-        has_say = sizes[number] >= LEAST
-        weights += np.bincount(codes[counted][has_say], 1 / sizes[number][has_say], len(vectors))
+        large = sizes[number] >= LEAST
+        weights += np.bincount(codes[counted][large], 1 / sizes[number][large], len(vectors))
         shape = (len(names), len(vectors))
         shares = scipy.sparse.csr_matrix((1 / sizes[number], (number, codes[counted])), shape=shape)
         place = np.full(int(node.max(initial=0)) + 1, -1)
@@ -370,7 +366,7 @@ def contrasting_colours(field: LanguageField, tree: Tree, surface: Surface) -> A
     if not found.any() or vectors.shape[1] < 3:
         return None
     values = vectors @ np.linalg.eigh(found.T @ found)[1][:, :-4:-1]
-    ranks = np.empty(values.shape, np.float32)  # share of the weights that lies below each value
+    ranks = np.empty(values.shape, np.float32)  # share of the weights below each value
     for axis in range(3):
         order = np.argsort(values[:, axis], kind="stable")
         below = np.cumsum(weights[order])

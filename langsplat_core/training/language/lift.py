@@ -1,14 +1,14 @@
-"""Lifting: from masks in photographs to CLIP vectors on Gaussians, on the unit sphere.
+"""Lifting: from masks in photographs to unit CLIP vectors of Gaussians.
 
-Each Gaussian takes the geometric median, or the weighted mean, of the vectors of the masks it belongs to; a
-codec encodes that afterwards. Averaging in CLIP space never yields the vector of a third object half way
-between two latents.
+Each Gaussian gets the geometric median, or the weighted mean, of the vectors of its masks; a codec encodes
+these afterwards. Averages are taken in CLIP space, since half way between two latents may lie the latent of a
+third object.
 
-How much of every mask in every photograph each Gaussian paints is ``W^T onehot(mask)``. Targets are constant
-on masks, so this sparse matrix carries vectors of any length from photographs onto Gaussians. It is kept view
-by view, as pairs sorted by Gaussian, in memory or in files, and read block by block: what is held at a time
-does not grow with the number of photographs. From it follow 3D instances (`find_instances`) and votes of
-photographs for the nodes of a tree (`count_votes`) too.
+The mask weights ``W^T onehot(mask)`` are the pixels of every mask in every photograph that each Gaussian
+paints. Targets are constant on masks, so this sparse matrix carries vectors of any length from photographs to
+Gaussians. It is kept view by view, as pairs sorted by Gaussian, in memory or in files, and read block by
+block, so that memory does not grow with the number of photographs. It also gives 3D instances
+(`find_instances`) and votes of photographs for the nodes of a tree (`count_votes`).
 """
 
 from collections.abc import Sequence
@@ -30,18 +30,21 @@ from langsplat_core.training.language.codec_fit import nearest_centres, spherica
 
 @dataclass(frozen=True, eq=False)
 class MaskGroups:
-    """Groups of masks that say the same: the group, of G, of every mask of every view.
+    """G groups of masks with similar vectors.
 
-    Most of the hundred masks that show a Gaussian say one of a few things: its median is taken over these.
+    The hundred masks that show a Gaussian have few distinct meanings: its median is taken over their groups.
     """
 
-    of_mask: Array  # of all masks, one view after the other
+    of_mask: Array  # group of every mask, one view after the other
     counts: Sequence[int]  # number of masks of each view
     vectors: Array  # (G, D) float32 unit vectors
 
 
 def group_masks(vectors: Sequence[Array], groups: int = 2_048) -> MaskGroups:
-    """Return at most `groups` groups of the masks, or each its own; vectors: (M, D) float32 unit a view."""
+    """Return the groups of masks: of equal vectors or, above `groups`, of clusters.
+
+    vectors: (M, D) float32 unit vectors of each view.
+    """
     joined, number = np.concatenate(vectors), dict[bytes, int]()
     of_mask = np.array([number.setdefault(vector.tobytes(), len(number)) for vector in joined], int)
     centres = joined[np.unique(of_mask, return_index=True)[1]]
@@ -62,7 +65,7 @@ class MaskWeights:
 
     pairs: Sequence[Array]  # of each view, of type PAIR, by rising row: Gaussian, mask, its level, pixels
     count: int
-    block_size: int = 16_384  # Gaussians handled at a time
+    block_size: int = 16_384  # Gaussians per block
 
     @property
     def blocks(self) -> list[tuple[int, int]]:
@@ -72,7 +75,7 @@ class MaskWeights:
 
     @cached_property
     def _edges(self) -> list[Array]:
-        """Places in each view's pairs at which blocks begin, and the last one ends."""
+        """Indices of each view's pairs at which blocks begin, and the last one ends."""
         firsts = np.arange(0, self.count + self.block_size, self.block_size)
         return [np.searchsorted(view["row"], firsts) for view in self.pairs]
 
@@ -88,20 +91,20 @@ class MaskWeights:
             weights.append(part["weight"])
         shape = (last - first, len(LEVELS) * len(groups.vectors))
         entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
-        return scipy.sparse.coo_matrix(entries, shape).tocsr()  # which adds up what falls on one place
+        return scipy.sparse.coo_matrix(entries, shape).tocsr()  # sums duplicates
 
     def sums(self, sets: Array, size: int, counts: Sequence[int]) -> "tuple[scipy.sparse.csr_matrix, Array]":
         """Return the (size, masks of all views) float32 pixels that each set of Gaussians paints.
 
-        And the int32 view and level of each mask as one number, 3 view + level. sets: (N,) set of each
-        Gaussian, -1 for those of none; counts: number of masks of each view.
+        Also returns the int32 number 3 view + level of each mask. sets: (N,) set of each Gaussian, -1 for
+        none; counts: number of masks of each view.
         """
         views, labelling = [scipy.sparse.csr_matrix((size, 0))], [np.zeros(0, np.int32)]
         for view, (pairs, count) in enumerate(zip(self.pairs, counts, strict=True)):
             within = pairs[sets[pairs["row"]] >= 0]
             place = sets[within["row"]], within["mask"]
             painted = scipy.sparse.coo_matrix((within["weight"].astype(np.float64), place), (size, count))
-            views.append(painted.tocsr())  # which adds up what falls on one place
+            views.append(painted.tocsr())  # sums duplicates
             labelling.append(np.zeros(count, np.int32))
             labelling[-1][within["mask"]] = len(LEVELS) * view + within["level"]
         sums = scipy.sparse.hstack(views, "csr", np.float32)
@@ -134,24 +137,23 @@ def view_pairs(
     return pairs
 
 
-# 3D instances: which Gaussians belong together, by the plainest form of MaskClustering (Yan et al. 2024).
+# 3D instances, by the simplest form of MaskClustering (Yan et al. 2024).
 #
-# Two masks of different views are of one instance where most of what they claim, among the Gaussians that
-# both views see, is claimed by both; masks linked so, directly or not, are one instance, and a Gaussian
-# belongs to the instance whose masks it paints most of. No vector is looked at: that the front and the back
-# of a thing have slightly different vectors does not tear it apart.
+# A mask claims the Gaussians of which it has more than half of the weight in its view. Two masks of different
+# views are linked if the IoU of their claims, among the Gaussians that both views see, is large. Connected
+# masks are one instance, and a Gaussian belongs to the instance whose masks it paints most of. Vectors are
+# not used, since those of the front and the back of an instance differ.
 
-SAME = 0.6  # overlap over union of what two masks claim from which they are one instance
+SAME = 0.6  # IoU of the claims of two masks above which they are linked
 
 
 def find_instances(
     mask_weights: MaskWeights, counts: Sequence[int], level: int = len(LEVELS) - 1, sample: int = 50_000
 ) -> Array:
-    """Return the (N,) int32 number of the instance that each Gaussian belongs to, at a level.
+    """Return the (N,) int32 number of each Gaussian's instance at a level; NO_NODE if it is in no mask.
 
-    NO_NODE where no mask of that level shows it. Instances are numbered from the largest, by number of
-    Gaussians. counts: number of masks of each view; sample: Gaussians that decide which masks go together,
-    since what is compared grows with views squared.
+    Instances are numbered from the largest, by number of Gaussians. counts: number of masks of each view;
+    sample: number of Gaussians by which masks are compared, whose cost grows with the views squared.
     """
     view_of = np.repeat(np.arange(len(counts)), counts)
     claims = _claims(mask_weights, np.cumsum([0, *counts]), level, sample)
@@ -169,7 +171,7 @@ def find_instances(
         most = np.zeros(mask_weights.count, np.float32)
         np.maximum.at(most, row, weights.data)
         heaviest = np.flatnonzero(weights.data == most[row])[::-1]
-        instances[row[heaviest]] = weights.indices[heaviest]  # of equal ones the first, written last
+        instances[row[heaviest]] = weights.indices[heaviest]  # the first of equal ones is written last
     order = np.argsort(-np.bincount(instances, minlength=size + 1)[:size], kind="stable")
     rank = np.full(size + 1, NO_NODE, np.int32)
     rank[order] = np.arange(size)
@@ -177,7 +179,7 @@ def find_instances(
 
 
 def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> "scipy.sparse.csr_matrix":
-    """(n, M) ones where a mask holds more than half of a sampled Gaussian's weight in its view and level."""
+    """Return (n, M) ones where a mask has over half of a sampled Gaussian's weight in its view and level."""
     chosen = np.full(mask_weights.count, -1)
     sample = np.random.default_rng(0).permutation(mask_weights.count)[:most]
     chosen[np.sort(sample)] = np.arange(len(sample))
@@ -195,13 +197,13 @@ def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> 
 
 
 def _overlapping(claims: "scipy.sparse.csr_matrix", view_of: Array) -> "scipy.sparse.csr_matrix":
-    """Return (M, M) links between masks of different views whose overlap over union is large."""
+    """Return (M, M) links between masks of different views whose claims have an IoU above `SAME`."""
     count, views = len(view_of), int(view_of.max(initial=-1)) + 1
     both = (claims.T @ claims).tocoo()
     a, b = both.row, both.col
     entries = np.ones(count, np.float32), (np.arange(count), view_of)
     of_view = scipy.sparse.csr_matrix(entries, (count, views))
-    seen = claims @ of_view  # (n, V): is the Gaussian claimed in the view at all
+    seen = claims @ of_view  # (n, V): 1 if the Gaussian is claimed in the view
     visible = (claims.T @ seen).tocsr()  # (M, V): Gaussians of the mask that the view sees
     union = -both.data
     for mask, other in ((a, b), (b, a)):
@@ -212,15 +214,15 @@ def _overlapping(claims: "scipy.sparse.csr_matrix", view_of: Array) -> "scipy.sp
 
 # Votes of photographs for the nodes of a scene's tree.
 
-VOTE = 0.5  # overlap over union of a node and a mask from which the mask is of just that node
-SHOWN = 25.0  # pixels of a node from which a photograph shows it
+VOTE = 0.5  # IoU of a node and a mask above which the mask is a vote for the node
+SHOWN = 25.0  # least pixels of a node in a photograph that shows it
 
 
 def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) -> Array:
-    """Return the (K, 2) uint16 numbers of photographs with a mask of just each node, and without one.
+    """Return the (K, 2) uint16 numbers of photographs with a mask of exactly each node, and without one.
 
-    Compared is what a view shows of the node; a photograph that hardly shows it has no vote. counts: number
-    of masks of each view.
+    Masks are compared with the visible part of a node; a photograph that hardly shows it does not vote.
+    counts: number of masks of each view.
     """
     sums, labelling = mask_weights.sums(tree.leaves, tree.count, counts)
     sums = sums.tocsc()
@@ -246,7 +248,7 @@ def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) ->
 def lift_sample(
     mask_weights: MaskWeights, groups: MaskGroups, rows: Array, robust: bool, progress: Progress = silent
 ) -> tuple[Array, Array]:
-    """Lift onto the Gaussians at `rows`, which ascend; see `lift_weights`."""
+    """Return what `lift_weights` does, for the Gaussians at ascending `rows`."""
     parts = [scipy.sparse.csr_matrix((0, len(LEVELS) * len(groups.vectors)), dtype=np.float32)]
     for number, (first, last) in enumerate(mask_weights.blocks):
         inside = rows[(rows >= first) & (rows < last)] - first
@@ -260,8 +262,8 @@ def lift_weights(weights: "scipy.sparse.csr_matrix", vectors: Array, robust: boo
     """Return (3, n, D) float32 unit vectors, zero where unobserved, and (3, n) float32 confidence.
 
     Confidence is the total blending weight, in pixels. weights: (n, 3 G) of n Gaussians in G groups of masks,
-    level after level; vectors: (G, D) float32 unit vectors of the groups. `robust` takes the geometric
-    median, else the mean.
+    level after level; vectors: (G, D) float32 unit vectors of the groups; robust: take the geometric median
+    instead of the mean.
     """
     lifted = np.zeros((len(LEVELS), weights.shape[0], vectors.shape[1]), np.float32)
     confidences = np.zeros((len(LEVELS), weights.shape[0]), np.float32)
@@ -270,7 +272,7 @@ def lift_weights(weights: "scipy.sparse.csr_matrix", vectors: Array, robust: boo
         confidence[:] = np.asarray(at_level.sum(1)).ravel()
         centre[:] = unit(at_level @ vectors)
         if robust and at_level.nnz:
-            # Pairs below 0.2 % of their Gaussian's total: half of all pairs, and little of the weight.
+            # Pairs below 0.2 % of their Gaussian's total are half of all pairs with little of the weight.
             at_level.data[at_level.data < 2e-3 * np.repeat(confidence, np.diff(at_level.indptr))] = 0
             at_level.eliminate_zeros()
             parts = (at_level.indptr, at_level.indices, at_level.data, vectors, centre)
@@ -291,15 +293,15 @@ def _add_reweighted(total: Array, vector: Array, centre: Array, weight: float) -
         total[k] += scaled * vector[k]
 
 
-# Sums may be reordered: without that the compiler cannot use vector instructions, which are 10 times faster.
+# `fastmath` allows reordered sums, which the compiler needs for vector instructions, 10 times as fast.
 @partial(kernel, fastmath={"reassoc", "contract", "nsz"})
 def _weiszfeld(
     first: int, last: int, indptr: Array, indices: Array, data: Array, vectors: Array, centre: Array
 ) -> None:
-    """Improve rows [first, last) of `centre` (N, D) towards the weighted geometric median on the sphere.
+    """Move rows [first, last) of `centre` (N, D) to the weighted geometric median on the sphere.
 
-    Weiszfeld's iteration: reweight every vector by 1 / chordal distance and average again. The floor on the
-    distance keeps a centre that coincides with a vector finite; it is far below the noise of CLIP.
+    Weiszfeld's iteration: weight every vector by 1 / chordal distance and average again. The least distance
+    keeps a centre that coincides with a vector finite; it is far below the noise of CLIP.
     """
     dim = vectors.shape[1]
     total = np.empty(dim, np.float32)
@@ -320,7 +322,7 @@ def _weiszfeld(
                     centre[row, k] = total[k] / length
 
 
-# The paper's lifting in one pass: latents averaged directly, ``x = W^T H / W^T 1``.
+# One-pass lifting: weighted means of latents, ``x = W^T H / W^T 1``.
 
 
 def lift_latents(
@@ -331,7 +333,7 @@ def lift_latents(
     settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
-    """Return (3, N, d) latents ``W^T H / W^T 1`` of masks' pixels alone, and (3, N) confidence."""
+    """Return (3, N, d) unit latents of ``W^T H / W^T 1`` over pixels with a mask, and (3, N) confidence."""
     count, d = len(gaussians), codec.latent_dim
     total = np.zeros((count, len(LEVELS), d + 1))
     for done, (camera, features) in enumerate(views):
@@ -351,18 +353,18 @@ def lift_latents(
 
 # Lifting by gradient descent: latents trained through the rasterizer, as the paper does it.
 #
-# LangSplat (section 3.3, and its public code): everything but the language features is frozen; a step
-# compares one photograph's latents H with the blended features, ``F = W y``, by their mean absolute
-# difference over pixels with a mask, and Adam moves the features x. The renderer is linear, so that a step
-# is one `splat` and one `gather`, which serve all three levels:
+# LangSplat (section 3.3, and its public code): only the language features are trained. A step compares one
+# photograph's latents H with the blended features, ``F = W y``, by their mean absolute difference over pixels
+# with a mask, and Adam moves the features x. The renderer is linear, so a step is one `splat` and one
+# `gather` for all three levels:
 #
 #     d loss / d y = W^T (mask * sign(F - H)) / (pixels times d).
 #
-# What is blended is y = x, or, as published, y = x / (|x| + 1e-9). The published start at zero then makes
-# the first gradients about 1e9 times too large, which Adam's second moment must forget before anything
-# moves; from the one-pass mean the same loss is reached much sooner.
+# Blended are y = x or, as published, y = x / (|x| + 1e-9). With the published start at zero the first
+# gradients are about 1e9 times too large, until Adam's second moment has forgotten them; a start at the
+# one-pass mean reaches the same loss much sooner.
 
-KEPT_BYTES = 4e9  # of views that are kept; further ones are projected again at every step
+KEPT_BYTES = 4e9  # of projected views that are kept; others are projected again at every step
 
 
 def lift_by_gradient(
@@ -374,13 +376,13 @@ def lift_by_gradient(
     settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
-    """Return (3, N, d) float32 unit latents and (3, N) confidence, both as of `lift_latents`.
+    """Return (3, N, d) float32 unit latents and (3, N) confidence, both as in `lift_latents`.
 
-    Latents are zero where unobserved. `config` says for how many steps, how fast, from where. Deterministic
-    for a given seed on the CPU.
+    Latents are zero where unobserved. config: number of steps, learning rate and start. Deterministic for a
+    given seed on the CPU.
     """
     start, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
-    import torch  # seconds that other modes need not pay
+    import torch  # takes seconds; other modes do not need it
 
     check_settings(config, "--lift.")
     published = config.start == "zeros-as-published"
@@ -399,7 +401,7 @@ def lift_by_gradient(
         index = int(order[step % len(views)])
         camera, labels, latents = targets[index]
         view = kept.get(index)
-        if view is None:  # the geometry is frozen: views are kept as far as memory allows
+        if view is None:  # the geometry is fixed
             view = rasterizer.view(gaussians, camera, settings)
             if sum(one.nbytes for one in (view, *kept.values())) <= KEPT_BYTES:
                 kept[index] = view
@@ -414,10 +416,10 @@ def lift_by_gradient(
 
 
 def _loss_and_gradient(view: LiftingView, labels: Array, latents: Array, y: Array) -> tuple[float, Array]:
-    """Masked L1 of one view, the mean over levels, pixels and numbers, and its (3, N, d) gradient by y.
+    """Return the masked L1 of one view, a mean over levels, pixels and components, and its gradient by `y`.
 
-    What each pixel ought to show: the row of the (M + 1, d) `latents` by its (3, H, W) `labels`; -1, the
-    last row, for none.
+    The target of each pixel is the row of the (M + 1, d) `latents` at its (3, H, W) `labels`; -1 is none. y:
+    (3, N, d), like the gradient.
     """
     levels, count, d = y.shape
     image = view.splat(np.ascontiguousarray(np.moveaxis(y, 0, 1).reshape(count, levels * d)))[0]

@@ -1,24 +1,24 @@
-"""A tree of things from masks that disagree: parts in things in groups, by the consensus of all views.
+"""Merge tree of a scene from inconsistent masks: parts, instances and groups by the consensus of all views.
 
-The surface of a scene is divided into small patches, and then the two neighbours merge between which least
-stands, until no two are neighbours (average linkage). What stands between two neighbours x and y is
+The surface of a scene is divided into small patches, then the two neighbours with the lowest cost merge,
+until no two are neighbours (average linkage). The cost of neighbours x and y is
 
-    cost(x, y) = [ SEEN (1 - agreement) + SEEN border + BENT concavity + |difference of chromaticity|
+    cost(x, y) = [ SEEN (1 - agreement) + SEEN border + BENT concavity + COLOUR |difference of chromaticity|
                    + STAND standing ] s
 
-    agreement     chance that a pixel of x and one of y lie in one mask, mean over views and levels, each
+    agreement     probability that a pixel of x and one of y are in one mask, mean over views and levels,
                   weighted by the smaller one's pixels there
-    border        share of views and levels in which the two ends of a link across lie in two masks, mean over
-                  the links between x and y
-    concavity     how much the surface bends towards itself along these links: things meet where it does
-    standing      h / (h + thickness) (1 - size / twice the width) where the smaller one's middle is h before
-                  the plane of the larger one, which is so thick and wide: it stands on a table, hangs on a
-                  wall; 0 behind the plane, and where its size is more
-    s             (smaller one's share of the area / PLAIN) ^ SMALL: crumbs join early
+    border        share of views and levels in which the two ends of a link are in two masks, mean over the
+                  links between x and y
+    concavity     how much the surface is concave along these links, as where two instances meet
+    standing      h / (h + thickness) (1 - size / twice the width) if the centre of the smaller one is h in
+                  front of the plane of the larger one, of this thickness and width: it stands on a table or
+                  hangs on a wall; 0 behind the plane, and if the last factor is negative
+    s             (smaller one's share of the area / PLAIN) ^ SMALL: small patches merge early
 
-A mask of one photograph may be wrong; few are wrong in the same way from all sides. No mask's vector is read,
-and masks of any source do. The tree is known from affinity trees of masks (THGS 2025, PairGS 2026); they need
-a trained segmenter, this one does without: `--masks.source graph`.
+A mask of one photograph may be wrong; few are wrong in the same way from all sides. Vectors of masks are not
+used, and masks may be of any source. Similar affinity trees of masks (THGS 2025, PairGS 2026) need a trained
+segmenter; this one also works without: `--masks.source graph`.
 """
 
 import heapq
@@ -42,11 +42,11 @@ from langsplat_core.scene.transform import C0
 from langsplat_core.training.language.lift import MaskWeights
 
 SEEN, BENT, COLOUR, STAND = 0.5, 0.6, 1.0, 1.0  # weights of the cost's terms
-UNSEEN = 0.5  # disagreement of what no view shows together
+UNSEEN = 0.5  # disagreement of Gaussians and patches that no view shows together
 STEP_BENT = 0.1  # weight of concavity in the step between two Gaussians
 SCALE, SMALLEST = 0.6, 10  # of the division into patches, see `surface.divide`
-PLAIN, SMALL = 1 / 200, 0.1  # share of the area that merges at its plain cost, and the power of the others
-ENOUGH = 4.0  # pixels of a Gaussian in a mask from which it counts no more
+PLAIN, SMALL = 1 / 200, 0.1  # share of the area with factor s = 1, and the exponent of s
+ENOUGH = 4.0  # largest weight, in pixels, of a Gaussian in a mask
 STAGE = "merging what masks agree on"
 
 
@@ -55,24 +55,24 @@ class MergeTree:
     """A binary tree over P patches of a surface: nodes 0 to P - 1 are the patches, later ones merge two."""
 
     patches: Array  # (N,) int32 patch of every Gaussian; -1 for those on no surface
-    children: Array  # (K, 2) int32 nodes that node P + k is made of, each made before
-    costs: Array  # (K,) float64 what stood between these
+    children: Array  # (K, 2) int32 children of node P + k, each with a lower number
+    costs: Array  # (K,) float64 cost of merging these
 
     @property
     def count(self) -> int:
-        """Count P of the patches: a forest of one tree a connected surface has P - K roots."""
+        """Number P of patches; with a tree for each connected surface, P - K nodes are roots."""
         return int(self.patches.max(initial=-1)) + 1
 
     @cached_property
     def highest(self) -> Array:
-        """The (P + K,) float64 the most that stood between what a node is made of; 0 of a patch."""
+        """The (P + K,) float64 highest cost of a merge within each node; 0 for a patch."""
         highest = np.zeros(self.count + len(self.children))
         for node, (children, own) in enumerate(zip(self.children, self.costs, strict=True), self.count):
             highest[node] = max(own, *highest[children])
         return highest
 
     def totals(self, values: Array) -> Array:
-        """Return (P + K, ...) sums of (P, ...) values of patches in every node; of bools, whether any is."""
+        """Return (P + K, ...) sums of (P, ...) values over the patches of every node; of bools, any."""
         totals = np.concatenate([values, np.zeros((len(self.children), *values.shape[1:]), values.dtype)])
         for node, (a, b) in enumerate(self.children, self.count):
             totals[node] = totals[a] + totals[b]
@@ -85,10 +85,10 @@ class MergeTree:
         return np.asarray((above > cost) & (self.highest <= max(cost, most)))
 
     def cut(self, cost: float, most: float = 0.0, values: Array | None = None) -> Array:
-        """Return the (P,) int32 node around each patch: the largest that costs at most `cost`.
+        """Return the (P,) int32 node of each patch: the largest with a highest cost of at most `cost`.
 
-        A larger one, that costs at most `most`, takes its place where its value, of `values` (P + K,), is
-        more than the largest sum of those of nodes within it that can be kept together.
+        A larger node, with a cost of at most `most`, replaces nodes within it if its value, in `values`
+        (P + K,), exceeds the largest sum of values of disjoint nodes within it.
         """
         owner, kept = np.arange(len(self.highest), dtype=np.int32), self.highest <= max(cost, 0)
         best = np.zeros(len(owner)) if values is None else values.copy()
@@ -104,14 +104,14 @@ class MergeTree:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """The masks, colours, places and borders of P patches, from which they are merged."""
+    """The masks, colours, positions and borders of P patches."""
 
     masses: "scipy.sparse.csr_matrix"  # (P, masks of all views) float32 pixels, columns sorted
-    labelling: Array  # (masks of all views,) int32 view and level of each mask, counted through
+    labelling: Array  # (masks of all views,) int32 number 3 view + level of each mask
     moments: Array  # (P, 7, 4) sums over the area, > 0, of x, y, z, 1 and the chromaticity times x, y, z, 1
-    eyes: Array  # (V, 3) positions of cameras, from the same origin, which tell the outside
-    borders: Array  # (2, B) int32 neighbouring patches, the first one's number is the lower
-    sums: Array  # (B, 3) float64 over the links between them: their count, disagreement, concavity
+    eyes: Array  # (V, 3) positions of cameras, relative to the same origin, which define the outside
+    borders: Array  # (2, B) int32 neighbouring patches, the lower number first
+    sums: Array  # (B, 3) float64 sums over their links: number, disagreement, concavity
 
 
 def find_tree(
@@ -122,7 +122,7 @@ def find_tree(
     eyes: Array,
     progress: Progress = silent,
 ) -> MergeTree:
-    """Return the tree of a scene; counts: masks of each view; eyes: (V, 3) positions of cameras."""
+    """Return the merge tree of a scene; counts: masks of each view; eyes: (V, 3) positions of cameras."""
     everywhere = np.full(len(gaussians), -1, np.int32)
     if len(surface.rows) == 0:
         return MergeTree(everywhere, np.zeros((0, 2), np.int32), np.zeros(0))
@@ -146,16 +146,17 @@ def find_tree(
         *find_borders(of, surface.ends, disagreement, concavity),
     )
     children, costs = merge(patches, progress)
-    return MergeTree(np.append(of, np.int32(-1))[surface.anchors], children, costs)  # an anchor of -1 is none
+    return MergeTree(np.append(of, np.int32(-1))[surface.anchors], children, costs)  # -1: without an anchor
 
 
-# What stands between two linked Gaussians.
+# Costs between linked Gaussians.
 
 
 def link_disagreement(surface: Surface, mask_weights: MaskWeights, progress: Progress = silent) -> Array:
-    """Return the (E,) share of views and levels in which the ends of each link lie in two masks.
+    """Return the (E,) share of views and levels in which the ends of each link are in different masks.
 
-    Of those where both lie in one, weighted by the pixels of the fainter end, at most `ENOUGH`.
+    Only views and levels with a mask at both ends count, weighted by the lower of their pixels, at most
+    `ENOUGH`.
     """
     first, second = surface.ends
     apart, seen = np.zeros(len(first), np.float32), np.zeros(len(first), np.float32)
@@ -167,7 +168,7 @@ def link_disagreement(surface: Surface, mask_weights: MaskWeights, progress: Pro
         weight = np.ascontiguousarray(pairs["weight"])
         most = np.zeros(len(LEVELS) * len(surface.rows), np.float32)
         np.maximum.at(most, place, weight)
-        # The mask that each Gaussian paints most of at each level; of equal ones the first, written last.
+        # The mask that each Gaussian paints most of at each level; the first of equal ones is written last.
         mask = np.full(len(most), -1, np.int32)
         heaviest = np.flatnonzero(weight == most[place])[::-1]
         mask[place[heaviest]] = pairs["mask"][heaviest]
@@ -181,7 +182,7 @@ def link_disagreement(surface: Surface, mask_weights: MaskWeights, progress: Pro
 def _compare(
     begin: int, end: int, first: Array, second: Array, masks: Array, most: Array, apart: Array, seen: Array
 ) -> None:
-    """Add a view's levels to links [begin, end): (3, M) mask and weight of each Gaussian."""
+    """Add a view to links [begin, end). masks, most: (3, M) mask of each Gaussian and its weight."""
     for link in range(begin, end):
         a, b = first[link], second[link]
         for level in range(masks.shape[0]):
@@ -193,7 +194,7 @@ def _compare(
 
 
 def link_concavity(surface: Surface, eyes: Array) -> Array:
-    """Return (E,) in [0, 1], how far normals at ends lean together; eyes: (V, 3), which tell the outside."""
+    """Return the (E,) concavity of links in [0, 1], from normals; eyes: (V, 3), which define the outside."""
     normals = _normals(surface)
     away = surface.positions - eyes[scipy.spatial.cKDTree(eyes).query(surface.positions)[1]]
     normals[(normals * away).sum(1) > 0] *= -1
@@ -204,7 +205,7 @@ def link_concavity(surface: Surface, eyes: Array) -> Array:
 
 
 def _normals(surface: Surface) -> Array:
-    """Return (M, 3) unit normals of the planes through the neighbourhoods, of either sign."""
+    """Return (M, 3) unit normals of planes fitted to the neighbourhoods, of either sign."""
     normals = np.empty((len(surface.rows), 3))
     for part in pieces(len(normals), 65_536):
         near = surface.neighbours[part]
@@ -222,9 +223,9 @@ def _normals(surface: Surface) -> Array:
 def find_borders(
     of: Array, ends: tuple[Array, Array], disagreement: Array, concavity: Array
 ) -> tuple[Array, Array]:
-    """Return the borders of patches, and the sums over their links, see `Patches`.
+    """Return `borders` and `sums` of `Patches`.
 
-    of: (M,) patch of each end; ends, disagreement, concavity: (E,) of each link.
+    of: (M,) patch of each surface Gaussian; ends, disagreement, concavity: (E,) of each link.
     """
     sides = np.sort(np.stack([of[end] for end in ends]).astype(np.int64), axis=0)
     between, size = sides[0] != sides[1], int(of.max(initial=-1)) + 1
@@ -235,14 +236,14 @@ def find_borders(
 
 
 class _Merger:
-    """The nodes that are not merged yet, with their sums and neighbours."""
+    """The nodes during merging, with their sums and neighbours."""
 
     def __init__(self, patches: Patches) -> None:
         masses, self._labelling = patches.masses, patches.labelling
         shape = len(patches.moments), int(self._labelling.max(initial=-1)) + 1
         entries = masses.data, self._labelling[masses.indices], masses.indptr
         pixels = scipy.sparse.csr_matrix(entries, shape).toarray()
-        # The masks that show each node, its pixels in these, and those in each view and level.
+        # For each node: its masks, its pixels in them, and its pixels in each view and level.
         seen = (np.split(of, masses.indptr[1:-1]) for of in (masses.indices, masses.data))
         self._masks: list[Any] = list(zip(*seen, pixels, strict=True))
         self._moments, self._eyes = list(patches.moments), patches.eyes
@@ -263,13 +264,13 @@ class _Merger:
         return float(between * (area / self._plain) ** SMALL)
 
     def _standing(self, small: int, large: int) -> float:
-        """How surely the smaller node stands before the plane of the larger one, in [0, 1)."""
+        """Return the term `standing` of the cost, in [0, 1)."""
         (middle, own, _), (base, extents, outwards) = self._planes[small], self._planes[large]
         height, share = float((middle - base) @ outwards), np.linalg.norm(own) / max(2 * extents[1], 1e-30)
         return float(height / (height + extents[0]) * (1 - share)) if height > 0 and share < 1 else 0.0
 
     def _plane(self, moments: Array) -> tuple[Array, Array, Array]:
-        """Return a node's middle, its standard deviations, rising, and the axis of the first, outwards."""
+        """Return a node's centre, its standard deviations, rising, and the axis of the first, outwards."""
         middle = moments[3, :3] / moments[3, 3]
         squares, axes = np.linalg.eigh(moments[:3, :3] / moments[3, 3] - np.outer(middle, middle))
         nearest = np.linalg.norm(self._eyes - middle, axis=1).argmin()
@@ -298,14 +299,14 @@ class _Merger:
 
 
 def merge(patches: Patches, progress: Progress = silent) -> tuple[Array, Array]:
-    """Return (K, 2) int32 nodes merged and (K,) float64 costs, in order; of equal ones the older first."""
+    """Return (K, 2) int32 merged nodes and (K,) float64 costs, in order; at equal costs older nodes first."""
     nodes, count = _Merger(patches), len(patches.moments)
     waiting = [(nodes.cost(a, b), a, b) for a in range(count) for b in nodes.neighbours[a] if a < b]
     heapq.heapify(waiting)
     made: list[tuple[int, int, float]] = []
     while waiting:
         cost, a, b = heapq.heappop(waiting)
-        if b not in nodes.neighbours[a]:  # one of them is part of another node by now
+        if b not in nodes.neighbours[a]:  # one of them was merged
             continue
         new = nodes.join(a, b)
         made.append((a, b, cost))
@@ -318,7 +319,7 @@ def merge(patches: Patches, progress: Progress = silent) -> tuple[Array, Array]:
 
 @kernel
 def _agreement(a: tuple[Array, ...], b: tuple[Array, ...], labelling: Array) -> float:
-    """Chance that a pixel of a and one of b lie in one mask; `1 - UNSEEN` where no labelling has both."""
+    """Return the term `agreement` of the cost; `1 - UNSEEN` if no view and level has both nodes."""
     columns_a, values_a, pixels_a = a
     columns_b, values_b, pixels_b = b
     agreed, seen = 0.0, np.minimum(pixels_a, pixels_b).sum()
@@ -338,19 +339,19 @@ def _agreement(a: tuple[Array, ...], b: tuple[Array, ...], labelling: Array) -> 
     return agreed / seen
 
 
-# Label maps of patches and nodes: what each pixel of a photograph shows of them.
+# Label maps of patches and nodes in photographs.
 
-SOLID = 0.5  # of a pixel: where the Gaussians cover less, there is nothing
-CELL = 8  # pixels a side, in which patches of one channel keep apart
+SOLID = 0.5  # least alpha of a pixel with a label
+CELL = 8  # px, side of cells, each with one patch per channel at most
 
 
 def draw_patches(
     view: LiftingView, gaussians: Gaussians, patches: Array, settings: RasterSettings = INRIA
 ) -> Array:
-    """Return the (H, W) int32 patch that most of each pixel is, -1 for none.
+    """Return the (H, W) int32 patch with the most weight in each pixel, -1 for none.
 
-    patches: (N,) int32 of the Gaussians, -1 for those of none; settings: the view's. Patches whose boxes in
-    the image do not meet share a channel, so that thousands take some dozen.
+    patches: (N,) int32 of the Gaussians, -1 for none; settings: the view's. Patches with disjoint boxes share
+    a channel of the splatted image, so that thousands of patches need some dozens.
     """
     inside = patches >= 0
     if not inside.any():
@@ -373,7 +374,7 @@ def draw_patches(
 
 
 def _boxes(footprints: Footprints, camera: Camera, patches: Array, count: int) -> Array:
-    """Return (P, 4) left, top, right, bottom cell of what each patch may paint, the last two exclusive."""
+    """Return (P, 4) left, top, right, bottom cell of each patch's box, the last two exclusive."""
     drawn = np.flatnonzero((patches >= 0) & (footprints.opacities > 0))
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     np.minimum.at(low, patches[drawn], footprints.means_px[drawn] - footprints.extents_px[drawn] - 1)
@@ -384,7 +385,10 @@ def _boxes(footprints: Footprints, camera: Camera, patches: Array, count: int) -
 
 
 def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
-    """Return (P,) channel of each patch or -1, the largest box first, and (C, rows, columns) owners."""
+    """Return the (P,) channel of each patch, -1 for none, and the (C, rows, columns) patch of each cell.
+
+    Channels are assigned greedily, the largest box first.
+    """
     channel_of = np.full(len(boxes), -1)
     rows, columns = (int(boxes[:, side].max(initial=0)) for side in (3, 2))
     owners = np.full((32, rows, columns), -1, np.int32)
@@ -403,8 +407,8 @@ def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
 def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> tuple[Array, Array]:
     """Return label maps (3, H, W) int32, as of `masks.label_maps`, and the (M,) node of each region.
 
-    drawn: (H, W) patches, -1 for none; cuts: (P,) node of each patch at each level; least: share of the image
-    below which a node is left out.
+    drawn: (H, W) patches, -1 for none; cuts: (P,) node of each patch at each level; least: least share of the
+    image of a region.
     """
     maps = np.full((len(cuts), *drawn.shape), -1, np.int32)
     shown, there = np.zeros(0, int), drawn >= 0

@@ -110,7 +110,7 @@ class CudaRenderer:
 
     def __init__(self, settings: RasterSettings = INRIA) -> None:
         self.device, self._settings = torch.device(gsplat.DEVICE), settings
-        load_rasterizer("cuda")  # BackendError where gsplat does not work
+        load_rasterizer("cuda")  # raises BackendError if gsplat does not work
 
     def render(
         self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int, focal: float | None = None
@@ -137,9 +137,9 @@ Backend = Literal["auto", "cpu", "cuda"]
 
 
 def renderer_for(backend: Backend, settings: RasterSettings = INRIA) -> DifferentiableRenderer:
-    """Return the renderer a user asked for; `auto` takes CUDA where gsplat really draws there, else the CPU.
+    """Return the renderer of a backend; `auto` is CUDA if gsplat draws there, else the CPU.
 
-    Raises BackendError when `cuda` is asked for and cannot work.
+    Raises BackendError if `cuda` is chosen and cannot work.
     """
     if backend != "auto":
         return CudaRenderer(settings) if backend == "cuda" else CpuRenderer(settings)
@@ -161,11 +161,11 @@ def evaluate_views(
     near: float | None = None,
     progress: Progress = silent,
 ) -> list[ViewScore]:
-    """Draw the views at `indices` and score them against the photographs; colours are clamped to [0, 1].
+    """Return the scores of the views at `indices` against the photographs; colours are clamped to [0, 1].
 
-    small: the same views read at 320 px, with which shrunk images are compared too: a photograph that is
-    shrunk twice differs from one that was read at that size by as much as good images do. near: the near
-    plane, world units; None: that of what the cameras see.
+    small: the same views read at 320 px, with which shrunk images are compared, too: a photograph that was
+    shrunk twice differs from one that was read at this size by as much as good images do. near: the near
+    plane, world units; None: from what the cameras see.
     """
     renderer = renderer_for(backend, replace(INRIA, near=near or near_plane(gaussians, capture.cameras)))
     parameters = parameters_of(gaussians, renderer.device)
