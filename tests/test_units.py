@@ -32,7 +32,7 @@ from langsplat_core.arrays import Array, psnr
 from langsplat_core.cli.app import parse
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.agents.commands import Door
+from langsplat_core.extensions.agents.commands import SceneTools
 from langsplat_core.extensions.checkpoints.langsplat_files import write_checkpoint
 from langsplat_core.extensions.compaction.clean import CleanConfig, clean
 from langsplat_core.extensions.compaction.compact import BudgetConfig, choose_views, find_reduction
@@ -435,7 +435,7 @@ def printed(case: Case) -> Found:
     (taught,) = case.said("query", path, "our ball")
     ball = case.said("select", path, "ball", "--out", case.folder / "ball.ply")
     only = load_scene(case.folder / "ball.ply")
-    asked = Door({"room": path}).find("ball")
+    asked = SceneTools({"room": path}).find("ball")
     found = {
         "verdict": Same([(one["verdict"], one["level"]) for one in (answer, taught)]),
         "pixel": Near(answer["pixel"], 1.01),

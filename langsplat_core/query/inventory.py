@@ -111,7 +111,7 @@ def _claims(describer: Describer, latents: Array, of: Array, level: int) -> Iter
     names = np.zeros((len(surface), len(candidates)), np.float32)  # (M, C) probability of each candidate
     for column, word in enumerate(candidates):
         names[:, column] = np.where(best == word, shares, 0).sum(1)
-    for group in same_things(names, surface):
+    for group in synonym_groups(names, surface):
         numbers = candidates[group]
         winners = np.isin(best[:, 0], numbers)
         weight = surface[winners]
@@ -123,7 +123,7 @@ def _claims(describer: Describer, latents: Array, of: Array, level: int) -> Iter
             yield _Claim(level, tuple(words.phrases[number] for number in numbers), rows, probability)
 
 
-def same_things(names: Array, surface: Array) -> list[list[int]]:
+def synonym_groups(names: Array, surface: Array) -> list[list[int]]:
     """Return groups of columns that name the same things.
 
     names: (M, C) probabilities of C words, the largest claim first; surface: (M,) area of each feature. A
@@ -328,7 +328,7 @@ def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = s
     return Suggestions(tuple(islice(found, at_most)), tuple(dict.fromkeys((*candidates, *taught))))
 
 
-def combined(engine: QueryEngine, suggestions: Suggestions) -> tuple[str, ...]:
+def composed_examples(engine: QueryEngine, suggestions: Suggestions) -> tuple[str, ...]:
     """Return up to two compositional queries that are found: a part of a thing, and a thing near another."""
     here = suggestions.phrases[: TRIES * EXAMPLES]
     parts = (phrase for phrase in here if " " in phrase and is_part(phrase.split()[-1]))

@@ -14,10 +14,10 @@ from langsplat_core.query.inventory import (
     DEEPEST,
     completions,
     corrected,
-    same_things,
     scene_inventory,
     scene_outline,
     suggest,
+    synonym_groups,
 )
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import NO_NODE, LanguageField, LinearCodec, Scene, Tree
@@ -159,8 +159,8 @@ def test_words_that_claim_the_same_are_grouped():
     cup = np.array([0.45, 0.4, 0.1, 0])
     vague = np.array([0.05, 0.1, 0.9, 0.4])  # everywhere a little: a name for neither
     names = np.stack([vague, mug, cup], 1)
-    assert same_things(names, surface) == [[0], [1, 2]]
-    assert same_things(np.zeros((0, 0)), np.zeros(0)) == []
+    assert synonym_groups(names, surface) == [[0], [1, 2]]
+    assert synonym_groups(np.zeros((0, 0)), np.zeros(0)) == []
 
 
 def test_surface_of_gaussians():

@@ -20,7 +20,7 @@ from langsplat_core.query.compose import ComposedResult, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.inventory import Suggestions, combined, completions, corrected, suggest
+from langsplat_core.query.inventory import Suggestions, completions, composed_examples, corrected, suggest
 from langsplat_core.query.rule import Verdict
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
@@ -282,7 +282,7 @@ def prepare_suggestions(viewer: Viewer) -> None:
         found = suggest(asked, progress=progress)
         if asked.basis.guesses:  # colours, of which nothing is a part
             return found
-        return replace(found, examples=(*found.examples[:SIMPLE], *combined(asked, found)))
+        return replace(found, examples=(*found.examples[:SIMPLE], *composed_examples(asked, found)))
 
     viewer.ask_engine("finding examples", work, partial(setattr, state, "suggestions"), lambda reason: None)
 

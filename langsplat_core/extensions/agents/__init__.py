@@ -1,4 +1,4 @@
-"""Scenes that answer an agent, by the Model Context Protocol."""
+"""Scenes as tools for agents, by the Model Context Protocol."""
 
 from langsplat_core.registry import Extension
 

@@ -1,4 +1,4 @@
-"""`langsplat serve --mcp`: scenes answer an agent, by the Model Context Protocol over standard streams."""
+"""`langsplat serve --mcp`: scenes as tools for agents, by the Model Context Protocol on standard streams."""
 
 import asyncio
 import io
@@ -44,14 +44,14 @@ INSTRUCTIONS = (
     "Trained 3D scenes that can be searched with words. A verdict of 'not here' or 'weak match' is meant: do "
     "not report such a thing as there. Nothing is changed by any tool."
 )
-MOST_SIDE = 1024  # px of an image that is sent
-SIZE = (640, 480)  # px of an image towards a thing, where the scene has no cameras
-BACK = 2.2  # half diagonals of a thing's box: how far from it such a camera stands
+MOST_SIDE = 1024  # px, longer side of images that are sent
+SIZE = (640, 480)  # px of images of a scene without cameras
+BACK = 2.2  # distance of such a camera from an answer, in half diagonals of its box
 
 LONGEST_LINE = 1 << 20  # characters of a message
 NO_JSON, INVALID = -32700, -32600  # codes of JSON-RPC
 
-PROGRESS = ContextVar("PROGRESS", default=silent)  # of the call that runs here
+PROGRESS = ContextVar("PROGRESS", default=silent)  # of the current call
 
 
 @dataclass(frozen=True)
@@ -68,16 +68,16 @@ class Serve:
     def run(self) -> None:
         if not self.mcp:
             raise InputError("say how: --mcp is the Model Context Protocol, on standard input and output")
-        door = Door(scene_files(self.scene), self.encoder)
-        if len(door.scenes()) == 1:  # which is opened at the start: what is no scene ends here
-            door.engine()
-        server = build_server(door)
-        with handled(lambda number, _: end("langsplat", number)):  # there is nothing to keep
+        tools = SceneTools(scene_files(self.scene), self.encoder)
+        if len(tools.scenes()) == 1:  # opened at the start, so that errors are reported here
+            tools.engine()
+        server = build_server(tools)
+        with handled(lambda number, _: end("langsplat", number)):  # nothing has to be saved
             asyncio.run(_serve(server))
 
 
 def scene_files(place: Path) -> dict[str, Path]:
-    """Searchable scenes by name: of a folder all of it, named by their path in it. InputError for none."""
+    """Return searchable scenes by name; those of a folder by their path in it. InputError for none."""
     if not place.is_dir() or format_of(place) is not None:
         return {place.name: place}
     found = {path.relative_to(place).as_posix(): path for path in scenes_in(place)}
@@ -86,11 +86,11 @@ def scene_files(place: Path) -> dict[str, Path]:
     return found
 
 
-class Door:
-    """The tools by which an agent asks some scenes.
+class SceneTools:
+    """The tools of an agent for some scenes.
 
-    Answers are ready for JSON, lengths in metres where the scene says how long its unit is. One question at a
-    time; scenes and encoders are kept once they are loaded.
+    Answers are ready for JSON, lengths in metres if the scene has a scale. Not for concurrent calls; scenes
+    and encoders stay in memory once they are loaded.
     """
 
     def __init__(self, scenes: dict[str, Path], encoder: str = "") -> None:
@@ -179,7 +179,7 @@ class Door:
         return np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8), said
 
     def engine(self, name: str = "") -> QueryEngine:
-        """Return the engine of a scene, which is opened where it was not; InputError for none of them."""
+        """Return the engine of a scene, which the first call opens; InputError for an unknown name."""
         if not name and len(self._scenes) == 1:
             name = next(iter(self._scenes))
         if name not in self._scenes:
@@ -215,7 +215,7 @@ def _places(values: Array | None, unit: Unit) -> Any:
 
 
 def towards(scene: Scene, answer: QueryResult) -> Camera:
-    """Return the nearest camera that has the best answer in its image; a new one where there are none."""
+    """Return the scene's best camera for an answer, see `view_distance`; a new one without cameras."""
     assert answer.place is not None
     assert answer.box is not None
     if scene.cameras:
@@ -225,10 +225,10 @@ def towards(scene: Scene, answer: QueryResult) -> Camera:
     return look_at(middle + reach * away / max(float(np.linalg.norm(away)), 1e-300), middle, scene.up(), SIZE)
 
 
-class _Wire:
-    """Standard input and output, a message a line. What is no message is answered here with an error.
+class _LineStreams:
+    """Standard input and output with one message per line; other lines are answered with an error.
 
-    Nobody left to read ends the program. What libraries print goes to standard error.
+    A closed output ends the program. Output of libraries is redirected to standard error.
     """
 
     def __init__(self) -> None:
@@ -260,7 +260,7 @@ class _Wire:
         self._out.write(text)
 
     async def flush(self) -> None:
-        """Send what was written; where nobody reads, end the program as `| head` does, without a word."""
+        """Flush the output; if it is closed, end the program without a message, as with `| head`."""
         try:
             await asyncio.to_thread(self._out.flush)
         except BrokenPipeError:
@@ -273,14 +273,14 @@ class _Wire:
 async def _serve(server: "MCPServer[Any]") -> None:
     from mcp.server.stdio import stdio_server
 
-    wire: Any = _Wire()
+    wire: Any = _LineStreams()
     core = server._lowlevel_server  # noqa: SLF001  as the SDK's own `run_stdio_async` does
     async with stdio_server(wire, wire) as (incoming, outgoing):
         await core.run(incoming, outgoing, core.create_initialization_options())
 
 
 def _told(send: Callable[..., Any]) -> Progress:
-    """Return the progress of one call: the number of its stages so far, which must grow, and words."""
+    """Return the progress of one call, sent as the number of finished stages, which must grow, and text."""
     from anyio.from_thread import run
 
     stages: dict[str, int] = {}
@@ -288,15 +288,15 @@ def _told(send: Callable[..., Any]) -> Progress:
 
     def show(report: Report) -> None:
         done = stages.setdefault(report.stage, len(stages)) + report.fraction
-        if done >= sent[-1] + 0.02:  # what is less is no news
+        if done >= sent[-1] + 0.02:  # not more often
             sent.append(done)
             run(send, done, None, report.text)
 
     return Progress(show)
 
 
-def build_server(door: Door) -> "MCPServer[Any]":
-    """Return the door as tools of the protocol; what cannot be answered is a tool error of one line."""
+def build_server(tools: SceneTools) -> "MCPServer[Any]":
+    """Return a server of the protocol with these tools; failures are tool errors of one line."""
     from mcp.server import MCPServer
     from mcp.server.mcpserver import Context
     from mcp.server.mcpserver import Image as Picture
@@ -305,7 +305,7 @@ def build_server(door: Door) -> "MCPServer[Any]":
     from pydantic import ValidationError
 
     class Server(MCPServer[Any]):
-        turn = asyncio.Lock()  # one question at a time
+        turn = asyncio.Lock()  # one call at a time
 
         async def call_tool(
             self, name: str, arguments: dict[str, Any], context: Context[Any, Any] | None = None
@@ -318,7 +318,7 @@ def build_server(door: Door) -> "MCPServer[Any]":
                     return await super().call_tool(name, given, context)
             except ToolError as error:
                 said, cause = str(error), error.__cause__
-                if isinstance(cause, ValidationError):  # of which the SDK says several lines
+                if isinstance(cause, ValidationError):  # the SDK's message has several lines
                     wrong = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in cause.errors()]
                     said = "; ".join(wrong)
                 elif isinstance(cause, LangSplatError | OSError | MemoryError):
@@ -328,12 +328,12 @@ def build_server(door: Door) -> "MCPServer[Any]":
     server = Server("langsplat", instructions=INSTRUCTIONS, version=__version__, log_level="CRITICAL")
 
     def look(phrase: str = "", camera: int | None = None, scene: str = "") -> list[Picture | str]:
-        encoded, (drawn, said) = io.BytesIO(), door.look(phrase, camera, scene)
+        encoded, (drawn, said) = io.BytesIO(), tools.look(phrase, camera, scene)
         Image.fromarray(drawn).save(encoded, "PNG")
         return [Picture(data=encoded.getvalue(), format="png"), said]
 
-    look.__doc__ = (Door.look.__doc__ or "").replace("(H, W, 3) uint8 image", "image")
+    look.__doc__ = (SceneTools.look.__doc__ or "").replace("(H, W, 3) uint8 image", "image")
     hints = ToolAnnotations(read_only_hint=True, destructive_hint=False, open_world_hint=False)
-    for ask in (door.scenes, door.find, door.count, door.distance, door.describe, look):
+    for ask in (tools.scenes, tools.find, tools.count, tools.distance, tools.describe, look):
         server.tool(description=cleandoc(ask.__doc__ or ""), annotations=hints)(ask)
     return server

@@ -1,4 +1,4 @@
-"""Benchmarks of the field, protocol by protocol, and speed against error on one's own machine."""
+"""Published benchmarks with their protocols, and speed against error of rasterizers on this machine."""
 
 from langsplat_core.registry import Extension
 

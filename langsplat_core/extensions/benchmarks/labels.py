@@ -1,4 +1,4 @@
-"""Labels of the benchmarks: phrases in frames, and the masks where they are true, drawn when asked for."""
+"""Labels of the benchmarks: phrases in frames with true masks, which are drawn on demand."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -48,16 +48,16 @@ class MaskFile:
 
 @dataclass(frozen=True, eq=False)
 class LabelledPhrase:
-    """A phrase that is asked in a frame, with the true masks and boxes."""
+    """A phrase in a frame, with its true masks and boxes."""
 
     phrase: str
-    masks: tuple[PolygonMask | MaskFile, ...]  # of the things that it names; of none where it names nothing
-    # (B, 4) left, top, right, bottom on the label's grid, inclusive; None: no place is scored
+    masks: tuple[PolygonMask | MaskFile, ...]  # of its instances; empty if it names nothing in the frame
+    # (B, 4) left, top, right, bottom on the label's grid, inclusive; None: no position is scored
     boxes: Array | None
-    targets: int | None = None  # things that it names in the frame; None: one at least
+    targets: int | None = None  # number of its instances in the frame; None: at least one
 
     def truth(self, size: Size) -> Array:
-        """Return the masks joined on a grid of `size`, (H, W) bool."""
+        """Return the union of the masks on a grid of `size`, (H, W) bool."""
         return np.any([mask.draw(size) for mask in self.masks] or [np.zeros(size[::-1], bool)], axis=0)
 
 
@@ -65,7 +65,7 @@ class LabelledPhrase:
 class Frame:
     """A labelled view of a scene."""
 
-    name: str  # of its photograph, without extension; dots inside belong to it
+    name: str  # of its photograph, without extension; other dots are kept
     size: Size  # of the label's grid
     labels: tuple[LabelledPhrase, ...]
 
@@ -76,20 +76,20 @@ class LabelledScene:
 
     name: str
     frames: tuple[Frame, ...]
-    dataset: Path  # where its photographs and cameras lie, if it has them
-    left_out: tuple[str, ...] = ()  # labels that cannot be asked, each "frame: phrase (why)"
+    dataset: Path  # folder of its photographs and cameras, if it has them
+    left_out: tuple[str, ...] = ()  # labels that cannot be scored, each "frame: phrase (why)"
 
 
 @dataclass(frozen=True, eq=False)
 class Benchmark:
-    """A benchmark's scenes, as a folder holds them."""
+    """A benchmark's scenes in a folder."""
 
     name: str
     scenes: Mapping[str, LabelledScene]
 
 
 def read_grey(path: Path) -> Array:
-    """Return (H, W) uint8 brightness of an image file; FormatError where it cannot be read."""
+    """Return (H, W) uint8 brightness of an image file; FormatError if it cannot be read."""
     with opened(path) as image:
         return np.asarray(image.convert("L"))
 
@@ -103,7 +103,7 @@ def resized(mask: Array, size: Size) -> Array:
 
 
 def check_same_image(frame: str, drawn: Size, labelled: Size) -> None:
-    """InputError where a map or camera cannot show the labelled image: another shape."""
+    """Raise InputError if a map or camera has another aspect ratio than the labelled image."""
     (columns, rows), (width, height) = drawn, labelled
     slack = max(SAME_SHAPE * width * rows, width, height, columns, rows)  # a pixel of rounding is allowed
     if abs(columns * height - width * rows) > slack:
@@ -120,7 +120,7 @@ def without_suffix(name: str) -> str:
 
 
 def photograph_of(folder: Path, name: str) -> Path | None:
-    """Return the photograph called `name` in a folder, whatever its kind."""
+    """Return the photograph called `name`, of any kind, in a folder; None without one."""
     candidates = (folder / f"{name}{suffix}" for suffix in (*PHOTO_SUFFIXES, ".JPG", ".JPEG", ".PNG"))
     return next((path for path in candidates if path.is_file()), None)
 
@@ -189,7 +189,7 @@ def _read_scene(name: str, labels: Path, dataset: Path) -> LabelledScene:
 
 
 def _stated(path: Path, kind: type[T], benchmark: str) -> T:
-    """Return the content of a label file."""
+    """Return the content of a label file; FormatError if it does not fit `kind`."""
     try:
         return msgspec.convert(read_json_file(path, LIMIT), kind)
     except msgspec.ValidationError as error:
@@ -222,7 +222,7 @@ def _corners(stored: list[tuple[float, float]], size: Size, where: str) -> Array
 
 
 def _box(stored: Any, polygon: Array) -> Array:
-    """Return (4,) the label's box, the polygon's own where there is none."""
+    """Return the (4,) box of a label, else that of its polygon."""
     try:
         box = np.array(msgspec.convert(stored, tuple[float, float, float, float]))
     except msgspec.ValidationError:
@@ -272,7 +272,7 @@ def _read_ovs3d_scene(folder: Path) -> LabelledScene:
 
 
 def _classes(path: Path) -> tuple[str, ...]:
-    """One class a line, each once."""
+    """Return the classes in a file, one per line, each once."""
     lines = normalize("NFC", read_text(path)).split("\n")
     classes = tuple(dict.fromkeys(line.strip() for line in lines if line.strip()))
     if not classes:
@@ -280,14 +280,14 @@ def _classes(path: Path) -> tuple[str, ...]:
     return classes
 
 
-# GR-LERF (ZeroSplat, ECCV 2026): phrases for none, one or several things in LERF's scenes. No file of it was
-# at hand; what is read is the layout of Ref-LERF (ReferSplat, ICML 2025), with one thing for every phrase.
+# GR-LERF (ZeroSplat, ECCV 2026): phrases for none, one or several instances in LERF's scenes. Its files were
+# not available; the layout is that of Ref-LERF (ReferSplat, ICML 2025), which has one instance per phrase.
 #
 # <scene>/json/test_json/<frame>.json   object or objects [{category, sentence [...], segmentation}]; the last
 #                                       a file in <scene>/mask or gt_mask, or a polygon; none: no target
 # <scene>/                              photographs and cameras
 #
-# Things of a frame that share a sentence are its targets. A thing without sentences is asked by its category.
+# Instances of a frame with the same sentence are its targets. The phrase of one without is its category.
 
 
 class _Referred(msgspec.Struct):
@@ -342,7 +342,7 @@ def _referred_frame(path: Path, scene: Path) -> Frame:
 
 
 def _mask_in(scene: Path, name: str, path: Path) -> MaskFile:
-    """Return the mask file of a scene that a label names; FormatError where it is not there."""
+    """Return the mask file of a scene that a label names; FormatError if it is missing."""
     inside = not Path(name).is_absolute() and ".." not in Path(name).parts
     candidates = [scene / folder / name for folder in ("mask", "gt_mask", ".")] if inside else []
     found = next((one for one in candidates if one.is_file()), None)

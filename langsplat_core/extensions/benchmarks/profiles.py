@@ -1,9 +1,8 @@
-"""The protocols, each one frozen value that pins every constant and says where it is from.
+"""Protocols of the benchmarks: frozen values with every constant and its source.
 
-How each turns maps, drawn selections or the engine's own answer into a mask and a place; and who answers.
-
-Figures of one benchmark differ by ten points between protocols, so a figure belongs to a profile. Nothing
-here depends on a label: a profile is chosen by name, and no threshold is searched.
+The module also turns relevancy maps, rendered selections or the engine's own answers into masks and
+positions. Figures of one benchmark differ by ten points between protocols, so a figure belongs to a protocol.
+Nothing here depends on labels: a protocol is chosen by name, and no threshold is searched.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,9 +26,9 @@ from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import render, view_of
 from langsplat_core.scene import LEVELS, Camera
 
-Border = Literal["mirror", "inside"]  # cv2's reflect101; the mean of what lies inside the image
-LevelRule = Literal["peak", "inside"]  # the highest map; the highest mean inside its own mask
-# "clipped": LangSplat's loop, which never counts the last row and column; "inside": V2's.
+Border = Literal["mirror", "inside"]  # cv2's reflect101; the mean over pixels inside the image
+LevelRule = Literal["peak", "inside"]  # the highest peak; the highest mean inside its own mask
+# "clipped": LangSplat's loop, which never counts the last row and column; "inside": LangSplatV2's.
 Vote = Literal["none", "clipped", "inside"]
 LerfProtocol = Literal["langsplat-code", "langsplat-paper", "langsplat-v2", "direct-3d", "ours"]
 OvsProtocol = Literal["langsplat-paper", "direct-3d", "ours"]
@@ -40,33 +39,33 @@ class MapRule:
     """A rule that turns relevancy maps, one per level, into a mask and a peak."""
 
     window: int  # px, mean filter of the map that is cut; 1: none
-    raw_share: float  # of the unfiltered map in what is cut
+    raw_share: float  # weight of the unfiltered map in the map that is cut
     border: Border
     level: LevelRule
-    min_max: bool  # cut the chosen map after it was brought to [0, 1]
-    threshold: float  # strictly above belongs to the mask
+    min_max: bool  # scale the chosen map to [0, 1] before the cut
+    threshold: float  # strictly above is the mask
     vote: Vote
     vote_window: int  # px
-    peak_window: int  # px, mean filter of the map whose peak is the place; its level is chosen apart
-    ties: bool  # every pixel as high as the peak is tried, else the first in reading order
+    peak_window: int  # px, mean filter of the map whose peak is the position; its level is chosen by itself
+    ties: bool  # all pixels as high as the peak are positions, else the first in reading order
 
 
 @dataclass(frozen=True)
 class SilhouetteRule:
-    """Rule that makes a mask from the image of the selected Gaussians alone; no place is scored."""
+    """A rule that makes a mask from an image of the selected Gaussians alone; no position is scored."""
 
     alpha: float = 0.7  # strictly above, else the pixel is black
-    grey: int = 10  # of 255, strictly above belongs to the mask
+    grey: int = 10  # of 255, strictly above is the mask
 
 
 @dataclass(frozen=True)
 class OwnRule:
-    """The rule that turns the engine's own answer into a mask and a peak (see `own_prediction`)."""
+    """A rule that turns the engine's own answer into a mask and a peak (see `own_prediction`)."""
 
-    share: float = 0.5  # of a pixel's light that comes from members, strictly above
-    peak_window: int = 20  # px of an image of `rows` rows, as the paper's; in proportion for others
+    share: float = 0.5  # of a pixel's weight that is of members, strictly above
+    peak_window: int = 20  # px for an image of `rows` rows, as in the paper; in proportion for others
     rows: int = 731
-    composed: bool = False  # phrases are read by the grammar, else asked whole
+    composed: bool = False  # phrases are compositional queries, else plain ones
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ class Profile:
     """A protocol on one benchmark."""
 
     name: str
-    source: str  # what pins the constants, and what had to be filled in
+    source: str  # where the constants are from, and which had to be chosen
     rule: MapRule | SilhouetteRule | OwnRule
     max_rows: int = 1080  # higher images are scored at this height, as LangSplat's loader shrinks them
 
@@ -124,30 +123,30 @@ _OVS_PAPER = Profile(
 OVS_PROFILES: Mapping[str, Profile] = {profile.name: profile for profile in (_OVS_PAPER, _DIRECT, _OURS)}
 
 
-# From relevancy maps or images of selected Gaussians to a mask and a place; nothing here is given a label.
+# Masks and positions from relevancy maps or images of selected Gaussians, without labels.
 
-TINY = 1e-9  # added to the range that a map is divided by, as in LangSplat's code: a flat map is 0
+TINY = 1e-9  # added to the range by which a map is divided, as in LangSplat's code: a flat map is 0
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The answer to a phrase in a view, as it is scored."""
+    """The answer to a phrase in a view, for scoring."""
 
     mask: Array  # (H, W) bool
-    level: int | None = None  # whose map was cut
-    # (P, 2) int column and row: the place, or several as high; empty: none was named
+    level: int | None = None  # of the map that was cut
+    # (P, 2) int column and row: the position, or several equal ones; empty: none
     peaks: Array = field(default_factory=lambda: np.empty((0, 2), int))
 
 
 def read_maps(maps: Array, rule: MapRule) -> Prediction:
-    """Choose a level of (L, H, W) relevancy maps, L >= 1, and read its mask and place."""
+    """Return the prediction from (L, H, W) relevancy maps, L >= 1, of one chosen level."""
     maps = np.asarray(maps, np.float64)
     blended = [
         (1 - rule.raw_share) * mean_filtered(level, rule.window, rule.border) + rule.raw_share * level
         for level in maps
     ]
     heights = [values.max() for values in blended]
-    if rule.level == "inside":  # -1, below every relevancy, where nothing is inside
+    if rule.level == "inside":  # -1, below every relevancy, for an empty mask
         heights = [values[values > rule.threshold].mean() if high > rule.threshold else -1.0
                    for values, high in zip(blended, heights, strict=True)]  # fmt: skip
     chosen = int(np.argmax(heights))
@@ -160,7 +159,7 @@ def read_maps(maps: Array, rule: MapRule) -> Prediction:
 
 
 def peak_pixels(maps: Array, rule: MapRule) -> Array:
-    """Return (P, 2) column and row of the highest pixels over all maps; one, or a level's ties."""
+    """Return (P, 2) column and row of the highest pixel over all maps, or of all equal ones of its level."""
     smooth = [mean_filtered(level, rule.peak_window, rule.border) for level in maps]
     best = smooth[int(np.argmax([values.max() for values in smooth]))]
     pixels = np.argwhere(best == best.max())[:, ::-1]
@@ -168,7 +167,7 @@ def peak_pixels(maps: Array, rule: MapRule) -> Array:
 
 
 def mean_filtered(values: Array, window: int, border: Border) -> Array:
-    """Return (H, W) means over `window`^2 pixels; an even one reaches further up and left, as cv2's does."""
+    """Return (H, W) means over `window`^2 pixels; an even window extends further up and left, as in cv2."""
     if window <= 1:
         return values
     if border == "mirror":
@@ -178,7 +177,7 @@ def mean_filtered(values: Array, window: int, border: Border) -> Array:
 
 
 def voted(mask: Array, vote: Vote, window: int) -> Array:
-    """Return (H, W) bool majority of `window`^2 pixels, ties False; "clipped": no last row and column."""
+    """Return the (H, W) bool majority of `window`^2 pixels, ties False; "clipped": no last row and column."""
     if vote == "none" or window <= 1:
         return mask
     counted = np.ones(mask.shape)
@@ -189,14 +188,14 @@ def voted(mask: Array, vote: Vote, window: int) -> Array:
     return np.asarray(2 * votes > of + TINY)
 
 
-# How this program's own answer becomes a mask and a place in a view: the one place to change it.
+# Mask and position of this program's own answer in a view.
 
 
 def own_prediction(view: View, result: QueryResult, rule: OwnRule) -> Prediction:
-    """Return the mask and the place of an answer as the program shows it.
+    """Return mask and position of an answer as the program shows it.
 
-    The mask is what shows mostly members of the answer (hidden ones do not count), the place is the peak of
-    the filtered map of the answer's level. Nothing of either where the verdict is "not here".
+    The mask has the pixels that show mostly members of the answer, the position is the peak of the filtered
+    map of the answer's level. Both are empty unless the answer is found.
     """
     values = np.stack([result.members, result.relevancy[result.level]], 1).astype(np.float32)
     drawn = splatted_relevancy(view, values, PictureConfig().alpha_gate)
@@ -206,14 +205,14 @@ def own_prediction(view: View, result: QueryResult, rule: OwnRule) -> Prediction
     return Prediction(drawn[..., 0] > rule.share, result.level, np.array([[column, row]]))
 
 
-# Who answers: a scene of ours, or a folder of relevancy maps and masks that another system rendered. Neither
-# sees a label.
+# Sources of answers: a scene of this program, or a folder of relevancy maps and masks of another system.
+# Neither sees labels.
 #
 #     <view>/<phrase>.npy     float (L, H, W) or (H, W) relevancy; L levels, at most three
 #     <view>/<phrase>.png     a single map; for protocol direct-3d the drawn silhouette instead
 #
-# A PNG of 8 or 16 bits holds relevancy from 0 to 1. A "/" in a phrase is "_" in its file's name. Maps of one
-# phrase have one size; it need not be the labels', whose masks are then brought to it.
+# A PNG of 8 or 16 bits has relevancies from 0 to 1. A "/" in a phrase is "_" in its file name. Maps of one
+# phrase have one size; masks of labels are resized to it.
 
 
 def _read_relevancy(path: Path) -> Array:
@@ -240,19 +239,19 @@ TOGETHER = 10  # phrases splatted in one pass, three channels each
 
 @dataclass(frozen=True, eq=False)
 class SceneSource:
-    """A scene of ours, drawn from the labelled views."""
+    """A scene of this program, rendered from the labelled views."""
 
     engine: QueryEngine
     cameras: Mapping[str, Camera]  # by name without extension
-    trained: frozenset[str] | None  # names of the training views; None: they are not the dataset's names
+    trained: frozenset[str] | None  # names of the training views; None: unknown in the dataset's names
     profile: Profile
 
     def trained_on(self, frame: str) -> bool | None:
-        """Return True where the view was trained on, False where it was not, None where that is not known."""
+        """Return True for a training view, False for another, None if that is unknown."""
         return None if self.trained is None else frame in self.trained
 
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
-        """Return the answer to each phrase in the view `frame`, drawn at `size`, or why there is none."""
+        """Return the answer to each phrase in the view `frame`, rendered at `size`, or why there is none."""
         if frame not in self.cameras:
             return dict.fromkeys(phrases, "no camera of that name")
         camera = self.cameras[frame]
@@ -285,7 +284,7 @@ class SceneSource:
         return [read_maps(maps[row : row + count], rule) for row in range(0, len(maps), count)]
 
     def _silhouette(self, camera: Camera, result: QueryResult, rule: SilhouetteRule) -> Array:
-        """Return the mask of the answer's Gaussians drawn alone, as if nothing stood before them."""
+        """Return the mask of the answer's Gaussians rendered alone, without occlusion by others."""
         if not result.members.any():
             return np.zeros((camera.height, camera.width), bool)
         drawn = render(self.engine.scene.take(result.members), camera)  # over black
@@ -295,7 +294,7 @@ class SceneSource:
 
 @dataclass(frozen=True, eq=False)
 class MapSource:
-    """Another system's maps of one scene, scored on their own grid; its files are as above."""
+    """Another system's maps of one scene, scored on their own grid; for files see above."""
 
     folder: Path  # <view>/<phrase>...
     rule: MapRule | SilhouetteRule

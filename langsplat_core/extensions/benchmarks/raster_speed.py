@@ -1,11 +1,11 @@
 """The rasterizer benchmark (`langsplat bench raster`): time, error and memory of every operation, in one run.
 
-* Time: median of the calls that fit into 0.3 seconds (at least three), after a first call that is not
-  counted. A call of more than two seconds is measured once.
-* Error: against the float64 reference (`ReferenceWindow`), from a call of its own.
-* Memory: how far the process's resident set rises at its highest during the first call, with the heap's
-  free pages given back before. It counts everything: arrays of NumPy, PyTorch's, kernels' own, and what a
-  software OpenGL driver holds. Linux only; elsewhere unknown.
+* Time: median of the calls that fit into 0.3 seconds (3 to 15), after a first call that is not counted. If
+  the first call takes more than two seconds, its time is reported.
+* Error: against the float64 reference (`ReferenceWindow`), from a separate call.
+* Memory: peak rise of the process's resident set during the first call, after free pages of the heap were
+  returned to the system. It includes arrays of NumPy, PyTorch and kernels, and memory of a software OpenGL
+  driver. Linux only; elsewhere unknown.
 """
 
 import ctypes
@@ -40,8 +40,8 @@ from langsplat_core.scene import Camera, Gaussians, look_at
 Pixels = Annotated[int, Range(1, 65_536)]
 Size = tuple[Pixels, Pixels]  # width and height of an image
 Channels = Annotated[int, Range(1, 4_096)]  # values per Gaussian
-WINDOW = 112  # pixels a side of the window in the middle that errors are measured on
-_BAND = 1e-3  # relative distance to a cut-off; float32 footprints of a GPU are within about 3e-4 of it
+WINDOW = 112  # px, side of the central window in which errors are measured
+_BAND = 1e-3  # relative distance to a cut-off; footprints in float32 on a GPU differ by about 3e-4
 _FLIP = 2e-5  # an error in the band is a flip if larger than this and than twice all others
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _NOTES = """- ms: median of the calls after the first.
@@ -71,7 +71,7 @@ class BenchRaster:
     """Folder for raster.md and raster.json."""
 
     def run(self) -> None:
-        for path in self.scenes:  # before the minutes that the others take
+        for path in self.scenes:  # before minutes of measuring
             if not os.path.exists(path):
                 raise InputError(f"{path}: no such file; check the spelling and the folder")
         with TerminalProgress() as progress:
@@ -83,21 +83,21 @@ class BenchRaster:
         print(text)
 
 
-# Memory of this process, as Linux tells it. Not getrusage: its maximum is inherited from the parent process.
+# Memory of this process, from /proc of Linux; the maximum of getrusage is inherited from the parent process.
 
 
 def resident_memory() -> int | None:
-    """Bytes of this process now; None where the system does not tell."""
+    """Return the present resident set of this process, bytes; None if unknown."""
     return _status("VmRSS")
 
 
 def peak_memory() -> int | None:
-    """Most bytes of this process since it began or since `restart_peak`."""
+    """Return the peak resident set since the process began or `restart_peak`, bytes; None if unknown."""
     return _status("VmHWM")
 
 
 def restart_peak() -> int | None:
-    """Give free pages back and forget the peak; returns the bytes now, None where that cannot be done."""
+    """Return free pages to the system and reset the peak; return the present bytes, None if impossible."""
     if not _CLEAR.exists():
         return None
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
@@ -123,7 +123,7 @@ def _status(key: str) -> int | None:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A scene and the camera that sees it."""
+    """A scene and a camera."""
 
     scene: str  # "random", or the name of a file
     gaussians: Gaussians
@@ -134,14 +134,14 @@ class Case:
 class Error:
     """Differences from the reference."""
 
-    largest: float  # over all pixels compared
-    off_cuts: float  # over those where no cut-off is near
-    flips: int  # pixels near a cut-off that came out on its other side
+    largest: float  # over all compared pixels
+    off_cuts: float  # over pixels that are not near a cut-off
+    flips: int  # pixels near a cut-off on its other side
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One backend doing one operation."""
+    """Time, memory and error of an operation of a backend."""
 
     scene: str
     gaussians: int
@@ -156,7 +156,7 @@ class Measurement:
 
 
 def run_plan(plan: BenchRaster, progress: Progress = silent) -> tuple[dict[str, object], list[Measurement]]:
-    """Measure, for minutes; return what is said of the machine, and the measurements."""
+    """Return the description of the machine, and all measurements, which take minutes."""
     machine = describe_machine()
     backends = _backends(machine)
     progress("bench: compiling", 0.0)
@@ -183,7 +183,7 @@ def _cases(plan: BenchRaster) -> Iterator[Case]:
 
 
 def random_scene(count: int) -> Gaussians:
-    """`count` small Gaussians in a unit ball, sized so that the image's coverage does not grow with it."""
+    """Return `count` small Gaussians in a unit ball, of a size such that the image's coverage is constant."""
     generator = np.random.default_rng(0)
     directions = generator.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -204,7 +204,7 @@ def default_camera(width: int, height: int) -> Camera:
 
 
 def _backends(machine: dict[str, object]) -> list[Rasterizer]:
-    """Every fast backend of this machine; those that cannot load are named in `machine` and left out."""
+    """Return the fast backends of this machine; those that cannot load are named in `machine`."""
     backends = [load_rasterizer("cpu")]
     try:
         context = create_egl_context()
@@ -221,7 +221,7 @@ def _backends(machine: dict[str, object]) -> list[Rasterizer]:
 
 
 def describe_machine() -> dict[str, object]:
-    """Processor, cores, load and library versions."""
+    """Return processor, cores, load and library versions."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     load = f"{os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else "unknown"
     libraries = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "torch"))
@@ -240,7 +240,7 @@ def _processor() -> str:
 
 
 def warm_up(backends: Sequence[Rasterizer], channels: Sequence[int]) -> None:
-    """Compile and load everything on a tiny scene, so that no measurement contains it."""
+    """Compile and load everything with a tiny scene, so that measurements do not include it."""
     case = Case("random", random_scene(200), default_camera(40, 30))
     for backend in backends:
         for count in channels:
@@ -251,7 +251,7 @@ def warm_up(backends: Sequence[Rasterizer], channels: Sequence[int]) -> None:
 def measure(
     backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindow"
 ) -> Iterator[Measurement]:
-    """Time every operation of `backend` on one case."""
+    """Yield measurements of every operation of `backend` on one case."""
     shape = case.scene, len(case.gaussians), case.camera.width, case.camera.height, channels
     name = f"{backend.name} {getattr(backend, 'precision', '')}".strip()
     for operation, call, error_of in _operations(backend, case, channels):
@@ -260,7 +260,7 @@ def measure(
         yield Measurement(*shape, operation, name, 1e3 * seconds, peak, error)
 
 
-# Name, what is timed, and its error where one is known.
+# Name, function that is timed, and its error, if one is measured.
 _Operation = tuple[str, Callable[[], Any], "Callable[[ReferenceWindow], Error] | None"]
 
 
@@ -274,10 +274,10 @@ def _operations(backend: Rasterizer, case: Case, channels: int) -> Iterator[_Ope
     cameras, turn = (camera, replace(camera, world_to_camera=ahead)), iter(range(sys.maxsize))
 
     def frame() -> Array:
-        # The camera moves: a backend that keeps the last order must sort again.
+        # The camera moves, so that a backend that caches the order must sort again.
         return backend.view(case.gaussians, cameras[next(turn) % 2]).splat(values)[0]
 
-    if backend.name != "opengl":  # projects in its first draw
+    if backend.name != "opengl":  # which projects in its first draw
         yield "project", lambda: backend.view(case.gaussians, camera), None
     yield "frame", frame, None
     view: Any = backend.view(case.gaussians, camera)
@@ -315,15 +315,15 @@ def _timed(call: Callable[[], Any]) -> tuple[float, float | None]:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceWindow:
-    """The float64 reference in the middle of one view of N Gaussians, which may be millions.
+    """The float64 reference in the central window of a view of N Gaussians, which may be millions.
 
-    The reference draws Gaussians one by one, so a whole image of a million of them takes minutes. The
-    window's pixels depend only on the Gaussians that reach into it; projected by the whole image's camera (as
-    the Jacobian's clamp depends on the image's size) and shifted, they give exactly the pixels of the whole.
+    The reference draws Gaussians one by one, so a whole image of a million takes minutes. The window's pixels
+    depend only on the Gaussians that reach into it; projected by the whole image's camera (as the Jacobian's
+    clamp depends on the image's size) and shifted, they give exactly the pixels of the whole image.
 
-    Pixels where rounding may decide a cut-off (an alpha of just 1/255, a transmittance of just 1e-4) are the
-    *band*: there one flip outweighs every other error, so flips are counted and the error is stated without
-    them.
+    Pixels where rounding may decide a cut-off (an alpha of about 1/255, a transmittance of about 1e-4) are
+    the *band*: a flip there exceeds all other errors, so flips are counted, and errors are stated without the
+    band.
     """
 
     at: tuple[slice, slice]  # rows and columns of the image
@@ -332,19 +332,19 @@ class ReferenceWindow:
     band: Array  # (h, w) bool: pixels near a cut-off
 
     def splat(self, values: Array) -> Array:
-        """Blend (N, C) values into the window's (h, w, C) image, float64."""
+        """Return the (h, w, C) float64 image of the window from (N, C) values."""
         image: Array = self.weights @ values[self.rows].astype(np.float64)
         return image.reshape(*self.band.shape, -1)
 
     def splat_error(self, image: Array, values: Array) -> Error:
-        """Error of the (H, W, C) `image` that a backend made from `values`."""
+        """Return the error of a backend's (H, W, C) `image` of `values`."""
         errors = np.abs(image[self.at] - self.splat(values)).max(-1, initial=0)
         off = float(errors[~self.band].max(initial=0))
         flips = int((errors[self.band] > max(_FLIP, 2 * off)).sum())
         return Error(float(errors.max()), off, flips)
 
     def gather_error(self, gather: Callable[[Array], Array], image: Array) -> Error:
-        """Error of a backend's (H, W, C) -> (N, C), of an image that is 0 in the band and off the window."""
+        """Return the error of a backend's (H, W, C) -> (N, C), of `image` with 0 in the band and outside."""
         masked = np.zeros_like(image)
         masked[self.at] = image[self.at] * ~self.band[..., None]
         values = gather(masked)
@@ -357,7 +357,7 @@ class ReferenceWindow:
 def reference_window(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA
 ) -> ReferenceWindow:
-    """Draw the window with the reference; about 0.1 ms for each Gaussian that reaches into it."""
+    """Return the window of the reference; takes about 0.1 ms for each Gaussian that reaches into it."""
     footprints = project(gaussians, camera, settings)
     reach = rim(footprints, settings, _BAND)
     width, height = size = np.minimum(WINDOW, (camera.width, camera.height))

@@ -1,4 +1,4 @@
-"""Every labelled query against its answer: scores, their means, tables and JSON."""
+"""Scores of labelled queries, their means, tables and JSON."""
 
 import json
 import logging
@@ -38,7 +38,7 @@ from langsplat_core.scene import LEVELS, Camera
 
 
 def write_report(out: Path, name: str, text: str, figures: Any) -> None:
-    """Write `name`.md and .json into the folder `out`, each whole or not at all."""
+    """Write `name`.md and .json into the folder `out`, atomically."""
     with atomic_path(out / f"{name}.md") as path:
         path.write_text(text, encoding="utf-8")
     with atomic_path(out / f"{name}.json") as path:
@@ -52,38 +52,38 @@ def markdown(head: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
 
 
 def intersection_over_union(found: Array, truth: Array) -> float:
-    """Return the intersection over union of two (H, W) boolean masks; 1 where both are empty."""
+    """Return the intersection over union of two (H, W) boolean masks; 1 if both are empty."""
     union = np.logical_or(found, truth).sum()
     return float(np.logical_and(found, truth).sum() / union) if union else 1.0
 
 
-# Every labelled query against its answer.
+# Scores of single queries.
 
 
 @dataclass(frozen=True)
 class QueryScore:
-    """One phrase in one labelled view. What was not answered is wrong: a mean is over all queries."""
+    """Score of a phrase in a labelled view. Queries without an answer count as wrong in means."""
 
     scene: str
     frame: str
     phrase: str
     iou: float
-    hit: bool | None  # whether the place lies in a box of the label; None: not scored
-    level: str = ""  # whose map was cut
+    hit: bool | None  # True if the position is in a box of the label; None: not scored
+    level: str = ""  # of the map that was cut
     unanswered: str = ""  # why there is no answer
-    trained_on: bool | None = None  # whether the view is a training view; None: not known
+    trained_on: bool | None = None  # True for a training view; None: unknown
     grid: Size = (0, 0)  # width and height that were scored
-    targets: int | None = None  # things that the phrase names in the frame, where that may be none
-    is_empty: bool = True  # whether nothing was answered
+    targets: int | None = None  # number of the phrase's instances in the frame, if that may be 0
+    is_empty: bool = True  # True for an empty mask
 
 
 def score_scene(
     labelled: LabelledScene, source: Source, profile: Profile, progress: Progress = silent
 ) -> tuple[list[QueryScore], list[str]]:
-    """Return the scores of every query of a scene, and the labels that cannot be asked, with the reason.
+    """Return the scores of all queries of a scene, and the labels that cannot be scored, with the reason.
 
-    A frame's answers are complete, cut and all, before any mask of it is drawn. Raises InputError where a map
-    has another shape than the labelled image.
+    A frame's answers are final before any of its masks is drawn. Raises InputError if a map has another
+    aspect ratio than the labelled image.
     """
     scores: list[QueryScore] = []
     left_out = list(labelled.left_out)
@@ -123,13 +123,13 @@ def score_scene(
 
 
 def scored_size(size: Size, max_rows: int) -> Size:
-    """`size`, shrunk to `max_rows` rows where it has more."""
+    """Return `size`, shrunk to `max_rows` rows if it has more."""
     width, height = size
     return size if height <= max_rows else (max(1, int(width * max_rows / height)), max_rows)
 
 
 def inside_any_box(peaks: Array, boxes: Array | None, size: Size, grid: Size) -> bool:
-    """Return True where a peak (P, 2) on `grid` lies in a box (B, 4) of the label's `size`, borders too."""
+    """Return True if a peak (P, 2) on `grid` is in a box (B, 4) of the label's `size`, borders included."""
     if boxes is None or not len(peaks):
         return False
     scaled = boxes * np.tile(np.divide(grid, size), 2)
@@ -147,7 +147,7 @@ class Means:
 
     queries: int
     iou: float
-    localisation: float | None  # None: no place is scored
+    localisation: float | None  # None: no position is scored
     accuracy_25: float
     accuracy_50: float
 
@@ -158,9 +158,9 @@ class BenchmarkReport:
 
     benchmark: str
     profile: Profile
-    subject: str  # the scene or maps that were scored, and how
+    subject: str  # the scene or maps that were scored
     queries: tuple[QueryScore, ...]
-    left_out: tuple[str, ...]  # labels that cannot be asked, each "frame: phrase (why)"
+    left_out: tuple[str, ...]  # labels that cannot be scored, each "frame: phrase (why)"
 
 
 def means(queries: Sequence[QueryScore], group: Callable[[QueryScore], Hashable] = id) -> Means:
@@ -203,11 +203,11 @@ def table(report: BenchmarkReport) -> str:
 
 
 def target_table(queries: Sequence[QueryScore]) -> list[str]:
-    """Return the scores by how many things a phrase names, as Markdown; nothing where that is not told.
+    """Return the scores by number of targets, as Markdown; nothing if the labels do not have it.
 
-    Measures of GRES (CVPR 2023): gIoU is the mean of every query's IoU, of nothing 1 where nothing was
-    answered; no-target accuracy is the share of phrases for nothing that got that, target accuracy that of
-    the others that got something.
+    Measures of GRES (CVPR 2023): gIoU is the mean IoU of queries, 1 for an empty answer without targets;
+    no-target accuracy is the share of queries without targets that got an empty answer, target accuracy the
+    share of the others that got an answer.
     """
     rows = []
     for name, low, high in (("none", 0, 0), ("one", 1, 1), ("several", 2, np.inf), ("all", 0, np.inf)):
@@ -224,7 +224,7 @@ def _percent(share: float | None) -> str:
 
 
 def notes(report: BenchmarkReport) -> list[str]:
-    """Return lines of plain text on the protocol, the subject and the frames behind the figures."""
+    """Return lines of text about the protocol, the subject and the frames of the figures."""
     queries = report.queries
     lines = [
         f"{report.benchmark}, protocol {report.profile.name}: {report.profile.source}",
@@ -261,14 +261,14 @@ def save_json(path: Path, report: BenchmarkReport) -> None:
     write_json(path, content)
 
 
-# A benchmark's labels, and whoever answers them, brought together by names.
+# Matching of labels with scenes and maps, by names.
 
 log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Source of an evaluation: exactly one of `scene` and `maps` is set."""
+    """What is evaluated: exactly one of `scene` and `maps` is set."""
 
     scene: Path | None = None  # a scene file, or a folder of <benchmark's scene>.ply
     maps: Path | None = None  # <view>/<phrase>..., or <benchmark's scene>/<view>/<phrase>...
@@ -282,10 +282,10 @@ def run_benchmark(
     load_encoder: LoadEncoder,
     progress: Progress = silent,
 ) -> BenchmarkReport:
-    """Score `subject` on the scenes of `benchmark`.
+    """Return the scores of `subject` on the scenes of `benchmark`.
 
-    Raises InputError for a scene or maps that do not belong to the labels, EncoderError where the text
-    encoder cannot be loaded.
+    Raises InputError for a scene or maps that do not belong to the labels, EncoderError if the text encoder
+    cannot be loaded.
     """
     names = _chosen_scenes(list(benchmark.scenes), subject)
     queries, left_out = list[QueryScore](), list[str]()
@@ -325,12 +325,12 @@ def _scene_source(
     path = subject.scene / f"{labelled.name}.ply" if subject.scene.is_dir() else subject.scene
     if not path.exists():
         raise InputError(f"{path}: no such scene; name another folder, or that of one labelled scene")
-    # Published maps are read as published.
+    # Rules for maps need relevancies as published.
     rule: AnswerRule = "peak" if isinstance(profile.rule, MapRule) else "regions"
     engine = QueryEngine(searchable(path), load_encoder, encoder_id=subject.encoder, rule=rule)
     own = {without_suffix(camera.name): camera for camera in engine.scene.cameras}
     others = _other_cameras(own, labelled, progress)
-    # With no name in common the scene's views are named by another rule: nothing is known of training.
+    # Without a common name the scene has other names for views, and training views are unknown.
     related = not own.keys().isdisjoint([*others, *(frame.name for frame in labelled.frames)])
     trained = frozenset(own) if related else None
     return SceneSource(engine, {**others, **own}, trained, profile)
@@ -353,7 +353,7 @@ def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Pat
 def _other_cameras(
     own: Mapping[str, Camera], labelled: LabelledScene, progress: Progress
 ) -> Mapping[str, Camera]:
-    """Return the dataset's views by name, where the scene lacks one; InputError where neither has any."""
+    """Return the dataset's cameras by name, if the scene lacks some; InputError if neither has any."""
     wanted = [frame.name for frame in labelled.frames]
     if all(name in own for name in wanted):
         return {}
@@ -371,7 +371,7 @@ def _other_cameras(
 
 
 def _dataset_cameras(folder: Path, progress: Progress) -> tuple[Camera, ...]:
-    """Return the cameras that came with a dataset; none where it has none. Photographs are not shrunk."""
+    """Return the cameras of a dataset, for photographs in full size; empty without cameras."""
     whole = DatasetConfig(max_side=65_536)
     if (folder / "transforms.json").is_file():
         return load_nerfstudio(folder / "transforms.json", whole, progress).cameras

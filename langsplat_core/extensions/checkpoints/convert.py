@@ -1,4 +1,4 @@
-"""What `langsplat convert` reads and writes of other methods."""
+"""Files of other methods for `langsplat convert`."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ LANGSPLAT_LATENT = 3  # numbers per Gaussian that its rasterizer is compiled for
 
 
 def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[str, ...]]:
-    """Return the scene of a method's files, and lines that say what came over."""
+    """Return the scene in a method's files, and lines that report what was imported."""
     from langsplat_core.extensions.checkpoints.importing import import_scene, read_foreign  # imports torch
 
     foreign = read_foreign(request.paths, request.levels)
@@ -47,7 +47,7 @@ def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[st
 
 
 def export_langsplat(scene: Scene, folder: Path, progress: Progress = silent) -> tuple[str, ...]:
-    """Write `NAME_{1,2,3}/chkpnt30000.pth` with latents and `best_ckpt.pth`; return what was written.
+    """Write `NAME_{1,2,3}/chkpnt30000.pth` with latents and `best_ckpt.pth`; return the paths.
 
     Raises InputError for a scene whose codec is not an autoencoder of 3 numbers.
     """

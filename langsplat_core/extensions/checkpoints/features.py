@@ -1,7 +1,6 @@
-"""Files of other methods, each told by what it holds; and their language features, read a block at a time.
+"""Files of other methods, recognised by their content, and their language features, read in blocks.
 
-Methods keep 512 numbers per Gaussian, or something smaller that stands for them; either way no (N, 512) array
-is made here.
+Methods keep 512 numbers per Gaussian or a smaller code; in either case no (N, 512) array is made here.
 """
 
 import re
@@ -41,23 +40,23 @@ TOPK = 4  # codewords of a Gaussian in LangSplatV2
 class Features:
     """The vectors, or latents, of N Gaussians at one level."""
 
-    path: Path  # the file that they come from
+    path: Path  # of their file
     dim: int  # numbers per vector
-    # (n,) whole numbers below N -> (n, dim) float32 vectors of any length; zero for no features
+    # (n,) indices below N -> (n, dim) float32 vectors, not normalised; zero for no feature
     rows: Callable[[Array], Array]
 
 
 def whole_vectors(values: Array, path: Path) -> Features:
-    """Return (N, D) floats: vectors of Occam's LGS and Feature-3DGS, latents of LangSplat."""
+    """Return features from (N, D) floats: vectors of Occam's LGS and Feature-3DGS, latents of LangSplat."""
     return Features(path, int(values.shape[1]), lambda indices: np.asarray(values[indices], np.float32))
 
 
 def sparse_codes(logits: Array, codewords: Array, path: Path) -> Features:
-    """Return LangSplatV2's mixtures of the few codewords that a Gaussian's logits name.
+    """Return features of LangSplatV2: mixtures of a few codewords per Gaussian.
 
-    logits: (N, L K) floats, for L layers of codewords one after the other; codewords: (L, K, D) floats, the
-    layers' mixtures are added. The weights are the largest `TOPK` of a softmax, scaled to the sum 1. Logits
-    that are all equal were never trained, and stand for nothing. FormatError, which names `path`, for others.
+    logits: (N, L K) floats, for L layers of codewords one after the other; codewords: (L, K, D) floats. The
+    mixtures of the layers are added. Weights are the largest `TOPK` of a softmax, scaled to the sum 1. Logits
+    that are all equal were never trained: no feature. FormatError, which names `path`, for other shapes.
     """
     layers, size, dim = codewords.shape
     if logits.ndim != 2 or logits.shape[1] != layers * size or not np.isfinite(codewords).all():
@@ -78,7 +77,7 @@ def sparse_codes(logits: Array, codewords: Array, path: Path) -> Features:
 
 
 def _largest_of_softmax(logits: Array) -> Array:
-    """(n, K) logits -> (n, K) weights: the `TOPK` largest of their softmax over their sum, else 0."""
+    """Return (n, K) weights of (n, K) logits: the `TOPK` largest of their softmax over their sum, else 0."""
     powers = np.exp(logits - logits.max(1, keepdims=True))
     shares = powers / powers.sum(1, keepdims=True)
     largest = np.argsort(-shares, axis=1, kind="stable")[:, :TOPK]
@@ -89,7 +88,7 @@ def _largest_of_softmax(logits: Array) -> Array:
 
 
 def rearranged(features: Features, partner: Array) -> Features:
-    """Return features of other Gaussians; partner: (N,) int64 row of `features` of each, -1 for none."""
+    """Return features for other Gaussians; partner: (N,) int64 row of each in `features`, -1 for none."""
 
     def rows(indices: Array) -> Array:
         chosen = partner[indices]
@@ -100,15 +99,15 @@ def rearranged(features: Features, partner: Array) -> Features:
     return replace(features, rows=rows)
 
 
-# One file of what people give to an import, recognised by what it holds, never by its name or length. A
-# `Carrier` has Gaussians, features of one level, or both. What a method keeps beside its checkpoints, an
-# autoencoder or the vectors of clusters, is of no use alone.
+# One file of an import, recognised by its content, never by its name or length. A `Carrier` has Gaussians,
+# with or without features of one level. Other files of a method, an autoencoder or vectors of clusters,
+# belong to a carrier.
 
 PLAIN, UNNAMED = "3D Gaussian Splatting", "LangSplat or Occam's LGS"
 LANGSPLAT, OCCAM, V2 = "LangSplat", "Occam's LGS", "LangSplatV2"
 FEATURE_3DGS, OPEN_GAUSSIAN = "Feature-3DGS", "OpenGaussian"
-INSTANCE = 6  # numbers per Gaussian that OpenGaussian tells instances by, twice; they tell nothing alone
-PICKLE = b"\x80"  # how files of torch began before they were archives
+INSTANCE = 6  # numbers per Gaussian of OpenGaussian's instance features, stored twice; not used here
+PICKLE = b"\x80"  # start of torch files from before they were archives
 SEMANTIC = re.compile(r"semantic_\d+")
 
 
@@ -135,7 +134,7 @@ class Carrier:
 
     @property
     def has_features(self) -> bool:
-        """Return whether the file carries more than Gaussians."""
+        """True if the file has more than Gaussians."""
         return self.method != PLAIN
 
 
@@ -144,8 +143,8 @@ class Clusters:
     """OpenGaussian's vectors of clusters, and the cluster of each Gaussian: `cluster_lang.npz`."""
 
     path: Path
-    index: Array  # (N,) int64 rows of `vectors`; -1 for Gaussians of no cluster
-    vectors: Array  # (K, D) float32 of any length; zero for a cluster without any
+    index: Array  # (N,) int64 rows of `vectors`; -1 for Gaussians in no cluster
+    vectors: Array  # (K, D) float32, not normalised; zero for a cluster without a vector
 
     @property
     def features(self) -> Features:
@@ -165,7 +164,7 @@ Part = Carrier | Clusters | Autoencoder
 
 
 def read_part(path: Path) -> Part:
-    """Read a file of any method by its content; InputError where unopened, FormatError where unknown."""
+    """Return the content of a method's file; InputError if it cannot be opened, FormatError if unknown."""
     file, _ = open_for_reading(path)
     with file:
         start = file.read(8)
@@ -182,7 +181,7 @@ def _is_npz(path: Path) -> bool:
     try:
         with opened_archive(path, "archive") as archive:
             return all(name.endswith(".npy") for name in archive.names)
-    except FormatError:  # torch finds more in a damaged archive than zipfile does
+    except FormatError:  # torch reads some damaged archives that zipfile does not
         return False
 
 
@@ -217,7 +216,7 @@ def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
     known = np.where(counts[:, None] > 0, vectors, 0).astype(np.float32)
     index = index.astype(np.int64)
     told = [unread("arrays", arrays.keys() - {"leaf_feat", "leaf_ind", "leaf_score", "occu_count"})]
-    if beyond := np.count_nonzero((index > len(vectors)) | (index < -1)):  # -1, and one too many, mean none
+    if beyond := np.count_nonzero((index > len(vectors)) | (index < -1)):  # -1 and K stand for none
         told.append(f"{beyond} Gaussians are of clusters that are not there, and get none")
     report_losses(path, told)
     return Clusters(path, np.where((index >= 0) & (index < len(vectors)), index, -1), known)
@@ -252,7 +251,7 @@ def _from_torch(content: Any, path: Path) -> Part:
 
 
 def _language(elements: tuple[Any, ...], count: int, path: Path, tell: Tell) -> tuple[str, Features | None]:
-    """Return the method and the features of what follows the geometry; training's state plays no part."""
+    """Return the method and the features in the elements after the geometry, without training's state."""
     first = plain_array(elements[GEOMETRY], path)
     second = plain_array(elements[GEOMETRY + 1], path) if len(elements) > GEOMETRY + 1 else None
     if first is None or first.ndim != 2:  # (N,) radii of plain 3D Gaussian Splatting
@@ -273,25 +272,24 @@ def _language(elements: tuple[Any, ...], count: int, path: Path, tell: Tell) -> 
 
 
 def _wide(array: Array | None, count: int) -> Array | None:
-    """Return (N, D), (N, 1, D) or (N, D, 1) floats as (N, D) where D > 1; None for anything else."""
+    """Return (N, D), (N, 1, D) or (N, D, 1) floats as (N, D) if D > 1; None for anything else."""
     if array is None or array.dtype.kind != "f" or array.ndim not in (2, 3) or len(array) != count:
         return None
     flat = array.reshape(count, -1) if 1 in array.shape[1:] or array.ndim == 2 else array
     return flat if flat.ndim == 2 and flat.shape[1] > 1 else None
 
 
-# Which of the three levels a checkpoint is of, and how its Gaussians go with those of the others.
+# The level of a checkpoint, and how its Gaussians match those of others.
 
 _NUMBER = re.compile(r"_(?:level_?)?([1-3])$")  # `chkpnt30000_langfeat_2`, `scene_level_2`, `teatime_2/`
-LEAST_SHARED = 0.5  # of the Gaussians of a pruned checkpoint; with fewer in common it is another scene's
+LEAST_SHARED = 0.5  # least share of Gaussians in common of two checkpoints of one scene
 
 
 def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[int], str]:
-    """0, 1 or 2 for each checkpoint, and by what they were told apart.
+    """Return the level 0, 1 or 2 of each checkpoint, and how it was determined.
 
-    As `asked` (names of levels, in the order of the checkpoints); else as their names say or those of their
-    folders; else three in their order, and one alone is the whole. Raises InputError where
-    that leaves a doubt.
+    It is as `asked` (names of levels, in the order of the checkpoints), else by names of files or folders;
+    else three are in order, and a single one is "whole". Raises InputError if none of these applies.
     """
     if asked and (len(asked) != len(carriers) or len(set(asked)) != len(asked)):
         raise InputError(
@@ -317,7 +315,7 @@ def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[i
 
 
 def _numbered(path: Path) -> int | None:
-    """Return the number at the end of a file's name, or of its folder's."""
+    """Return the number at the end of a file's name, or of its folder's name; None without one."""
     for name in (path.stem, path.resolve().parent.name):
         found = _NUMBER.search(name)
         if found:
@@ -326,10 +324,10 @@ def _numbered(path: Path) -> int | None:
 
 
 def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:
-    """Return the Gaussians of checkpoints that lack different ones.
+    """Return the union of the Gaussians of checkpoints that lack different ones.
 
-    Those of the first come first, then what each further one has beside them. Raises FormatError where they
-    are not of one scene.
+    Those of the first checkpoint come first, then the additional ones of each further checkpoint. Raises
+    FormatError if they are not of one scene.
     """
     found = carriers[0].gaussians
     for carrier in carriers[1:]:
@@ -342,12 +340,10 @@ def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:
 
 
 def partners(means: Array, carrier: Carrier, may_lack: bool) -> Array | None:
-    """Return (N,) row of the `carrier`'s Gaussian at each of (N, 3) `means`, -1 where it has none.
+    """Return the (N,) rows of the `carrier`'s Gaussians at (N, 3) `means`, -1: none; None if all are equal.
 
-    None where they are the same Gaussians. Raises FormatError where they are not of one scene.
-
-    A checkpoint that `may_lack` some Gaussians has removed them: those at the same position, bit for bit, are
-    the same.
+    may_lack: the checkpoint may have removed Gaussians; those at bitwise equal positions are then the same.
+    Raises FormatError if they are not of one scene.
     """
     theirs = carrier.gaussians.means
     if np.array_equal(means, theirs, equal_nan=True):
@@ -361,9 +357,9 @@ def partners(means: Array, carrier: Carrier, may_lack: bool) -> Array | None:
 
 
 def _row_of(means: Array, theirs: Array, count: int, carrier: Carrier) -> Array:
-    """Return (N,) row of `theirs` at the same position, -1 for none; of several the k-th goes with the k-th.
+    """Return the (N,) rows of `theirs` at the same positions, -1: none; of several the k-th match the k-th.
 
-    FormatError where too few of `count` have one.
+    FormatError if too few of `count` match.
     """
     bits = np.concatenate([means, theirs]).astype(np.float32).view(np.uint32)
     places = np.unique(bits, axis=0, return_inverse=True)[1].reshape(-1)
@@ -380,7 +376,7 @@ def _row_of(means: Array, theirs: Array, count: int, carrier: Carrier) -> Array:
 
 
 def _ranked(places: Array) -> Array:
-    """Return (N,) distinct numbers for whole ones: upper bits the number, lower its rank among equals."""
+    """Return (N,) distinct integers: the given ones in the upper bits, the rank among equals in the lower."""
     order = np.argsort(places, kind="stable")
     ordered = places[order]
     rank = np.empty(len(places), np.int64)

@@ -1,10 +1,9 @@
-"""A scene of another method, put together from the files that people have of it, as a scene of this one.
+"""Import of scenes of other methods from their files.
 
-Nothing in a file is ever executed, and what a file is tells what it holds. docs/files.md says what to give of
-each method and what becomes of it. Latents of LangSplat's autoencoder are kept with it. Vectors of CLIP's own
-space go into a codec fitted to a sample of them, a codebook unless asked otherwise; clusters that have a
-vector each are a codebook already. Vectors are read a block of Gaussians at a time: all of them may be more
-than memory holds.
+Nothing in a file is executed, and files are recognised by their content. docs/files.md lists the files of
+each method and what is imported. Latents of LangSplat's autoencoder are kept with it. CLIP vectors are
+encoded by a codec fitted to a sample of them, by default a codebook; vectors of clusters are a codebook
+already. Vectors are read a block of Gaussians at a time, as all of them may exceed the memory.
 """
 
 from collections.abc import Sequence
@@ -54,8 +53,8 @@ from langsplat_core.training.language.codec_fit import (
 )
 
 WIDEST_LATENT = 16  # numbers per Gaussian up to which they are an autoencoder's; 1, 2, 3 and 8 were published
-ONE_LEVEL = (OPEN_GAUSSIAN, FEATURE_3DGS)  # methods that know no levels
-HUGE = 1e15  # feature; its square still fits float32
+ONE_LEVEL = (OPEN_GAUSSIAN, FEATURE_3DGS)  # methods without levels
+HUGE = 1e15  # largest feature, whose square fits float32
 FITTED, JUDGED = 12_000, 2_000  # Gaussians of each level that a codec is fitted to, and judged on
 BLOCK = 16_384  # Gaussians read at a time: 32 MB at 512 float32 numbers
 P = TypeVar("P", bound=Part)
@@ -68,18 +67,18 @@ class ForeignScene:
     method: str
     scene: Scene  # without a language field
     levels: tuple[Features | None, ...] = (None, None, None)  # of subpart, part and whole, each for all N
-    codec: AutoencoderCodec | None = None  # that the features are latents of; None where they are vectors
-    clusters: Clusters | None = None  # that the features come from
-    notes: tuple[str, ...] = ()  # what was taken for granted, for people
+    codec: AutoencoderCodec | None = None  # if the features are its latents; None: they are vectors
+    clusters: Clusters | None = None  # if the features are vectors of clusters
+    notes: tuple[str, ...] = ()  # assumptions, for the user
 
     @property
     def told(self) -> dict[int, Features]:
-        """The features that there are, by their level."""
+        """The features by level, without empty levels."""
         return {level: features for level, features in enumerate(self.levels) if features is not None}
 
     @property
     def dim(self) -> int:
-        """Length D of the vectors; 0 where there are no features."""
+        """Length D of the vectors; 0 without features."""
         if self.codec is not None:
             return self.codec.vector_dim
         return next((features.dim for features in self.told.values()), 0)
@@ -90,7 +89,7 @@ class ForeignScene:
         return next(features.path for features in self.told.values())
 
     def rows(self, level: int, indices: Array) -> Array:
-        """(n, D or d) float32 of any length at `level`, zero for none; FormatError if infinite or huge."""
+        """Return (n, D or d) float32 features at `level`, zero for none; FormatError if infinite or huge."""
         features = self.told[level]
         with np.errstate(invalid="ignore", over="ignore"):
             rows = features.rows(indices)
@@ -104,10 +103,10 @@ class ForeignScene:
 
 
 def read_foreign(paths: Sequence[Path], levels: Sequence[str] = ()) -> ForeignScene:
-    """Return the scene in checkpoints of another method and in what belongs to them, in any order.
+    """Return the scene in checkpoints and other files of another method, in any order.
 
-    `levels` names those of the checkpoints with features, in their order. Raises InputError where a file
-    cannot be opened or one is missing, FormatError where one is damaged, unknown, or of another scene.
+    levels: names of the levels of the checkpoints with features, in their order. Raises InputError if a file
+    cannot be opened or is missing, FormatError if one is damaged, unknown, or of another scene.
     """
     parts = [read_part(path) for path in paths]
     carriers = [part for part in parts if isinstance(part, Carrier)]
@@ -137,7 +136,7 @@ def _only(found: list[P], what: str) -> P | None:
 
 
 def _named(carrier: Carrier, autoencoder: Autoencoder | None) -> Carrier:
-    """Return the carrier with the method of its float features: they are latents or vectors."""
+    """Return the carrier with its method, by whether its features are latents or vectors."""
     if carrier.method != UNNAMED or carrier.features is None:
         return carrier
     width = carrier.features.dim
@@ -157,7 +156,7 @@ def _named(carrier: Carrier, autoencoder: Autoencoder | None) -> Carrier:
 
 
 def _of_clusters(carrier: Carrier | None, clusters: Clusters) -> ForeignScene:
-    """OpenGaussian's scene, whose one level is taken for the whole."""
+    """Return OpenGaussian's scene, whose only level is taken for "whole"."""
     if carrier is None:
         raise InputError(f"{clusters.path}: has no Gaussians; name the scene's checkpoint or PLY too")
     if len(clusters.index) != len(carrier.gaussians):
@@ -192,7 +191,7 @@ def _of_levels(
     featured = [carrier.about((plain or featured[0]).scene.origin) for carrier in featured]
     carriers = [plain] if plain else featured  # the scene's Gaussians: those without features, or the first's
     base = carriers[0]
-    if base.method == OCCAM:  # which removes what no view saw, so that levels keep different Gaussians
+    if base.method == OCCAM:  # it removes unseen Gaussians, so levels have different ones
         base = replace(base, scene=replace(base.scene, gaussians=all_gaussians(carriers)))
     levels: list[Features | None] = [None] * len(LEVELS)
     pruned = 0
@@ -227,7 +226,7 @@ def _scene(carrier: Carrier) -> Scene:
     return replace(scene, cameras=tuple(camera.moved(-scene.origin) for camera in read))
 
 
-# Its features as a language field.
+# Features as a language field.
 
 
 def import_scene(
@@ -237,14 +236,13 @@ def import_scene(
     config: CodecConfig | None = None,
     progress: Progress = silent,
 ) -> tuple[Scene, CodecReport | None]:
-    """Return the scene with its language field, and what its codec loses on vectors not fitted to.
+    """Return the scene with its language field, and the errors of its codec on vectors not fitted to.
 
-    There is no field where `foreign` has no features, and no loss where the codec is the method's own.
-
-    `encoder_id` is the text encoder of the space that the method's vectors are in, by default that of
-    LangSplat; `phrases` are stored encoded. A Gaussian's confidence is 1 where it has a feature, else 0.
-    Raises EncoderError where the encoder cannot be loaded, InputError where its vectors have another length
-    or no Gaussian has a feature, FormatError for features that are not finite.
+    Without features there is no field, and no errors are measured for the method's own codec. encoder_id: the
+    text encoder of the method's vectors, by default that of LangSplat; phrases: to encode and store. The
+    confidence of a Gaussian is 1 if it has a feature, else 0. Raises EncoderError if the encoder cannot be
+    loaded, InputError if its vectors have another length or no Gaussian has a feature, FormatError for
+    features that are not finite.
     """
     config = config or CodecConfig()
     check_settings(config, "--codec.")
@@ -271,7 +269,7 @@ def _codec(
     clusters = foreign.clusters
     if clusters is not None and len(clusters.vectors) <= LARGEST and config.kind == "codebook":
         counts = np.bincount(clusters.index[clusters.index >= 0], minlength=len(clusters.vectors))
-        used = np.flatnonzero((counts > 0) & _has_meaning(clusters.vectors))
+        used = np.flatnonzero((counts > 0) & _has_feature(clusters.vectors))
         if len(used) == 0:
             raise InputError("no cluster that Gaussians belong to has a meaning; there is nothing to search")
         return codebook_of(unit(clusters.vectors[used]), counts[used].astype(np.float64)), None
@@ -293,20 +291,20 @@ def _samples(foreign: ForeignScene, seed: int) -> tuple[Array, Array]:
     return samples[0], samples[1]
 
 
-def _has_meaning(vectors: Array) -> Array:
+def _has_feature(vectors: Array) -> Array:
     known: Array = np.linalg.norm(vectors, axis=1) > SHORTEST
     return known
 
 
 def _unit_rows(foreign: ForeignScene, level: int, rows: Array) -> tuple[Array, Array]:
-    """(n, D or d) float32 vectors or latents of length 1, and (n,) whether there is a meaning."""
+    """Return (n, D or d) float32 vectors or latents of length 1, and (n,) bool: it is a feature."""
     values = foreign.rows(level, rows)
-    known = _has_meaning(values)
+    known = _has_feature(values)
     return unit(values, SHORTEST).astype(np.float32), known
 
 
 def _latents(foreign: ForeignScene, codec: Codec, progress: Progress) -> tuple[Array, Array]:
-    """Return (3, N, d) of the codec's type, and (3, N) float32: 1 where a Gaussian has a meaning."""
+    """Return (3, N, d) latents of the codec's type, and (3, N) float32: 1 if a Gaussian has a feature."""
     count = len(foreign.scene.gaussians)
     latents = np.zeros((len(LEVELS), count, codec.latent_dim), codec.dtype)
     confidence = np.zeros((len(LEVELS), count), np.float32)

@@ -19,26 +19,25 @@ from langsplat_core.scene.codec import EPSILON, Layers, folded
 # ---- LangSplat's autoencoder, `best_ckpt.pth`: weights by the number of a layer in its network ----
 #
 #     encoder.{0,3,6,9,12}.{weight,bias}                        linear layers 512-256-128-64-32-3
-#     encoder.{1,4,7,10}.{weight,bias,running_mean,running_var} batch normalisation behind all but the last,
+#     encoder.{1,4,7,10}.{weight,bias,running_mean,running_var} batch normalisation after all but the last,
 #                                                               then ReLU, which has no weights
 #     decoder.{0,2,4,6,8,10,12}.{weight,bias}                   linear layers 3-16-32-64-128-256-256-512 with
 #                                                               ReLU between them
 #
-# Both results are scaled to length 1. Other widths and depths are read too: a layer's weights tell what it
-# is.
+# Both outputs are scaled to length 1. Other widths and depths are read too, from the weights of the layers.
 
 _NAME = re.compile(r"(encoder|decoder)\.([0-9]{1,3})\.(\w+)")
 Layer = dict[str, Array]
 
 
 def is_autoencoder(content: Mapping[Any, Any]) -> bool:
-    """Return whether these are weights of an encoder and a decoder."""
+    """Return True if the content is weights of an encoder and a decoder."""
     parts = {found[1] for name in content if (found := layer_name(name))}
     return parts == {"encoder", "decoder"}
 
 
 def layer_name(name: object) -> re.Match[str] | None:
-    """Return part, number and kind of a layer's weights of that name; None for another entry."""
+    """Return the match of part, layer number and kind in the name of weights; None for another entry."""
     return _NAME.fullmatch(name) if isinstance(name, str) else None
 
 
@@ -48,7 +47,7 @@ def autoencoder_from(content: Mapping[str, Any], path: Path) -> AutoencoderCodec
     Raises FormatError.
     """
     try:
-        with np.errstate(all="ignore"):  # what is not finite is refused below
+        with np.errstate(all="ignore"):  # weights that are not finite are refused below
             codec = AutoencoderCodec(
                 *(folded(_layers(content, part, path)) for part in ("encoder", "decoder"))
             )
@@ -60,7 +59,7 @@ def autoencoder_from(content: Mapping[str, Any], path: Path) -> AutoencoderCodec
 
 
 def _layers(content: Mapping[str, Any], part: str, path: Path) -> list[Layer]:
-    """Named weights of every layer that has any, in the network's order."""
+    """Return the named weights of every layer that has any, in the network's order."""
     layers: dict[int, Layer] = {}
     for name, value in content.items():
         found = layer_name(name)
@@ -71,7 +70,7 @@ def _layers(content: Mapping[str, Any], part: str, path: Path) -> list[Layer]:
 
 
 def autoencoder_weights(encoder: Layers, decoder: Layers) -> dict[str, Array]:
-    """Return the dictionary of a codec; its batch normalisations change nothing: theirs are folded in."""
+    """Return the dictionary of a codec; its batch normalisations are folded, so those written are neutral."""
     named: dict[str, Array] = {}
     for part, layers, step in (("encoder", encoder, 3), ("decoder", decoder, 2)):
         for number, (weight, bias) in enumerate(layers):
@@ -98,13 +97,13 @@ def autoencoder_weights(encoder: Layers, decoder: Layers) -> dict[str, Array]:
 #     6      logits of opacities                            (N, 1)
 #     7...   what a method adds, then the optimiser's state
 #
-# It is wrapped as (tuple, iteration). How many elements follow tells nothing: two methods add two each.
+# It is wrapped as (tuple, iteration). The number of elements does not identify a method: two add two each.
 
-GEOMETRY = 7  # elements that every method has
+GEOMETRY = 7  # number of elements in common
 
 
 def model_tuple(content: Any) -> tuple[Any, ...] | None:
-    """Return the elements of a Gaussian model in what a file holds; None where it is something else."""
+    """Return the elements of a Gaussian model in a file's content; None for other content."""
     if isinstance(content, (tuple, list)) and len(content) == 2 and isinstance(content[0], (tuple, list)):
         content = content[0]
     if not isinstance(content, (tuple, list)) or len(content) <= GEOMETRY:
@@ -123,7 +122,7 @@ _ELEMENTS: Mapping[str, tuple[int | str, ...]] = {
 
 
 def gaussians_of(elements: tuple[Any, ...], path: Path) -> Gaussians:
-    """Return the Gaussians in elements 1 to 6; FormatError where one has another shape."""
+    """Return the Gaussians in elements 1 to 6; FormatError if one has another shape."""
     arrays, dims = [], dict[str, int]()
     for index, (name, shape) in enumerate(_ELEMENTS.items(), 1):
         array = plain_array(elements[index], path)
@@ -140,14 +139,13 @@ def gaussians_of(elements: tuple[Any, ...], path: Path) -> Gaussians:
     return Gaussians(means, log_scales, quats, logits[:, 0], np.concatenate([base, rest], axis=1))
 
 
-# Checkpoints as LangSplat reads them: element 7 holds the features, and what an optimiser
-# would need is empty.
+# Checkpoints that LangSplat reads: element 7 has the features, the optimiser's state is empty.
 
 
 def write_checkpoint(path: Path, gaussians: Gaussians, features: Array, origin: Array = NO_ORIGIN) -> None:
-    """Write a level's checkpoint with (N, D) float32 `features`, zero where a Gaussian has no meaning.
+    """Write a level's checkpoint with (N, D) float32 `features`, zero for a Gaussian without a feature.
 
-    It loads with and without `weights_only`. An `origin` (3,) that positions are relative to lies beside it.
+    It loads with and without `weights_only`. An `origin` (3,) of the positions is written beside it.
     """
     import torch
 
@@ -185,12 +183,12 @@ def write_autoencoder(path: Path, encoder: Layers, decoder: Layers) -> None:
 def _tensor(array: Array) -> Any:
     import torch
 
-    return torch.from_numpy(np.array(array, order="C"))  # its own copy: a view would save the whole of it
+    return torch.from_numpy(np.array(array, order="C"))  # a copy: torch saves the whole array of a view
 
 
 def _save(content: Any, path: Path) -> None:
     import torch
 
-    # Given a path, torch 2.8 says nothing of a full disk.
+    # Given a path, torch 2.8 does not report a full disk.
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         torch.save(content, file)

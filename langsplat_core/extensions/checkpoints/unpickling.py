@@ -1,9 +1,9 @@
-"""Reading what torch saved, as plain data: tensors, numbers and containers of them, and never any code.
+"""Reading of torch files as plain data: tensors, numbers and containers of them, without running code.
 
-A pickle is looked through before torch runs it: it may name little more than what dense tensors are made of,
-since torch believes what a file says of sparse, quantised and nested ones, and reads beyond its memory. What
-training code leaves of NumPy among them plays no part here: it is passed over by a stand-in. Archives are
-mapped into memory and not read, as torch then sees where they end.
+A pickle is checked before torch runs it: it may name little more than the parts of dense tensors, since torch
+trusts the sizes in a file for sparse, quantised and nested ones, and reads beyond its memory. NumPy objects
+of training code are not needed here, and stand-ins replace them. Archives are mapped into memory, so that
+torch knows where they end.
 """
 
 import io
@@ -17,15 +17,15 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, optional_imports, quoted
 from langsplat_core.io.hostile import open_for_reading, opened_archive
 
-DEEPEST = 100  # tuples in tuples; Python's hash goes down them on the machine's stack, which ends at 100 000
-_ARCHIVE = b"PK\x03\x04"  # how torch tells an archive
-_PICKLES = 5  # that a file begins with where it is none: magic number, version, system, content, storages
+DEEPEST = 100  # nested tuples; Python's hash recurses on the machine's stack, which ends at 100 000
+_ARCHIVE = b"PK\x03\x04"  # by which torch recognises an archive
+_PICKLES = 5  # at the start of a file that is no archive: magic number, version, system, content, storages
 _STORAGES = ("Bool", "Byte", "Char", "Short", "Int", "Long", "Half", "BFloat16", "Float", "Double")
 _MARKED = (pickletools.markobject, pickletools.stackslice)
 
 
 class _Ignored:
-    """Stand-in for all that is NumPy's, whatever a file says of it."""
+    """Stand-in for any NumPy object, whose state is ignored."""
 
     def __init__(self, *_: Any) -> None:
         pass
@@ -35,7 +35,7 @@ class _Ignored:
 
 
 class IgnoredArray(_Ignored):
-    """Stand-in for an array of NumPy's, which a reader tells of."""
+    """Stand-in for a NumPy array, which readers report as ignored."""
 
 
 # NumPy's names before and since its version 2.
@@ -47,7 +47,7 @@ _NAMED = {
     *(f"torch.{kind}Storage" for kind in _STORAGES),
     *(f"torch._utils._rebuild_{what}" for what in ("tensor", "tensor_v2", "parameter")),
     *("torch.Size", "torch.device", "collections.OrderedDict"),
-    "_codecs.encode",  # how bytes are written
+    "_codecs.encode",  # in pickles of bytes
 }
 
 
@@ -55,11 +55,11 @@ _NAMED = {
 def load_torch(path: Path) -> Any:
     """Return the content of a file of `torch.save`.
 
-    Tensors are on the CPU and, where the file allows, read when used; `plain_array` and `plain_mapping` say
-    what is among them. Raises InputError where the file cannot be opened; FormatError where it is damaged, of
-    another kind, or names any class or function beside those of dense tensors.
+    Tensors are on the CPU and, in archives, read on access; see `plain_array` and `plain_mapping`. Raises
+    InputError if the file cannot be opened; FormatError if it is damaged, of another kind, or names any class
+    or function other than those of dense tensors.
     """
-    import torch  # a second to import, and only a checkpoint needs it
+    import torch  # takes a second; only checkpoints need it
 
     open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
     stand_ins: Any = [(IgnoredArray if name in _ARRAYS else _Ignored, name) for name in _OF_NUMPY]
@@ -70,27 +70,24 @@ def load_torch(path: Path) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True, mmap=archived)
         except FormatError as error:
             raise FormatError(f"{path}: {error}") from None
-        except Exception:  # noqa: BLE001  a damaged file raises whatever it hits first
+        except Exception:  # noqa: BLE001  a damaged file may raise anything
             reason = "not a whole file of torch.save; was the download complete?"
             raise FormatError(f"{path}: {reason}") from None
 
 
 def _look_through(path: Path) -> bool:
-    """Return whether a file is an archive. Raises FormatError for what its pickles may not hold."""
+    """Return True if a file is an archive. Raises FormatError for forbidden content of its pickles."""
     from torch._C import PyTorchFileReader
 
     packed = False
-    with (
-        suppress(FormatError),
-        opened_archive(path, "archive") as archive,
-    ):  # torch finds more in damaged ones
-        packed = archive.deflated  # whose bytes would be taken for numbers
+    with suppress(FormatError), opened_archive(path, "archive") as archive:  # torch reads some damaged ones
+        packed = archive.deflated  # torch would take compressed bytes for numbers
     if packed:
         raise FormatError("its archive is compressed, which torch.save does not; save it again by that")
     with open_for_reading(path)[0] as file:
         archived = file.read(len(_ARCHIVE)) == _ARCHIVE
         file.seek(0)
-        if archived:  # by torch's own reader: another could find another pickle in the same file
+        if archived:  # with torch's own reader, as another might find another pickle in the file
             _check_pickle(io.BytesIO(PyTorchFileReader(file).get_record("data.pkl")))
         for _ in range(0 if archived else _PICKLES):
             _check_pickle(file)
@@ -98,9 +95,9 @@ def _look_through(path: Path) -> bool:
 
 
 def _check_pickle(stream: IO[bytes]) -> None:
-    """Raise FormatError for a name that is not of `_NAMED`, and for tuples in more than DEEPEST others."""
-    depths: list[int] = []  # of what would lie on the unpickler's stack: tuples in one another
-    below: list[list[int]] = []  # at each mark
+    """Raise FormatError for a name that is not in `_NAMED`, and for more than DEEPEST nested tuples."""
+    depths: list[int] = []  # nesting of tuples for each entry of the unpickler's stack
+    below: list[list[int]] = []  # the stacks below each mark
     memo: dict[Any, int] = {}
     for opcode, argument, _ in pickletools.genops(stream):
         if opcode.name == "MARK":
@@ -125,9 +122,9 @@ def _check_pickle(stream: IO[bytes]) -> None:
 
 
 def plain_array(value: Any, path: Path) -> Array | None:
-    """Return a tensor as a NumPy array, not copied where it need not be; None for anything else.
+    """Return a tensor as a NumPy array, without a copy if possible; None for anything else.
 
-    Raises FormatError for a tensor that no array can be, or that claims more numbers than it was stored with.
+    Raises FormatError for a tensor that cannot be an array, or claims more numbers than its storage has.
     """
     import torch
 
@@ -138,11 +135,11 @@ def plain_array(value: Any, path: Path) -> Array | None:
     value = value.detach()
     try:
         array: Array = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
-    except (RuntimeError, ValueError):  # more dimensions than NumPy has, marks of lazy operations
+    except (RuntimeError, ValueError):  # more dimensions than NumPy allows, flags of lazy operations
         raise FormatError(f"{path}: holds a tensor that is no array of numbers") from None
     return array
 
 
 def plain_mapping(value: Any) -> dict[Any, Any] | None:
-    """Return a dictionary, without what a file may have set in place of its methods, or None."""
+    """Return a plain copy of a dictionary, whose methods a file may have replaced; None for anything else."""
     return dict(dict.items(value)) if isinstance(value, dict) else None

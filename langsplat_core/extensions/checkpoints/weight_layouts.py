@@ -2,11 +2,11 @@
 
 Tensors in the layouts of open_clip, OpenAI, segment_anything and sam2 are renamed to those of transformers.
 
-What a model is made of follows from the shapes of its tensors; an open_clip_config.json beside them says
-what shapes do not: the heads, and which GELU. Without one, CLIP's heads are 64 wide, those for images at
-most 16, as in the models that OpenAI and open_clip published; and the GELU is OpenAI's quick one where the
-file holds OpenAI's `input_resolution` too or has "quickgelu" or "openai" in its name, else the exact one.
-Of SAM 2, whose windows and heads no shape tells, the published sizes are known.
+The configuration of a model follows from the shapes of its tensors, except for the heads and the kind of
+GELU, which an open_clip_config.json beside them states. Without one, CLIP's heads are 64 wide, at most 16 of
+them for images, as in the models that OpenAI and open_clip published; and the GELU is OpenAI's quick one if
+the file has OpenAI's `input_resolution`, `context_length` and `vocab_size`, or "quickgelu" or "openai" in its
+name, else the exact one. Windows and heads of SAM 2 are those of the published sizes.
 """
 
 import json
@@ -49,7 +49,7 @@ from langsplat_core.semantics.weights import (
 
 Tensors = Mapping[str, Any]  # name -> torch.Tensor
 Settings = dict[str, Any]
-Names = tuple[tuple[str, str], ...]  # patterns of another layout's names, and what transformers has there
+Names = tuple[tuple[str, str], ...]  # patterns of another layout's names, and their replacements
 
 MOBILE_SAM = (
     "a MobileSAM, whose encoder TinyViT transformers does not have; pass sam_vit_b_01ec64.pth in its place, "
@@ -57,14 +57,14 @@ MOBILE_SAM = (
 )
 TIMM = "its image tower is timm's (PE-Core, MobileCLIP); pass facebook/metaclip-2-worldwide-b16 in its place"
 HEAD_WIDTH, MOST_HEADS = 64, 16
-SAM_HEADS = 8  # of the mask decoder, which no shape tells
+SAM_HEADS = 8  # of the mask decoder, which do not follow from shapes
 NOT_OURS = "open_clip's {part} states {name} {value!r}, which is not computed here"
 
 CLIP_NAMES: Names = (
     (r"^visual\.class_embedding$", "vision_model.embeddings.class_embedding"),
     (r"^visual\.conv1\.weight$", "vision_model.embeddings.patch_embedding.weight"),
     (r"^visual\.positional_embedding$", "vision_model.embeddings.position_embedding.weight"),
-    (r"^visual\.ln_pre\.", "vision_model.pre_layrnorm."),  # as transformers spells it
+    (r"^visual\.ln_pre\.", "vision_model.pre_layrnorm."),  # spelt so in transformers
     (r"^visual\.transformer\.resblocks\.", "vision_model.encoder.layers."),
     (r"^visual\.ln_post\.", "vision_model.post_layernorm."),
     (r"^visual\.proj$", "visual_projection.weight"),
@@ -79,10 +79,10 @@ CLIP_NAMES: Names = (
     (r"\.mlp\.c_proj\.", ".mlp.fc2."),
 )
 TRANSPOSED = ("text_projection", "visual.proj")
-OPENAI = {"input_resolution", "context_length", "vocab_size"}  # numbers beside OpenAI's weights
+OPENAI = {"input_resolution", "context_length", "vocab_size"}  # numbers among OpenAI's weights
 UNUSED = OPENAI | {"attn_mask"}
-# Settings of open_clip_config.json that are read or follow from the shapes; and what transformers calls those
-# that must be as the shapes say.
+# Settings of open_clip_config.json that are read or follow from the shapes; and the names in transformers of
+# those that are compared with the shapes.
 STATED = {
     "model_cfg": {"embed_dim", "vision_cfg", "text_cfg", "quick_gelu", "custom_text", "init_logit_scale"},
     "vision_cfg": {"image_size", "patch_size", "width", "layers", "head_width", "mlp_ratio", "patch_dropout"},
@@ -92,8 +92,8 @@ SAME = {
     "context_length": "max_position_embeddings", "width": "hidden_size", "layers": "num_hidden_layers",
     "image_size": "image_size", "patch_size": "patch_size", "vocab_size": "vocab_size",
 }  # fmt: skip
-WORLDWIDE = ("pool_type", "eos_id", "hf_tokenizer_name")  # of a MetaCLIP 2; its tokenizer.json says them too
-# What other settings may be without any effect.
+WORLDWIDE = ("pool_type", "eos_id", "hf_tokenizer_name")  # of a MetaCLIP 2; its tokenizer.json has them too
+# Values of other settings that have no effect.
 USUAL: tuple[object, ...] = (None, False, 0, "", {}, "tok", "argmax", "linear")
 
 SAM_NAMES: Names = (
@@ -119,7 +119,7 @@ SAM_NAMES: Names = (
     (r"(_head|_mlps\.\d)\.layers\.1\.", r"\1.layers.0."),
     (r"(_head|_mlps\.\d)\.layers\.2\.", r"\1.proj_out."),
 )
-SAM2_NAMES: Names = (  # what is named otherwise than in SAM
+SAM2_NAMES: Names = (  # additional patterns of SAM 2
     (r"^vision_encoder\.trunk\.", "vision_encoder.backbone."),
     (r"(\.neck\.convs\.\d)\.conv\.", r"\1."),
     (r"\.mlp\.layers\.0\.", ".mlp.proj_in."),
@@ -153,10 +153,10 @@ SAM2_SIZES: Mapping[tuple[int, int], Hiera] = MappingProxyType(  # by width of t
 def converted(
     id: str, file: Path, sizes: Mapping[tuple[int, int], Hiera] = SAM2_SIZES, side: int = 1024
 ) -> Converted | None:
-    """Return weights renamed to those of transformers; None where they are of no layout known here.
+    """Return weights with the names of transformers; None for an unknown layout.
 
-    id: what messages name; sizes, side: what no shape tells of a SAM 2, its encoder's settings and the pixels
-    of the square that it sees. Raises EncoderError for a file that is damaged.
+    id: for messages; sizes, side: settings of a SAM 2 that do not follow from shapes, those of its encoder
+    and the side of its square input, px. Raises EncoderError for a damaged file.
     """
     with loading_errors(id, "CLIP or SAM"):
         tensors = _read(id, file)
@@ -173,15 +173,15 @@ def converted(
 
 
 def _unpickled(path: Path) -> dict[str, Any]:
-    """Return the tensors of a file of torch, by name, read when they are used where the file allows."""
+    """Return the tensors of a torch file by name; those of archives are read on access."""
     import torch
 
-    mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
+    mapped = zipfile.is_zipfile(path)  # files from before PyTorch 1.6 are no archives
     return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
 
 
 def _read(id: str, file: Path) -> Tensors:
-    """Return the tensors of a file, without a checkpoint's wrappings; none of its code is run."""
+    """Return the tensors of a file, taken out of a checkpoint's dictionaries; no code is run."""
     import torch
     from safetensors.torch import load_file
 
@@ -228,7 +228,7 @@ def _clip(file: Path, tensors: Tensors) -> Converted:
 
 
 def _stated(path: Path) -> Settings:
-    """Content of open_clip_config.json; empty where there is none."""
+    """Return the content of open_clip_config.json; empty without the file."""
     if not path.is_file():
         return {}
     try:
@@ -242,7 +242,7 @@ def _stated(path: Path) -> Settings:
 
 
 def _clip_config(tensors: Tensors) -> Settings:
-    """Return settings by the shapes, as in a config.json of transformers."""
+    """Return settings from the shapes, as in a config.json of transformers."""
     words, wide = _shape(tensors, "token_embedding.weight", 2)
     channels, _, patch, _ = _shape(tensors, "visual.conv1.weight", 4)
     positions, _ = _shape(tensors, "visual.positional_embedding", 2)
@@ -254,7 +254,7 @@ def _clip_config(tensors: Tensors) -> Settings:
         "num_hidden_layers": _count(tensors, r"transformer\.resblocks\.(\d+)\."),
         "num_attention_heads": wide // HEAD_WIDTH,
         "max_position_embeddings": _shape(tensors, "positional_embedding", 2)[0],
-        "eos_token_id": 2,  # to transformers: the end is the token with the highest number, as in open_clip
+        "eos_token_id": 2,  # in transformers: the end token has the highest number, as in open_clip
     }
     vision = {
         "image_size": patch * round((positions - 1) ** 0.5),
@@ -269,7 +269,7 @@ def _clip_config(tensors: Tensors) -> Settings:
 
 
 def _check(model: Settings, config: Settings) -> None:
-    """Raise ValueError where open_clip_config.json asks for another network than the tensors are."""
+    """Raise ValueError if open_clip_config.json states another network than that of the tensors."""
     for part, known in STATED.items():
         settings, found = model.get(part, model), config.get(part.replace("cfg", "config"), {})
         for name, value in settings.items():
@@ -281,7 +281,7 @@ def _check(model: Settings, config: Settings) -> None:
 
 
 def _renamed(tensors: Tensors, names: Names) -> dict[str, Any]:
-    """Return tensors under the names of transformers."""
+    """Return tensors with names replaced by patterns."""
     renamed = {}
     for old, tensor in tensors.items():
         name = old
@@ -298,7 +298,7 @@ def _clip_tensors(tensors: Tensors) -> dict[str, Any]:
     if more := renamed.keys() & own.keys() - {"logit_scale"}:
         raise ValueError(f"{min(more)} is no tensor of a CLIP with a vision transformer")
     for name in [name for name in renamed if ".in_proj_" in name]:
-        # queries, keys and values are one tensor of open_clip's
+        # open_clip has queries, keys and values in one tensor
         thirds = zip("qkv", renamed.pop(name).chunk(3), strict=True)
         renamed |= {name.replace(".in_proj_", f".{role}_proj."): third for role, third in thirds}
     return renamed
@@ -311,7 +311,7 @@ def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
 
 
 def _sam_config(tensors: Tensors) -> Settings:
-    """Return settings by the shapes, as in a config.json of transformers."""
+    """Return settings from the shapes, as in a config.json of transformers."""
     _, grid, _, wide = _shape(tensors, "image_encoder.pos_embed", 4)
     patch = _shape(tensors, "image_encoder.patch_embed.proj.weight", 4)[2]
     layers = _count(tensors, r"image_encoder\.blocks\.(\d+)\.")
@@ -340,7 +340,7 @@ def _sam_config(tensors: Tensors) -> Settings:
 
 
 def _decoder_config(tensors: Tensors, first: str) -> Settings:
-    """Return settings of the halves for prompts and masks by shapes; `first`: of an "mlp"'s layers."""
+    """Return settings of prompt encoder and mask decoder from shapes; first: name of an MLP's first layer."""
     tokens, size = _shape(tensors, "mask_decoder.mask_tokens.weight", 2)
     decoder = "mask_decoder.transformer.layers.0."
     narrow = _shape(tensors, f"{decoder}cross_attn_token_to_image.q_proj.weight", 2)[0]
@@ -359,9 +359,9 @@ def _decoder_config(tensors: Tensors, first: str) -> Settings:
 
 
 def _sam2_tensors(tensors: Tensors) -> dict[str, Any]:
-    """Return the half of a SAM 2 or 2.1 that sees single images; its memory of films is left out.
+    """Return the tensors of a SAM 2 or 2.1 for single images, without its memory for videos.
 
-    tensors: without "sam_" before the names of prompt encoder and mask decoder.
+    tensors: without the prefix "sam_" of prompt encoder and mask decoder.
     """
     import torch
 
@@ -373,7 +373,7 @@ def _sam2_tensors(tensors: Tensors) -> dict[str, Any]:
 
 
 def _sam2_config(tensors: Tensors, sizes: Mapping[tuple[int, int], Hiera], side: int) -> Settings:
-    """Return settings by shapes and published sizes, as in a config.json of transformers."""
+    """Return settings from shapes and published sizes, as in a config.json of transformers."""
     _, wide, *background = _shape(tensors, "image_encoder.trunk.pos_embed", 4)
     blocks = _count(tensors, r"image_encoder\.trunk\.blocks\.(\d+)\.")
     if (wide, blocks) not in sizes:
@@ -414,29 +414,29 @@ def _shape(tensors: Tensors, name: str, axes: int) -> tuple[int, ...]:
 
 
 def _count(tensors: Tensors, pattern: str) -> int:
-    """Count the numbers in names that begin with `pattern`."""
+    """Return the count of distinct numbers in names that begin with `pattern`."""
     return len({found[1] for found in map(re.compile(pattern).match, tensors) if found})
 
 
-# SigLIP (Zhai et al. 2023) and SigLIP 2 (Tschannen et al. 2025): pairs judged one by one by a sigmoid.
+# SigLIP (Zhai et al. 2023) and SigLIP 2 (Tschannen et al. 2025), trained with a sigmoid loss per pair.
 #
-# SigLIP 2's fixed-resolution checkpoints are SigLIP models with another vocabulary, and say so in their
-# `model_type`. A text's vector is that of its last token, padding or not, and no token is masked: a phrase
-# is always padded to the length of training.
+# SigLIP 2's fixed-resolution checkpoints are SigLIP models with another vocabulary and the same `model_type`.
+# A text's vector is that of its last token, padding or not, and no token is masked: a phrase is always padded
+# to the length of training.
 #
 # Their logits are scale * cosine + bias, with a learned scale of 110 to 120 and a bias of -12 to -17. The
-# bias makes a pair improbable unless it is right, since of n^2 pairs in a batch only n are; in relevancy,
-# which is made of differences of cosines, it cancels.
+# bias reflects that of n^2 pairs in a batch only n are right; it cancels in relevancy, which depends on
+# differences of cosines.
 
-# Share of a model's logit scale that is the temperature of relevancy. LERF and LangSplat take 10 for CLIP,
-# whose training caps the scale at 100: a tenth. The larger the scale, the smaller the gaps between cosines of
-# right and wrong pairs that training had to make, so a tenth of it gives the margins of two families like
-# relevancies. It is a rule of proportion, not a calibration: verdicts need thresholds of their own.
+# Temperature of relevancy, as a share of a model's logit scale. LERF and LangSplat use 10 for CLIP, whose
+# training caps the scale at 100. With a larger scale, training needs smaller gaps between cosines of right
+# and wrong pairs, so a tenth of the scale gives two families similar relevancies. It is a rule of proportion
+# and no calibration: verdicts need thresholds of their own.
 SHARE_OF_SCALE = 0.1
 
 
 class SiglipText(TorchText):
-    """The text tower of a SigLIP, by torch."""
+    """The text tower of a SigLIP in torch."""
 
     padded = True
 
@@ -449,18 +449,18 @@ class SiglipText(TorchText):
         if not math.isfinite(scale):
             raise EncoderError(f"{weights.id}: not SigLIP weights: logit_scale is not in them")
         self.temperature = SHARE_OF_SCALE * math.exp(scale)
-        # SentencePiece's unigram kind is the first generation's, whose captions had no punctuation.
+        # The first generation, with SentencePiece's unigram model, was trained without punctuation.
         gone = string.punctuation if type(self.tokenizer.model).__name__ == "Unigram" else ""
         self._without = str.maketrans("", "", gone)
 
     def encode(self, texts: list[str]) -> Array:
-        """Encode texts like the captions of its training: clean, in lower case."""
+        """Return the vectors of texts, cleaned and in lower case as in its training."""
         lower = (clean_text(text).lower().translate(self._without) for text in texts)
         return super().encode([" ".join(text.split()) for text in lower])
 
 
 def siglip_images(weights: Weights) -> ImageTower:
-    """Return the image tower of a SigLIP, by torch."""
+    """Return the image tower of a SigLIP in torch."""
     from transformers import SiglipVisionModel as Model
 
     usual = np.full((2, 3), 0.5)
@@ -474,7 +474,7 @@ def _siglip_config(weights: Weights) -> Any:
 
 
 def _read_scalar(weights: Weights, name: str) -> float:
-    """Return a number among the weights, the rest unread; NaN where, as in half a model, there is none."""
+    """Return a number among the weights without reading the rest; NaN if missing, as in half a model."""
     from safetensors import safe_open
 
     with loading_errors(weights.id, "readable"):
@@ -492,20 +492,20 @@ SIGLIP = Family(SiglipText, siglip_images)
 
 
 class MetaClip2Text(ClipText):
-    """The text tower of a MetaCLIP 2 (Chuang et al. 2025): a CLIP of 300 languages."""
+    """The text tower of a MetaCLIP 2 (Chuang et al. 2025), a CLIP for 300 languages."""
 
     def __init__(self, weights: Weights) -> None:
         super().__init__(weights, "MetaClip2", "")
-        # XLM-V's tokenizer marks where a phrase begins, mT5's only where it ends; the file says which.
+        # XLM-V's tokenizer has a begin token, mT5's has only an end token; tokenizer.json defines them.
         self._begin = self.tokenizer.encode("").ids[:-1]
-        self._model.text_model.eos_token_id = self._end[0]  # a CLIP's where config.json states none
+        self._model.text_model.eos_token_id = self._end[0]  # config.json may have that of a CLIP
 
 
 METACLIP2 = Family(MetaClip2Text, partial(torch_clip_images, name="MetaClip2"))
 
 
 class Tipsv2Text(TorchText):
-    """The text tower of a TIPS v2 (Cao et al. 2026), by torch."""
+    """The text tower of a TIPS v2 (Cao et al. 2026) in torch."""
 
     ends = False
 
@@ -515,15 +515,15 @@ class Tipsv2Text(TorchText):
         both = load_config(Tipsv2Config, weights, "TIPS v2")
         text = both.text_config
         super().__init__(Tipsv2TextModel, weights, text, "pooler_output", text.hidden_size)
-        self.temperature = SHARE_OF_SCALE / both.temperature_init_value  # the weights do not hold it
+        self.temperature = SHARE_OF_SCALE / both.temperature_init_value  # it is not in the weights
 
     def encode(self, texts: list[str]) -> Array:
-        """Encode texts in lower case, as all of its training were."""
+        """Return the vectors of texts in lower case, as in its training."""
         return super().encode([text.lower() for text in texts])
 
 
 class Tipsv2Images(Images):
-    """The image tower of a TIPS v2, by torch; its pixels are not normalised."""
+    """The image tower of a TIPS v2 in torch; its pixels are not normalised."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import Tipsv2Config, Tipsv2VisionModel
@@ -534,23 +534,22 @@ class Tipsv2Images(Images):
         self.patch, self._before = int(config.patch_size), 1 + int(config.num_register_tokens)
 
     def patches(self, pixels: Array) -> Array:
-        """Cut (1, 3, H, W) float32, sides multiples of a patch's, into (P, D) patches row by row."""
+        """Return (P, D) vectors of patches, row by row, of (1, 3, H, W) float32 pixels in whole patches."""
         return self.infer(pixels, "last_hidden_state")[0, self._before :]
 
 
 class Tipsv2Encoder(Encoder):
-    """Both halves of a TIPS v2: a region's vector is the mean of its pixels', which are those of patches.
+    """Both halves of a TIPS v2: a region's vector is the mean over its pixels of their patches' vectors.
 
-    An image is seen once, its shorter side as long as in training, that of a panorama shorter.
+    An image is encoded once, its shorter side as long as in training, that of a panorama shorter.
     """
 
     def encode_regions(self, image: Array, label_maps: Array) -> Array:
-        """Return one unit vector for each region, as `features.embed_regions` does."""
+        """Return one unit vector per region, see `features.embed_regions`."""
         tower = cast("Tipsv2Images", self._images)
         height, width = image.shape[:2]
-        scale = (
-            self.image_size / max(min(height, width), max(height, width) / 4) / tower.patch
-        )  # of panoramas
+        # A panorama's longer side is at most four times the length of training.
+        scale = self.image_size / max(min(height, width), max(height, width) / 4) / tower.patch
         grid = [max(1, round(side * scale)) for side in (height, width)]
         size = grid[1] * tower.patch, grid[0] * tower.patch
         seen = Image.fromarray(image).resize(size, Image.Resampling.BILINEAR)
@@ -567,16 +566,16 @@ TIPSV2 = Family(Tipsv2Text, Tipsv2Images, Tipsv2Encoder)
 
 
 def load_sam3(weights: Weights) -> Sam:
-    """Load the half of a SAM 3 (Carion et al. 2025) that answers points, out of the model for films."""
+    """Load the tracker of a SAM 3 (Carion et al. 2025), prompted with points, out of the video model."""
     from transformers import Sam3TrackerConfig, Sam3TrackerModel
 
     config = load_config(Sam3TrackerConfig, weights, "SAM 3")
-    if hasattr(config, "tracker_config"):  # the encoder is the detector's, and its settings are stated there
+    if hasattr(config, "tracker_config"):  # the encoder's settings are those of the detector
         with loading_errors(weights.id, "SAM 3"):
             vision = {"vision_config": config.detector_config["vision_config"]}
             config = Sam3TrackerConfig(**config.tracker_config | vision)
     model = load_model(Sam3TrackerModel, weights, config)
-    # The coarsest map is the detector's alone: transformers would add what stands for no memory to the last.
+    # The coarsest map is for the detector; transformers would add the embedding of "no memory" to it.
     neck = model.vision_encoder.neck
     neck.fpn_layers = neck.fpn_layers[: len(model.backbone_feature_sizes)]
     side = int(model.config.prompt_encoder_config.image_size)

@@ -1,19 +1,19 @@
-"""Scenes without floaters: Gaussians that hang in free space.
+"""Removal of floaters: Gaussians that hang in free space.
 
-They are found by three measures and removed within an error budget.
+They are found by two measures and removed within an error budget, by a third.
 
-**Regions.** Two neighbours touch where the gap between their centres is no longer than `TOUCH` times the sum
-of their extents (one standard deviation) along it. What touches is one region; a region of few Gaussians
-beside the scene's surfaces is a floater, a single one is the smallest region. Extents make this a measure
-without a unit: large sparse Gaussians of a wall touch as small dense ones do. Over six scenes, trained by
-five programs, 0.8 to 1.4 % of the Gaussians are in regions that 1.25 extents leave alone.
+**Regions.** Two neighbours touch if the gap between their centres is at most `TOUCH` times the sum of their
+extents (one standard deviation) along it. Gaussians that touch are one region; a region of few Gaussians
+apart from the scene's surfaces is a floater, down to a single Gaussian. Relative to extents, large sparse
+Gaussians of a wall touch as small dense ones do. Over six scenes, trained by five programs, 0.8 to 1.4 % of
+the Gaussians are in small regions at 1.25 extents.
 
-**Free space.** A faint veil touches what lies behind it. A Gaussian counts as in free space in a view where
-its centre lies before the surface that is seen through it (the median depth). Veils are found
-first and are no part of regions, which they would bridge.
+**Free space.** A faint veil touches the surface behind it. A Gaussian is in free space in a view if its
+centre is in front of the surface that is seen through it (the median depth). Veils are found first and are in
+no region, as they would connect regions.
 
-**Visibility.** What contributes the least to any view (`compact.contributions`) goes first, as many as the
-loss, measured on other views, allows.
+**Visibility.** Suspects that contribute least to any view (`compact.contributions`) are removed first, as
+many as the loss, measured on other views, allows.
 """
 
 from collections.abc import Callable
@@ -48,15 +48,15 @@ from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
 from langsplat_core.scene.surface import Surface, build_surface
 
-# From the least suspicious to the most; `python -m tests.benchmarks clean` measures them.
-TOUCH = (1.1, 1.25, 1.5)  # a region that touches no other even if so many extents are bridged
-AHEAD = (0.4, 0.55, 0.7)  # share of the views of a place in which it lies in free space
-USUAL = 0.45  # median gap to the nearest in trained scenes, at most; sparser ones get as much larger a TOUCH
+# Thresholds from the least suspicious to the most; `python -m tests.benchmarks clean` measures them.
+TOUCH = (1.1, 1.25, 1.5)  # largest gap of a region's Gaussians, in extents
+AHEAD = (0.4, 0.55, 0.7)  # least share of views in which a Gaussian is in free space
+USUAL = 0.45  # median gap to the nearest in trained scenes; TOUCH grows in proportion in sparser ones
 
 
 @dataclass(frozen=True)
 class CleanConfig(BudgetConfig):
-    """Settings of `langsplat clean`: the error allowed, its views, and what may be a floater."""
+    """Settings of `langsplat clean`: the error allowed, its views, and the size of floaters."""
 
     region: Count = 100  # Gaussians: a larger connected region is no floater
 
@@ -65,22 +65,22 @@ class CleanConfig(BudgetConfig):
 class Floaters:
     """Suspected floaters among N Gaussians."""
 
-    suspicion: Array  # (N,) int8 0: none, up to 3
-    region: Array  # (N,) bool: of a small region; the other suspects hang in free space
+    suspicion: Array  # (N,) int8 from 0, none, to 3
+    region: Array  # (N,) bool: in a small region; the other suspects are in free space
 
 
 def find_floaters(
     scene: Scene, cameras: tuple[Camera, ...], largest: int, progress: Progress = silent
 ) -> Floaters:
-    """Return the floaters that `cameras` see: regions of at most `largest`, but for the largest of all."""
+    """Return suspected floaters, by `cameras`; regions of at most `largest` Gaussians, except the largest."""
     gaussians = scene.gaussians
     suspicion = np.zeros(len(gaussians), np.int8)
     share = _free_space(scene, cameras, progress)
     for level, least in enumerate(AHEAD, 1):
         suspicion[share >= least] = level
-    rows = np.flatnonzero(suspicion == 0)  # a veil would bridge what lies before and behind it
+    rows = np.flatnonzero(suspicion == 0)  # a veil would connect regions in front of it and behind it
     solid = gaussians.take(rows)
-    surface = build_surface(solid, min_opacity=0.02)  # free space alone judges what is fainter
+    surface = build_surface(solid, min_opacity=0.02)  # fainter ones are judged by free space alone
     gaps = _gaps(solid, surface)
     nearest = float(np.median(np.partition(gaps, 1, axis=1)[:, 1])) if gaps.shape[1] > 1 else USUAL
     region = np.zeros(len(gaussians), bool)
@@ -92,7 +92,7 @@ def find_floaters(
 
 
 def _gaps(gaussians: Gaussians, surface: Surface) -> Array:
-    """Return (M, k) distance of each Gaussian of the surface to its neighbours, over both extents."""
+    """Return (M, k) distances of the surface's Gaussians to their neighbours, over the sum of extents."""
     count, width = surface.neighbours.shape
     first, second = np.repeat(np.arange(count), width), surface.neighbours.ravel()
     apart = surface.positions[second] - surface.positions[first]
@@ -107,7 +107,7 @@ def _gaps(gaussians: Gaussians, surface: Surface) -> Array:
 
 
 def _small_regions(surface: Surface, near: Array, largest: int) -> Array:
-    """Rows in regions of at most `largest` but the largest; near: (M, k) bool, which neighbours touch."""
+    """Return rows in regions of at most `largest`, except the largest; near: (M, k) bool: they touch."""
     count, width = near.shape
     if count == 0:
         return surface.rows
@@ -121,7 +121,10 @@ def _small_regions(surface: Surface, near: Array, largest: int) -> Array:
 
 
 def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -> Array:
-    """Return the (N,) share of the views not hidden that see through each centre; 0 where but one does."""
+    """Return the (N,) share of views, of those in which it is not hidden, that see through each centre.
+
+    It is 0 if only one view does.
+    """
     gaussians = scene.gaussians
     ahead, on = np.zeros(len(gaussians), int), np.zeros(len(gaussians), int)
     for index, camera in enumerate(cameras):
@@ -130,7 +133,7 @@ def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -
         rows = np.flatnonzero(camera.in_image(pixels, z))
         column, row = pixels[rows].astype(int).T
         there, z = depths[row, column], z[rows]
-        ahead[rows] += (there > 0) & (z < 0.95 * there)  # what is nearer to the surface lies on it
+        ahead[rows] += (there > 0) & (z < 0.95 * there)  # nearer to the surface, it is on it
         on[rows] += (there > 0) & (np.abs(z - there) <= 0.05 * there)
         progress("finding floaters", (index + 1) / len(cameras))
     share: Array = np.where(ahead > 1, ahead / np.maximum(ahead + on, 1), 0.0)
@@ -139,14 +142,14 @@ def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -
 
 @dataclass(frozen=True, kw_only=True)
 class CleanReport(Loss):
-    """Report of a cleaning: what went, and its cost."""
+    """Numbers of removed Gaussians, and the loss."""
 
     gaussians: int  # before
-    invalid: int  # rows removed because nothing can draw them
-    regions: int  # floaters removed: of small regions
-    free_space: int  # floaters removed: in free space
-    kept: int  # suspected, but too dear for the budget
-    psnr_before: float | None  # mean over the photographs that measure; None without
+    invalid: int  # removed rows that cannot be drawn
+    regions: int  # removed floaters in small regions
+    free_space: int  # removed floaters in free space
+    kept: int  # suspects that are kept for the budget
+    psnr_before: float | None  # mean over the measuring photographs; None without
     psnr_after: float | None
 
     @property
@@ -158,7 +161,10 @@ class CleanReport(Loss):
 def clean(
     scene: Scene, views: Views, config: CleanConfig, progress: Progress = silent
 ) -> tuple[Array, CleanReport]:
-    """Return the (N,) bool rows that stay, and the report; InputError where photographs disagree."""
+    """Return the (N,) bool rows that stay, and the report.
+
+    Raises InputError for a scene without valid rows, and for photographs of something else.
+    """
     valid = scene.gaussians.valid()
     if not valid.any():
         raise InputError("the scene holds nothing that can be drawn: there is nothing to clean")
@@ -195,13 +201,13 @@ def clean(
 
 class _Trial(NamedTuple):
     keep: Array  # (N,) bool, changed in place
-    losses: Callable[[], Array]  # (V,) dB that the measuring views lose without the rest
+    losses: Callable[[], Array]  # (V,) dB that the measuring views lose without the removed rows
     budget: float
     progress: Progress
 
 
 def _by_change(trial: _Trial, rising: Array) -> None:
-    """Remove as many of `rising`, by rising contribution, as the budget allows: by bisection."""
+    """Remove as many of `rising`, ordered by contribution, as the budget allows, by bisection."""
     low, high = 0, len(rising) + 1
     middle = len(rising)  # first all of them
     while middle > low:
@@ -216,13 +222,14 @@ def _by_change(trial: _Trial, rising: Array) -> None:
 
 
 def _by_photographs(trial: _Trial, order: Array, means: Array) -> None:
-    """Remove what photographs do not miss, and as many more as the budget allows.
+    """Remove suspects that photographs do not need, and as many more as the budget allows.
 
-    Groups of `order` are removed one after the other. What a group adds to the mean loss, and the standard
-    error of that, is taken from the budget. A group that costs more than is left is halved, and its halves
-    are tried. Gains are not added to the budget, or true floaters would pay for the loss of what is none.
-    What was removed while others still hid its worth is found last: what lies together is measured again
-    without all others, and the dearest come back until the rest is within the budget.
+    Groups of `order` are removed one after the other. The cost of a group, its addition to the mean loss plus
+    the standard error of that, is taken from the budget. A group that costs more than is left is halved, and
+    its halves are tried. Gains are not added to the budget, else true floaters would pay for other Gaussians.
+    Last, Gaussians whose cost was hidden by others at the time are found: spatial groups of removed ones are
+    measured again, each alone against all others removed, and the most costly are put back until the rest is
+    within the budget.
     """
     keep, budget = trial.keep, trial.budget
     losses, spent, done = np.zeros(1), 0.0, 0  # nothing is lost in any view
@@ -258,14 +265,14 @@ def _by_photographs(trial: _Trial, order: Array, means: Array) -> None:
 
 
 def _cost(added: Array) -> float:
-    """Return what (V,) dB added to the loss of the views take from the budget."""
+    """Return the cost of (V,) dB added to the losses of the views: their mean plus its standard error."""
     return max(float(added.mean() + added.std() / np.sqrt(len(added))), 0.0)
 
 
 def clean_scene(
     source: Path, out: Path, config: CleanConfig, photos: Path | None = None, progress: Progress = silent
 ) -> CleanReport:
-    """Write the scene `source` without its floaters to `out`, with all that belongs to it; see `clean`."""
+    """Write the scene `source` without its floaters to `out`, with its companions; see `clean`."""
     scene = scene_for(out, source)
     check_settings(config)
     views = choose_views(scene, photos, config, progress)

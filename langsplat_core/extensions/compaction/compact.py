@@ -1,11 +1,11 @@
-"""Scenes made as small as an error budget allows: fewer Gaussians, a lower SH degree, no training.
+"""Compaction of scenes within an error budget: fewer Gaussians, a lower SH degree, no training.
 
-Some views of a scene rank its Gaussians, others measure what images lose without some of them. For every SH
+Some views of a scene rank its Gaussians, others measure the loss of images without some of them. For every SH
 degree that the budget allows by itself, from the scene's own downward, the smallest number of Gaussians
 within the budget is found by bisection; the degree with the fewest numbers wins. The contribution of the last
-Gaussian kept becomes a threshold, and only now the measuring views have a say too: whatever contributes more
-than that to any of them is kept after all. Everything is measured as the target format stores it, and the
-file's own content is read back and measured before it takes its name.
+Gaussian that is kept is then a threshold for the measuring views: Gaussians that contribute more to any of
+them are kept, too. Everything is measured as the target format stores it, and the written file is read back
+and measured before it is renamed to its final name.
 
 **Contribution.** In a view with blending weights w (a row of W per pixel p), taking Gaussian i of colour c_i
 away changes pixel p by about w_pi (c_i - C_p): its weight times its distance from the image C. The adjoint
@@ -14,22 +14,22 @@ sums this over pixels without ever listing them: with one gather of [1, C, |C|^2
     W_i = sum_p w_pi,    E_i = sum_p w_pi |c_i - C_p|^2 = |c_i|^2 W_i - 2 c_i . (W^T C)_i + (W^T |C|^2)_i,
 
 and by Cauchy-Schwarz sum_p w_pi |c_i - C_p| <= sqrt(W_i E_i), an upper bound of the total change in display
-values times pixels. That is of one Gaussian taken away alone. Many of one colour hold a white wall up
-together, though each has nothing but its like behind it; so every Gaussian counts as at least `ALONE` away
-from the image: its contribution is sqrt(W_i (E_i + ALONE^2 W_i)). Over views the largest counts, so that what
-only one view shows is not averaged away. On the bundled scene, at 77 % of the Gaussians, the mean loss (the
-worst view's) is 0.21 (1.3) dB; ranked by W_i it is 0.42 (1.3), by sqrt(W_i E_i) 0.30 (3.4).
+values times pixels, if one Gaussian is removed alone. Many Gaussians of one colour form a white wall, though
+each has only similar ones behind it. So the distance of every Gaussian to the image is increased by `ALONE`:
+its contribution is sqrt(W_i (E_i + ALONE^2 W_i)). The largest over views counts, so that Gaussians in only
+one view are not averaged away. On the bundled scene, at 77 % of the Gaussians, the mean loss (the worst
+view's) is 0.21 (1.3) dB; ranked by W_i it is 0.42 (1.3), by sqrt(W_i E_i) 0.30 (3.4).
 
-**Loss.** With photographs, the loss in PSNR is measured on them. Without, it is derived from how far the new
-image lies from the original one: removing something from a trained scene is, to first order, uncorrelated
-with what the scene already gets wrong (at a minimum of the training loss no direction helps), so squared
-errors add. A view that the original shows with mean squared error e and that changes by d loses
+**Loss.** With photographs, the loss in PSNR is measured on them. Without, it is derived from the difference
+of the new image and the original one: the change by a removal is, to first order, uncorrelated with the
+errors of a trained scene (at a minimum of the training loss no direction helps), so squared errors add. A
+view that the original shows with mean squared error e and that changes by d loses
 
     10 log10(1 + d / e) dB.
 
-e is not known without photographs; it is what a scene of an assumed PSNR has. A scene that is worse than
-assumed loses less than stated, so the assumption should be on the high side. On the bundled scene, with its
-photographs and true e, this agreed with the measured loss within 0.03 dB at losses up to 1 dB.
+Without photographs e is that of a scene of an assumed PSNR. A scene that is worse than assumed loses less
+than stated, so the assumption should be high. On the bundled scene, with its photographs and true e, this
+agreed with the measured loss within 0.03 dB at losses up to 1 dB.
 """
 
 import tempfile
@@ -65,12 +65,12 @@ from langsplat_core.scene.transform import place_scene
 T = TypeVar("T")
 
 ALONE = 0.055  # display values, RGB distance; see above
-HOLD_OUT = 6  # every n-th view measures
+HOLD_OUT = 6  # every n-th view is a measuring view
 
 
 @dataclass(frozen=True)
 class BudgetConfig:
-    """An error that is allowed, and the views it is measured on."""
+    """The error that is allowed, and the views it is measured on."""
 
     max_psnr_loss: Decibels = 0.1  # dB, mean over the measuring views; nothing that loses more is written
     views: SeveralCount = 96
@@ -99,7 +99,7 @@ class Views:
     origin: str  # where they come from, for the report
 
     def measured(self, scene: Scene) -> list[MeasuringView]:
-        """Return the measuring views with the scene's images; InputError where photographs show another."""
+        """Return the measuring views with the scene's images; InputError if photographs do not fit."""
         found = []
         for camera, photograph in zip(self.measuring, self.photographs, strict=True):
             truth = None if photograph is None else photograph.astype(np.float32) / 255
@@ -114,10 +114,10 @@ class Views:
 
 
 def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progress: Progress) -> Views:
-    """Choose the cameras of the photographs, else of the scene, else some around it.
+    """Return views with the cameras of the photographs, else of the scene, else some around it.
 
-    At most ``config.views``. Photographs that the scene was not trained on, if there are any, all measure;
-    otherwise every `HOLD_OUT`-th view does. Raises InputError where fewer than two views are left.
+    There are at most ``config.views``. If some photographs were not used in training, only these measure;
+    otherwise every `HOLD_OUT`-th view does. Raises InputError if ranking or measuring views are missing.
     """
     check_settings(config)
     if photos is not None:
@@ -125,7 +125,7 @@ def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progre
     if len(scene.cameras) >= 2:
         cameras, origin = _thinned(scene.cameras, config.views), "the scene's cameras"
     else:
-        # The whole scene, and nearer, where small Gaussians show.
+        # At two distances: the whole scene, and nearer for small Gaussians.
         cameras = [*scene.spiral_cameras(min(config.views, 48), (640, 480), distances=(2.6, 1.6))]
         origin = "a ring around the scene (it has no cameras): what lies inside may be judged invisible"
     ranking, measuring = _divided([camera.within(config.max_side) for camera in cameras])
@@ -133,8 +133,8 @@ def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progre
 
 
 def _photographed(scene: Scene, photos: Path, config: BudgetConfig, progress: Progress) -> Views:
-    with tempfile.TemporaryDirectory() as work:  # for points that may have to be found, and that are not used
-        settings = DatasetConfig(max_side=config.max_side, allow_few_cameras=True)  # only looked through
+    with tempfile.TemporaryDirectory() as work:  # for structure from motion, if it is needed
+        settings = DatasetConfig(max_side=config.max_side, allow_few_cameras=True)  # nothing is trained
         capture = load_capture(photos, settings, Path(work), progress)
     trained = {camera.name for camera in scene.cameras}
     known = [i for i, camera in enumerate(capture.cameras) if camera.name in trained]
@@ -158,13 +158,13 @@ def _photographed(scene: Scene, photos: Path, config: BudgetConfig, progress: Pr
 
 
 def _thinned(items: Sequence[T], most: int) -> list[T]:
-    """At most `most` of `items`, evenly spaced, in order."""
+    """Return at most `most` of `items`, evenly spaced, in order."""
     count = min(len(items), most)
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, count).round().astype(int))]
 
 
 def _divided(items: list[T]) -> tuple[list[T], list[T]]:
-    """Return what ranks, and what measures: every `HOLD_OUT`-th, or half of fewer than twelve."""
+    """Return ranking and measuring items: every `HOLD_OUT`-th measures, or half of fewer than twelve."""
     step = HOLD_OUT if len(items) >= 12 else 2
     measuring = items[step // 2 :: step]
     return [item for i, item in enumerate(items) if i % step != step // 2], measuring
@@ -205,7 +205,7 @@ def psnr_losses(scene: Scene, views: Sequence[MeasuringView], assumed_psnr: floa
 
 
 def estimated_loss(change: float, assumed_psnr: float) -> float:
-    """Return the dB lost when a view of `assumed_psnr` dB changes by the mean squared error `change`."""
+    """Return the dB lost if a view of `assumed_psnr` dB changes by the mean squared error `change`."""
     return float(10 * np.log10(1 + change * 10 ** (assumed_psnr / 10)))
 
 
@@ -250,7 +250,7 @@ class Loss:
 
     @property
     def lines(self) -> list[str]:
-        """The losses in lines for people."""
+        """The losses as lines of text."""
         how = (
             "measured on photographs"
             if self.assumed_psnr is None
@@ -277,8 +277,8 @@ def compact_scene(
 ) -> CompactReport:
     """Write the scene `source` to `out` as small as ``config.max_psnr_loss`` allows.
 
-    `photos` is the dataset it was trained on; without, the loss is derived from the change of the images.
-    Raises InputError, and leaves `out` as it was, where the budget cannot be kept or nothing can be dropped.
+    photos: the dataset it was trained on; without, the loss is derived from the change of the images. Raises
+    InputError, and leaves `out` as it was, if the budget cannot be kept or nothing can be dropped.
     """
     scene = scene_for(out, source)
     check_settings(config)
@@ -305,14 +305,14 @@ def compact_scene(
 
 
 def scene_for(out: Path, source: Path) -> Scene:
-    """Return the scene `source`, with what a file `out` has no room for said before the work; InputError."""
+    """Return the scene `source` after checks of `out`, and report what `out` cannot hold; InputError."""
     row, scene = check_writable(out, source), load_scene(source)
     report_left_out(out, scene, f"{row.suffix} files", row.loses, f"its companion *{ORIGIN_SUFFIX}")
     return scene
 
 
 def _stored(scene: Scene, out: Path) -> tuple[Scene, int]:
-    """Return the scene after a journey through a file named like `out`, and the bytes that it took."""
+    """Return the scene as written to and read from a file in the format of `out`, and its bytes on disk."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / out.name
         save_scene(path, replace(scene, path=path), tell=False)
@@ -332,7 +332,7 @@ def find_reduction(
     config: BudgetConfig,
     progress: Progress = silent,
 ) -> tuple[Array, int]:
-    """Return the (N,) bool rows that stay, and the SH degree; InputError where nothing fits or may go."""
+    """Return the (N,) bool rows that stay, and the SH degree; InputError if none fits or can be dropped."""
     name = "the scene" if scene.path is None else shown(scene.path)
     score = contributions(scene, views.ranking, progress)
     if not score.any():
@@ -365,8 +365,8 @@ def smallest(
 ) -> tuple[int, int] | None:
     """Return the count of Gaussians and SH degree with the fewest numbers whose loss is within `budget` dB.
 
-    None if even the whole exceeds it. `loss_of` should not rise with the count; where it does, the answer is
-    within the budget all the same, only perhaps not the smallest.
+    None if even the whole exceeds it. `loss_of` should not rise with the count; if it does, the answer is
+    within the budget but may not be the smallest.
     """
     found: list[tuple[int, int]] = []
     for degree in range(sh_degree, -1, -1):
@@ -382,7 +382,7 @@ def smallest(
                 low = middle
         found.append((high, degree))
     progress("finding the smallest scene", 1.0)
-    # Any format must hold position, scale, rotation, opacity and colour of a Gaussian.
+    # Numbers of position, scale, rotation, opacity and colour, in any format.
     return min(found, key=lambda choice: choice[0] * (11 + 3 * SH_COUNTS[choice[1]]), default=None)
 
 

@@ -1,4 +1,4 @@
-"""`langsplat mesh`, `register`, `merge` and `map`: triangles, two scenes of one place, what a robot needs."""
+"""`langsplat mesh`, `register`, `merge` and `map`: meshes, two scenes of one place, and maps for robots."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -178,7 +178,7 @@ class Merge:
 
 
 def registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) -> Registration:
-    """Return the similarity from a scene to another; InputError unless renderings confirm it."""
+    """Return the registration of a scene with another; InputError unless it is trusted."""
     found = register(moving, fixed, scaled, progress=progress)
     if not found.trusted:
         hint = "" if scaled else ", and give --scaled where their units differ"
@@ -199,9 +199,9 @@ def read_transform(path: Path) -> Similarity:
         raise malformed(path, f"no transform ({printable_line(error, 100)})") from None
 
 
-# `langsplat map`: what a robot needs to know of a scene.
+# `langsplat map`.
 
-OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values, as map_server of ROS writes and reads them
+OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values of ROS' map_server
 THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.196}
 NO_SCALE = (
     "nobody said how long a unit of this scene is, and a map is in metres: measure something and give "
@@ -315,14 +315,14 @@ def write_collider(path: Path, occupancy: Occupancy) -> None:
 def write_voxels(
     path: Path, occupancy: Occupancy, scene: Scene, engine: QueryEngine | None, progress: Progress
 ) -> None:
-    """Write the occupied voxels, each with the whole of the tree that it is in and the word of that."""
+    """Write the occupied voxels, each with its whole of the tree and the word for it."""
     cells = np.argwhere(occupancy.occupied)
     nodes, words = np.full(len(cells), NO_NODE), {}
     if engine is not None:
         nodes = _nodes(occupancy, scene, engine, cells)
         try:
             outline = scene_outline(Describer(engine, None, progress))
-        except EncoderError as error:  # a phrasebook answers goals, but names nothing
+        except EncoderError as error:  # goals may be in the phrasebook, but names need an encoder
             print(f"voxels have no words: {error}")
             outline = ()
         words = {int(one.node): "" if one.word is None else one.word.phrase for one in outline}
@@ -337,7 +337,7 @@ def write_voxels(
 
 
 def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array) -> Array:
-    """Return (V,) the whole of the Gaussian nearest to each voxel, NO_NODE far from any."""
+    """Return the (V,) whole of the Gaussian nearest to each voxel, NO_NODE far from any."""
     from scipy.spatial import cKDTree
 
     whole = engine.tree.at(LEVELS.index("whole"))

@@ -1,8 +1,8 @@
 """Meshes of a scene: rendered depth and colour, fused in a truncated signed distance field (Open3D).
 
-The depth of a pixel is that of the median Gaussian, the one at which the transmittance falls to 0.5, there
-where this Gaussian is densest along the ray. The depth of its centre, which `View.median_depth` gives, is off
-wherever a large Gaussian is seen aslant.
+The depth of a pixel is that at which the median Gaussian, where the transmittance falls to 0.5, is densest
+along the ray. The depth of its centre, which `View.median_depth` returns, is wrong for a large Gaussian that
+is seen at an angle.
 """
 
 import os
@@ -29,20 +29,20 @@ from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import Camera, Gaussians, Scene
 
 SIDE, MOST = 640, 160  # pixels of the longer side of an image, and images, at most
-FINEST = 100  # voxels in the radius of what is fused, unless pixels are larger
-TRUNCATION = 4  # voxels behind and before a surface
-OVERSAMPLED = 8  # voxels in a pixel, at most
-SPECK = 128  # triangles; a connected piece with fewer is noise
-FLATTEST = 1e-3  # of a Gaussian's longest axis: its shortest, for the place where it is densest
-DEVIATIONS = 3.0  # from its centre, beyond which no Gaussian has a surface
-ROOM = 1.5  # extents of the cube in which holes are closed; what bulges out of it stays open
-BLOCK = 8  # voxels a side that are kept together
-VIEWS = 48  # of a scene without cameras, from all around it ...
-ELEVATIONS = (-37.0, 64.0)  # ... at these degrees above its horizon: a mesh has an underside
+FINEST = 100  # voxels per radius of the scene, unless pixels are larger
+TRUNCATION = 4  # voxels behind and in front of a surface
+OVERSAMPLED = 8  # voxels per pixel, at most
+SPECK = 128  # least triangles of a connected piece
+FLATTEST = 1e-3  # least ratio of a Gaussian's shortest to its longest axis, for the depth where it is densest
+DEVIATIONS = 3.0  # standard deviations from its centre within which a Gaussian has its surface
+ROOM = 1.5  # extents of the cube in which holes are closed; a surface that leaves it stays open
+BLOCK = 8  # voxels per side of a block
+VIEWS = 48  # around a scene without cameras ...
+ELEVATIONS = (-37.0, 64.0)  # ... in degrees above its horizon, so that a mesh has an underside
 STAGE = "fusing depth images"
-SUFFIXES = (".ply", ".glb")  # that meshes are written as
+SUFFIXES = (".ply", ".glb")  # of mesh files
 
-Depth = tuple[Camera, Array, Array]  # (H, W) float32 along z, 0 where there is none, and (H, W, 3) uint8
+Depth = tuple[Camera, Array, Array]  # (H, W) float32 depth along z, 0 for none, and (H, W, 3) uint8 colours
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,17 +55,17 @@ class Mesh:
     name: str = "scene"
 
     def holes(self) -> int:
-        """Return the number of holes: loops of edges with a triangle on one side alone."""
+        """Return the number of holes: loops of edges with a triangle on one side only."""
         return int(_rims(self.triangles)[1].max(initial=-1)) + 1
 
     def hollows(self) -> int:
-        """Return the number of pieces that are turned inside out: hollows in others, of a watertight mesh."""
+        """Return the number of pieces of negative volume, which are cavities of a watertight mesh."""
         a, b, c = (self.vertices[self.triangles[:, corner]] for corner in range(3))
         volumes = np.bincount(self.pieces(), (np.cross(a, b) * c).sum(1))
         return int(np.count_nonzero(volumes < 0))
 
     def pieces(self) -> Array:
-        """Return (T,) the number of the connected piece that each triangle is of."""
+        """Return the (T,) number of the connected piece of each triangle."""
         piece = _pieces(self.triangles[:, [0, 1, 1, 2]].reshape(-1, 2), len(self.vertices))
         return np.asarray(piece[self.triangles[:, 0]])
 
@@ -76,10 +76,10 @@ class Mesh:
 
 
 def surface_depth(gaussians: Gaussians, camera: Camera, rows: Array) -> Array:
-    """Return the depth at which the Gaussian of each pixel is densest along its ray, (H, W) float32.
+    """Return the (H, W) float32 depth at which the Gaussian of each pixel is densest along its ray.
 
-    The ray runs through the pixel's centre, its Gaussian is that of `rows` (H, W); depth is along z, world
-    units, and 0 where the row is -1 or the point behind the camera.
+    rows: (H, W) Gaussian of each pixel, -1 for none. The ray runs through the pixel's centre; depth is along
+    z, world units, and 0 without a Gaussian or behind the camera.
     """
     found = np.flatnonzero(rows >= 0)
     chosen, place = np.unique(rows.reshape(-1)[found], return_inverse=True)
@@ -109,9 +109,9 @@ def fuse(
 ) -> tuple[Mesh, float]:
     """Return the surface of a scene, and the side of its voxels, world units.
 
-    resolution: that side, by default a `FINEST` of the scene's radius, but no less than 1.5 pixels; views:
-    how many must show a surface, >= 1; more leave out more, and what is left is nearer to the truth; cameras:
-    to be rendered, by default the scene's own, or generated ones. Raises InputError where nothing is seen.
+    resolution: side of the voxels, by default 1 / `FINEST` of the scene's radius, but at least 1.5 pixels;
+    views: least number of views of a surface, >= 1: more leave more holes and fewer errors; cameras: to
+    render, by default the scene's own, or generated ones. Raises InputError if nothing is visible.
     """
     every = cameras or scene.cameras or scene.spiral_cameras(VIEWS, (SIDE, SIDE * 3 // 4), ELEVATIONS)
     chosen, images, pixels = some_cameras(every, MOST, SIDE), [], []
@@ -142,7 +142,7 @@ def _rendered(scene: Scene, camera: Camera) -> Depth:
 
 
 def _fused(images: list[Depth], centre: Array, resolution: float, views: int, progress: Progress) -> Mesh:
-    """Mesh on a grid of voxels that begins at `centre` (3,), so that it moves with the scene."""
+    """Return the mesh from a grid of voxels with its origin at `centre` (3,), which moves with the scene."""
     import open3d
 
     o3d, core = open3d, open3d.core
@@ -168,7 +168,7 @@ def _fused(images: list[Depth], centre: Array, resolution: float, views: int, pr
 
 
 def _taken(mesh: "object") -> Mesh:
-    """Convert a legacy mesh of Open3D to arrays."""
+    """Return a legacy mesh of Open3D as arrays."""
     vertices, triangles, colours = (
         np.asarray(getattr(mesh, name)) for name in ("vertices", "triangles", "vertex_colors")
     )
@@ -176,7 +176,7 @@ def _taken(mesh: "object") -> Mesh:
 
 
 def _cleaned(mesh: Mesh) -> Mesh:
-    """Without the pieces of fewer triangles than a `SPECK`. InputError where nothing is left."""
+    """Return the mesh without pieces of fewer than `SPECK` triangles. InputError if nothing is left."""
     piece = mesh.pieces()
     kept = mesh.triangles[np.bincount(piece)[piece] >= SPECK] if len(piece) else mesh.triangles
     if len(kept) == 0:
@@ -186,22 +186,22 @@ def _cleaned(mesh: Mesh) -> Mesh:
 
 
 def _pieces(edges: Array, count: int) -> Array:
-    """(count,) the number of the connected piece of each vertex, by (E, 2) edges."""
+    """Return the (count,) number of the connected piece of each vertex, from (E, 2) edges."""
     links = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1])
 
 
 def _distinct(rows: Array) -> tuple[Array, Array]:
-    """Return the distinct ones of (N, k) integers >= 0, in rising order, and (N,) which each row is."""
+    """Return the distinct rows of (N, k) integers >= 0, sorted, and the (N,) index of each row in them."""
     kind = first = np.zeros(len(rows), np.int64)
-    for column in rows.T:  # as single numbers: np.unique along an axis is twenty times slower
+    for column in rows.T:  # np.unique of single numbers is twenty times as fast as along an axis
         keys = kind * (column.max(initial=0) + 1) + column
         _, first, kind = np.unique(keys, return_index=True, return_inverse=True)
     return rows[first], kind
 
 
 def _rims(triangles: Array) -> tuple[Array, Array]:
-    """Return (R, 2) directed edges that no triangle runs back, and (R,) the number of their loop."""
+    """Return (R, 2) directed edges without a triangle on one side, and the (R,) number of their loop."""
     sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     edges, which = _distinct(np.sort(sides, axis=1))
     net = np.bincount(which, np.where(sides[:, 0] < sides[:, 1], 1, -1)).astype(int)
@@ -212,13 +212,13 @@ def _rims(triangles: Array) -> tuple[Array, Array]:
 
 
 def watertight(points: Array, triangles: Array, near: float) -> tuple[Array, Array]:
-    """Return a surface as one of which every edge has two triangles, which run along it in opposite ways.
+    """Return a surface of which every edge has two triangles, with opposite directions along it.
 
-    points: (V, D) places, and colours or nothing behind them; near: places that are closer are one.
+    points: (V, D) positions, with or without colours after them; near: distance at which points are merged.
 
-    Triangles without an area, beside their own reverse, or twice are left out, and a fan closes every rim.
-    Then every edge is run forth as often as back, so that its triangles are pairs. Where there are several
-    each gets a vertex of its own on the edge, a hair aside, and its triangles become fans.
+    Triangles without an area, with their own reverse, or repeated are left out, and a fan closes every rim.
+    Then every edge has as many triangles in one direction as in the other, which form pairs. If an edge has
+    several pairs, each pair gets a vertex of its own near the edge's middle, and its triangles become fans.
     """
     cells = np.rint((points[:, :3] - points[:, :3].min(axis=0, initial=0)) / near).astype(np.int64)
     place = _distinct(cells)[1]
@@ -254,7 +254,7 @@ def watertight(points: Array, triangles: Array, near: float) -> tuple[Array, Arr
 
 
 def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
-    """Return a watertight surface (Poisson), and its area over two voxels from any vertex, units^2."""
+    """Return a watertight surface (Poisson), and its area more than two voxels from any vertex, units^2."""
     import open3d
     from scipy.spatial import cKDTree
 
@@ -280,7 +280,7 @@ def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
 
 @contextmanager
 def _silenced() -> Iterator[None]:
-    """Drop what native code prints: PoissonRecon tells of roots that it does not find, and does without."""
+    """Drop output of native code: PoissonRecon prints harmless warnings about roots that it does not find."""
     sys.stdout.flush()
     nowhere, kept = os.open(os.devnull, os.O_WRONLY), {number: os.dup(number) for number in (1, 2)}
     try:
@@ -294,7 +294,7 @@ def _silenced() -> Iterator[None]:
         os.close(nowhere)
 
 
-# Files that other programs open.
+# Files of meshes.
 
 
 def check_suffix(path: Path | str) -> Path:
@@ -308,17 +308,17 @@ def check_suffix(path: Path | str) -> Path:
 def write_mesh(path: Path | str, mesh: Mesh, scene: Scene) -> None:
     """Write a mesh of a scene, in the world, as .ply or .glb, atomically. InputError for another suffix.
 
-    A .glb has the axes and the node of the scene's Gaussians as `write_gltf` writes these.
+    A .glb has the axes and the node that `write_gltf` writes for the scene's Gaussians.
     """
     path = check_suffix(path)
     if path.suffix.lower() == ".ply":
-        far = scene.origin.any()  # places are then float64
+        far = scene.origin.any()  # positions are then float64
         places = scene.in_world(mesh.vertices) if far else mesh.vertices.astype(np.float32)
         columns = dict(zip(POSITION, places.T, strict=True))
         columns |= dict(zip(CHANNELS, to_bytes(255 * mesh.colour).T, strict=True))
         write_table(path, columns, mesh.triangles)
         return
-    # Colours are light as it was photographed, so the material is unlit, and linear.
+    # Photographed colours include the lighting, so the material is unlit; glTF has linear colours.
     file = GltfWriter("KHR_materials_unlit")
     light = np.column_stack([linear_light(mesh.colour), np.ones(len(mesh.vertices))])
     attributes = {

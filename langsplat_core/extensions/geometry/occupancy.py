@@ -1,7 +1,7 @@
-"""A scene as a robot needs it: voxels, the map of the floor, and free places that face a thing.
+"""Maps for robots: voxels, a map of the floor, and free poses in front of instances.
 
-Space along a ray of a training camera is free up to the depth of half transmittance and occupied there. What
-no ray passed or met is unknown.
+Space along a ray of a training camera is free up to the depth of half transmittance and occupied there. Space
+that no ray reaches is unknown.
 """
 
 from dataclasses import dataclass
@@ -22,17 +22,17 @@ from langsplat_core.scene.transform import Similarity, turned_origin
 
 MOST_CELLS = 60_000_000  # of a grid
 SIDE = 240  # pixels of the longer side of the depth images
-HIT = 0.1  # of the rays that reach a voxel, how many end there from which it is occupied
-OUTSIDE = 0.02  # of the seen surface, at each end of each axis, that a grid leaves out: floaters, what is far
-MARGIN = 5  # voxels around what is seen
-MOST_LOOKS = 20_000  # places from which it is tried whether a thing is seen
-MOST_PAIRS = 4_000_000  # of a place and a cell of a thing, whose distance is measured
+HIT = 0.1  # least share of a voxel's rays that end in it if it is occupied
+OUTSIDE = 0.02  # share of the seen surface outside the grid at each end of each axis: floaters, far surfaces
+MARGIN = 5  # voxels around the seen surface
+MOST_LOOKS = 20_000  # positions, at most, that are tested for a free line to an instance
+MOST_PAIRS = 4_000_000  # distances, at most, between positions and cells of an instance
 STAGE = "measuring what is free"
 
 
 @dataclass(frozen=True, eq=False)
 class Occupancy:
-    """X x Y x Z voxels in the axes of a map: metres, z up, the ground at z = 0."""
+    """X x Y x Z voxels in map axes: metres, z up, the ground at z = 0."""
 
     to_map: Similarity  # from the scene to the map's metres
     origin: Array  # (3,) lower corner of the first voxel, metres
@@ -42,12 +42,12 @@ class Occupancy:
 
     @property
     def occupied(self) -> Array:
-        """The (X, Y, Z) bool, the voxels in which enough of the rays end."""
+        """The (X, Y, Z) bool voxels in which enough of the rays end."""
         return np.asarray((self.hits > 0) & (self.hits >= HIT * (self.hits + self.passes.astype(np.float64))))
 
     @property
     def seen(self) -> Array:
-        """The (X, Y, Z) bool, the voxels that some ray reaches."""
+        """The (X, Y, Z) bool voxels that a ray reaches."""
         return np.asarray((self.hits > 0) | (self.passes > 0))
 
 
@@ -57,29 +57,29 @@ class FloorMap:
 
     origin: Array  # (2,) lower left corner of the first cell, metres
     resolution: float
-    occupied: Array  # (X, Y) bool: something stands between the step and the robot's height
-    free: Array  # (X, Y) bool: seen there, and nothing stands
+    occupied: Array  # (X, Y) bool: occupied between the step and the robot's height
+    free: Array  # (X, Y) bool: seen and not occupied
 
     def centres(self, cells: Array) -> Array:
-        """Return the (P, 2) middles of cells, metres."""
+        """Return the (P, 2) centres of cells, metres."""
         return np.asarray(self.origin + (cells + 0.5) * self.resolution)
 
 
 @dataclass(frozen=True)
 class Goal:
-    """A pose in front of a thing."""
+    """A pose in front of an instance."""
 
     x: float  # metres
     y: float
-    yaw: float  # radians from the map's x axis, towards the thing
-    distance: float  # metres from the robot's middle to the thing's nearest point
+    yaw: float  # radians from the map's x axis, towards the instance
+    distance: float  # metres from the robot's centre to the instance's nearest point
 
 
 def map_axes(room: Room, metres: float, origin: Array = NO_ORIGIN) -> Similarity:
-    """Return the similarity from a scene with an `origin` (3,) to the axes of a map.
+    """Return the similarity from a scene with an `origin` (3,) to map axes.
 
-    z is up, the ground at 0, and x as near to the world's x axis, or its y axis where that is nearly up, as a
-    level axis can be. metres: of a unit.
+    z is up, the ground at 0, and x the level axis nearest to the world's x axis, or to its y axis if x is
+    nearly up. metres: per unit.
     """
     first = np.eye(3)[0 if abs(room.up[0]) < 0.9 else 1]
     first = first - (first @ room.up) * room.up
@@ -93,7 +93,10 @@ def map_axes(room: Room, metres: float, origin: Array = NO_ORIGIN) -> Similarity
 def find_occupancy(
     scene: Scene, to_map: Similarity, resolution: float, progress: Progress = silent
 ) -> Occupancy:
-    """Voxels, `resolution` metres, along the cameras' rays; InputError: none, blind, too many cells."""
+    """Return voxels of `resolution` metres, from depth images of the scene's cameras.
+
+    Raises InputError without cameras or surfaces, and for more than `MOST_CELLS` voxels.
+    """
     if not scene.cameras:
         raise InputError("the scene has no cameras, so nothing says what is free; map a trained scene")
     rays = []
@@ -126,7 +129,7 @@ def find_occupancy(
 
 @kernel
 def trace(eye: Array, ends: Array, hits: Array, passes: Array) -> None:
-    """Count voxels walked from `eye` (3,) to `ends` (P, 3) (Amanatides and Woo 1987), up to the largest."""
+    """Count the voxels along rays from `eye` (3,) to `ends` (P, 3) (Amanatides and Woo 1987), saturating."""
     most = np.iinfo(np.uint16).max
     shape = hits.shape
     cell, last, step = np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(3, np.int64)
@@ -158,7 +161,7 @@ def trace(eye: Array, ends: Array, hits: Array, passes: Array) -> None:
 
 
 def floor_map(occupancy: Occupancy, step: float, height: float) -> FloorMap:
-    """Return the map for a robot of a height, metres, that drives over what is lower than `step`."""
+    """Return the map for a robot of a height that drives over obstacles lower than `step`, metres."""
     floors = occupancy.origin[2] + np.arange(occupancy.hits.shape[2]) * occupancy.resolution
     band = (floors + occupancy.resolution / 2 >= step) & (floors <= height)
     if not band.any():
@@ -172,10 +175,10 @@ def floor_map(occupancy: Occupancy, step: float, height: float) -> FloorMap:
 
 
 def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None = None) -> Array:
-    """Return the cells in which the middle of a robot may be, (X, Y) bool.
+    """Return the (X, Y) bool cells in which the centre of a robot may be.
 
-    They are as far as its radius, metres, from obstacles, and connected with `start`, or with most others.
-    Raises InputError where there are none.
+    They are at least its radius, metres, from obstacles, and connected with `start`, by default the largest
+    such region. Raises InputError if there are none.
     """
     blocked = np.pad(~plan.free, 1, constant_values=True)
     clear = (ndimage.distance_transform_edt(~blocked)[1:-1, 1:-1] - 0.5) * plan.resolution >= radius
@@ -191,10 +194,9 @@ def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None =
 
 
 def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -> Goal | None:
-    """Return the pose of `where` (X, Y) bool nearest to a thing, facing it, with nothing between, or None.
+    """Return the pose in `where` (X, Y) bool nearest to an instance, facing it, with a free line, or None.
 
-    points: (P, 2) metres, of the thing seen from above, P >= 1; least: metres to be kept from it, also where
-    it hangs.
+    points: (P, 2) metres, of the instance seen from above, P >= 1; least: least distance to it, metres.
     """
     cells = np.argwhere(where)
     if len(cells) == 0:
@@ -208,9 +210,9 @@ def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -
     own = np.zeros(plan.free.shape, bool)
     inside = ((thing >= 0) & (thing < own.shape)).all(1)
     own[tuple(thing[inside].T)] = True
-    blocked = plan.occupied & ~ndimage.binary_dilation(own, iterations=2)  # its own outline is no obstacle
+    blocked = plan.occupied & ~ndimage.binary_dilation(own, iterations=2)  # all but the instance itself
     middle = np.median(points, axis=0)
-    # Of cells as near to its outline that before its middle: which is first in the map says nothing.
+    # Of equally near cells, the one nearest to the centre of the instance.
     aside = ((centres - middle) ** 2).sum(1)
     for best in np.lexsort((aside, np.round(nearest / plan.resolution)))[:MOST_LOOKS]:
         if nearest[best] >= least and not _between(plan, blocked, centres[best], spots[gaps[best].argmin()]):
@@ -223,7 +225,7 @@ def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -
 
 
 def _between(plan: FloorMap, blocked: Array, start: Array, end: Array) -> bool:
-    """Return whether the line between two places (2,), metres, crosses a cell of `blocked` (X, Y) bool."""
+    """Return True if the line between two positions (2,), metres, crosses a cell of `blocked` (X, Y) bool."""
     count = 2 * int(np.linalg.norm(end - start) / plan.resolution) + 2
     along = start + np.linspace(0, 1, count)[:, None] * (end - start)
     cells = np.floor((along - plan.origin) / plan.resolution).astype(int)
@@ -232,7 +234,7 @@ def _between(plan: FloorMap, blocked: Array, start: Array, end: Array) -> bool:
 
 
 def collider(occupancy: Occupancy) -> tuple[Array, Array]:
-    """Return triangles around all that is occupied, as `watertight` does: (V, 3) corners, m, and (T, 3)."""
+    """Return watertight triangles around all occupied voxels: (V, 3) vertices, m, and (T, 3)."""
     solid = np.pad(occupancy.occupied, 1)
     loop = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])  # counterclockwise from above
     corners = []

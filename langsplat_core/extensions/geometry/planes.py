@@ -1,4 +1,4 @@
-"""Points spread evenly over a scene's surface, and its floor: planes in them, by RANSAC (Open3D)."""
+"""Points sampled evenly from a scene's surface, and its floor, a plane found in them by RANSAC (Open3D)."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,21 +13,20 @@ from langsplat_core.scene.surface import surface_areas, surface_weights
 if TYPE_CHECKING:
     from open3d.geometry import PointCloud
 
-FEWEST = 100  # Gaussians: fewer have no surface to speak of
+FEWEST = 100  # least opaque Gaussians of a scene with a surface
 SAMPLES = 30_000  # points of the surface
-NEAR = 0.02  # of the scene's radius: how far from a plane its points lie
-LEAST = 0.02  # of the surface: what is less is no plane of a room
+NEAR = 0.02  # largest distance of a plane's points, as a share of the scene's radius
+LEAST = 0.02  # least share of the surface in a plane of a room
 MOST = 8  # planes that are tried
-LEVEL = 0.9  # cosine with up of the normals of a floor, at least
-BELOW = 0.05  # of the surface, that may lie below the floor: what shines through it, and floaters
+LEVEL = 0.9  # least cosine of a floor's normals with up
+BELOW = 0.05  # largest share of the surface below the floor: reflections and floaters
 
 
 def sample_surface(gaussians: Gaussians, count: int, seed: int = 0) -> tuple[Array, Array]:
-    """Return (count, 3) float64 points on the surface, as many on equal areas, and their unit normals.
+    """Return (count, 3) float64 points on the surface, of equal density by area, and their unit normals.
 
     Normals, (count, 3), are of either sign. A Gaussian is a disc across its shortest axis, with the density
-    of its two longest ones; one of a wall counts as many times as it covers. Raises InputError for a scene
-    with less than `FEWEST` opaque Gaussians.
+    of its two longest ones. Raises InputError for fewer than `FEWEST` opaque Gaussians.
     """
     rows = np.flatnonzero(surface_weights(gaussians) > 0)
     areas = surface_areas(gaussians)[rows]
@@ -45,7 +44,7 @@ def sample_surface(gaussians: Gaussians, count: int, seed: int = 0) -> tuple[Arr
 
 
 def cloud(points: Array, normals: Array | None = None) -> "PointCloud":
-    """Return (P, 3) points, with (P, 3) normals where there are such, as Open3D has them."""
+    """Return (P, 3) points, with (P, 3) normals if given, as a point cloud of Open3D."""
     import open3d
 
     made = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
@@ -56,17 +55,17 @@ def cloud(points: Array, normals: Array | None = None) -> "PointCloud":
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """The floor of a scene, for whoever stands in it."""
+    """Up direction and floor of a scene."""
 
-    up: Array  # (3,) unit: the floor's normal; the scene's own up where there is no floor
-    ground: float  # height of the floor along `up`, world units; without one of nearly the lowest surface
+    up: Array  # (3,) unit: the floor's normal; the scene's own up without a floor
+    ground: float  # height of the floor along `up`, world units; without one, of nearly the lowest surface
     has_floor: bool
 
 
 def find_room(scene: Scene) -> Room:
-    """Return up, and the largest level plane with little below it; InputError without a surface.
+    """Return up and floor: the largest level plane with little below it; InputError without a surface.
 
-    Planes are found one after the other, each among the level points that the ones before it left over.
+    Planes are found one by one, each among the level points that are in none of the planes before it.
     """
     import open3d
 

@@ -1,6 +1,7 @@
-"""Two scenes of one place: the transform between them, whether it can be trusted, and both as one scene.
+"""Registration and merging of two scenes of one place.
 
-Features of surface points are matched by RANSAC and refined by ICP (Open3D); renderings check the answer.
+Features of surface points are matched by RANSAC and refined by ICP (Open3D); rendered depths verify the
+transform.
 """
 
 from collections.abc import Sequence
@@ -23,27 +24,27 @@ from langsplat_core.scene.surface import surface_areas
 from langsplat_core.scene.transform import place_scene, rotating, similarity
 
 SAMPLES = 40_000  # points of each surface
-ROUGH, FINE = 0.06, 0.03  # of the fixed scene's radius: spacing of points for features, and for ICP
+ROUGH, FINE = 0.06, 0.03  # spacing of points for features and for ICP, as shares of the fixed scene's radius
 TRIES = 50_000  # of RANSAC
-AGAIN = 2  # times RANSAC is begun
-SIZES = (1.0, 0.8, 1.25)  # times the ratio of the scenes' radii: where it begins if the scale is open
-VIEWS, SIDE = 8, 120  # cameras of either scene that check it, and pixels of their longer side
-ALIKE = 0.05  # of the depth: surfaces that are no farther apart are the same
-TRUSTED = 0.7  # of the pixels that both scenes fill, from which two scenes are one place
-OVERLAP = 0.2  # of an image that both scenes fill, below which a camera says nothing
-NEAR = 0.02  # of the first scene's radius: surfaces no farther apart may be of one thing
-SAME = 0.4  # of the surface of each of two things that are one
+AGAIN = 2  # starts of RANSAC
+SIZES = (1.0, 0.8, 1.25)  # initial scales, if unknown, as factors of the ratio of the scenes' radii
+VIEWS, SIDE = 8, 120  # cameras of each scene for verification, and pixels of their longer side
+ALIKE = 0.05  # largest distance of equal surfaces, as a share of the depth
+TRUSTED = 0.7  # least share of equal depths, of pixels that both scenes fill, for scenes of one place
+OVERLAP = 0.2  # least share of an image that both scenes fill, for a camera to count
+NEAR = 0.02  # largest distance of surfaces of one instance, as a share of the first scene's radius
+SAME = 0.4  # least share of the surfaces of two equal instances that are near each other
 
 STAGE = "registering"
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The pose and size of a scene in the axes of another."""
+    """The transform from a scene to another one of the same place."""
 
     transform: Array  # (4, 4) float64 similarity, from the moving scene to the fixed one
-    rmse: float  # of points that lie on each other, units of the fixed scene
-    agreement: float  # of the pixels that both fill as seen by their cameras, the share of the same depth
+    rmse: float  # of matched points, units of the fixed scene
+    agreement: float  # share of equal depths of the pixels that both scenes fill, in views of both
 
     @property
     def scale(self) -> float:
@@ -52,17 +53,17 @@ class Registration:
 
     @property
     def trusted(self) -> bool:
-        """True if the two scenes show one place, as far as renderings tell."""
+        """True if the rendered depths agree, so that the scenes show one place."""
         return self.agreement >= TRUSTED
 
 
 def register(
     moving: Scene, fixed: Scene, scaled: bool = False, seed: int = 0, progress: Progress = silent
 ) -> Registration:
-    """Find the rigid motion, and with `scaled` the change of scale, that lays one scene onto another.
+    """Return the rigid motion, and with `scaled` the scale, from one scene to another.
 
-    Without `scaled` units are the same, up to what the two scenes say of metres. Raises InputError for a
-    scene without a surface. What is found is no more than a proposal unless it is `trusted`.
+    Without `scaled` both have the same unit, unless their metres per unit differ. Raises InputError for a
+    scene without a surface. The result is only a guess unless it is `trusted`.
     """
     unit = 1.0
     if moving.metres_per_unit is not None and fixed.metres_per_unit is not None:
@@ -70,7 +71,7 @@ def register(
     elif scaled:
         unit = fixed.bounds()[1] / moving.bounds()[1]
     centre, radius = fixed.bounds()
-    # Rooms are nearly alike from all sides.
+    # Rooms look similar after quarter turns.
     turns = [rotating(fixed.up(), -90.0 * quarter).about(centre).matrix for quarter in range(4)]
     mine, theirs = (sample_surface(scene.gaussians, SAMPLES, seed)[0] for scene in (moving, fixed))
     best: Registration | None = None
@@ -92,7 +93,7 @@ def register(
 def _aligned(
     moving: Array, fixed: Array, turns: list[Array], radius: float, scaled: bool, seed: int
 ) -> tuple[Array, float]:
-    """Return the (4, 4) that lays points (P, 3) onto others, and its error; turns: tried after RANSAC."""
+    """Return the (4, 4) transform from points (P, 3) to others, and its RMSE; turns: tried after RANSAC."""
     import open3d
 
     methods = open3d.pipelines.registration
@@ -131,7 +132,7 @@ def _aligned(
 
 
 def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:
-    """Return the share of pixels, filled in both as cameras of both see, of one depth; 0 without overlap."""
+    """Return the share of equal depths of pixels that both scenes fill, in views of both; 0: no overlap."""
     there = similarity(transform)
     mine, theirs = (
         some_cameras(scene.cameras or (scene.framing_camera((SIDE, SIDE)),), VIEWS, SIDE)
@@ -142,7 +143,7 @@ def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:
     same = both = 0
     for in_fixed, in_moving in views:
         near, far = (
-            view_of(scene, camera).median_depth().astype(np.float64)  # 0 where there is none
+            view_of(scene, camera).median_depth().astype(np.float64)  # 0 without a surface
             for scene, camera in ((fixed, in_fixed), (moving, in_moving))
         )
         filled = (near > 0) & (far > 0)
@@ -153,20 +154,20 @@ def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:
 
 
 def some_cameras(cameras: Sequence[Camera], most: int, side: int) -> list[Camera]:
-    """Return at most so many of the cameras, evenly chosen, with images of at most `side` pixels a side."""
+    """Return at most `most` of the cameras, evenly chosen, with images of at most `side` px per side."""
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(most, len(cameras))).astype(int))
     return [cameras[row].within(side) for row in chosen]
 
 
-# Two scenes in the same axes as one, with language field, cameras, tree and taught words.
+# Merging of two scenes in the same axes, with language field, cameras, tree and taught words.
 
 
 def merge(first: Scene, second: Scene) -> Scene:
-    """Return the Gaussians of both, those of `first` first, and all that belongs to them, about its origin.
+    """Return the Gaussians of both scenes, those of `first` first, with all their data, at its origin.
 
-    Gaussians of a scene without a language field get no meaning. Where both say something of the whole scene
-    or of one word, `first` counts; properties that only one has are left out. Raises InputError where one
-    image cannot be made of both, or one language field.
+    Gaussians of a scene without a language field get no feature. Settings of the whole scene and equal words
+    are those of `first`; properties that only one has are left out. Raises InputError if only one is
+    antialiased, or if the language fields cannot be merged.
     """
     if first.antialiased != second.antialiased:
         raise InputError(
@@ -191,11 +192,11 @@ def merge(first: Scene, second: Scene) -> Scene:
 
 
 def once(both: Scene, count: int, near: float) -> tuple[Scene, int]:
-    """Return a merged scene with the things that both scenes show kept once, and how many there are.
+    """Return a merged scene with instances of both scenes kept once, and the number of those with votes.
 
-    count: Gaussians of the first scene, which come first. Two wholes are one if `SAME` of the surface of each
-    has the other's at most `near` units away. The one that more photographs show stays, else the one of more
-    Gaussians; of the other stays what is farther than `near` from it, as a part of it.
+    count: Gaussians of the first scene, which come first. Two wholes are equal if `SAME` of the surface of
+    each is at most `near` units from the other. The one that more photographs show is kept, else that of more
+    Gaussians; Gaussians of the other one farther than `near` from it become a part of it.
     """
     tree = None if both.language is None else both.language.tree
     if both.language is None or tree is None:
@@ -203,7 +204,7 @@ def once(both: Scene, count: int, near: float) -> tuple[Scene, int]:
     nodes, means, areas = tree.at(len(LEVELS) - 1), both.gaussians.means, surface_areas(both.gaussians)
     solid = (nodes != NO_NODE) & (areas > 0)
     sides = [np.flatnonzero(solid[:count]), count + np.flatnonzero(solid[count:])]
-    shares = []  # by nodes of the first and the second scene, of what has the other scene's near
+    shares = []  # of each node's surface that is near one of the other scene, by pairs of nodes
     for mine, theirs in (sides, sides[::-1]):
         gaps, nearest = cKDTree(means[theirs]).query(means[mine], distance_upper_bound=near, workers=-1)
         there, of_whole = np.isfinite(gaps), areas[mine] / np.bincount(nodes[mine], areas[mine])[nodes[mine]]
@@ -229,15 +230,14 @@ def _language(first: Scene, second: Scene) -> LanguageField | None:
     known = first.language if first.language is not None else second.language
     if known is None:
         return None
-    a = _meaningless(known, len(first.gaussians)) if first.language is None else first.language
-    b = _meaningless(known, len(second.gaussians)) if second.language is None else second.language
+    a = _empty(known, len(first.gaussians)) if first.language is None else first.language
+    b = _empty(known, len(second.gaussians)) if second.language is None else second.language
     if a.encoder_id != b.encoder_id or a.codec.vector_dim != b.codec.vector_dim:
         raise InputError(
             f"their language fields are of two text encoders, {a.encoder_id} and {b.encoder_id}, and no "
             "phrase can be asked in both; train the field of one again with the other's encoder"
         )
     codec, latents = _one_codec(a, b)
-    everyday = a.everyday if a.everyday is not None else b.everyday
     words = {word.key for word in a.taught}
     return replace(
         a,
@@ -246,13 +246,13 @@ def _language(first: Scene, second: Scene) -> LanguageField | None:
         codec=codec,
         phrasebook={**b.phrasebook, **a.phrasebook},
         tree=None if a.tree is None or b.tree is None else _one_tree(a.tree, b.tree),
-        everyday=everyday,
+        everyday=a.everyday if a.everyday is not None else b.everyday,
         taught=a.taught + tuple(word for word in b.taught if word.key not in words),
     )
 
 
-def _meaningless(field: LanguageField, count: int) -> LanguageField:
-    """Return a field of `count` Gaussians that mean nothing, in the way of `field`."""
+def _empty(field: LanguageField, count: int) -> LanguageField:
+    """Return a field of `count` Gaussians without features, otherwise like `field`."""
     nothing = np.zeros(0, np.int32)
     empty = Tree(np.full(count, NO_NODE, np.int32), nothing, nothing.astype(np.uint8),
                  np.zeros((0, 2), np.uint16))  # fmt: skip
@@ -266,8 +266,7 @@ def _meaningless(field: LanguageField, count: int) -> LanguageField:
 
 def _one_codec(a: LanguageField, b: LanguageField) -> tuple[Codec, Array]:
     """Return a codec of both fields, and the (3, N, d) latents of both in it."""
-    mine, theirs = a.codec, b.codec
-    both = np.concatenate
+    mine, theirs, both = a.codec, b.codec, np.concatenate
     one, other = mine.tensors(), theirs.tensors()
     if one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one):
         return mine, both([a.latents, b.latents], axis=1)

@@ -1,11 +1,11 @@
 """OpenUSD stages of Gaussians: prims `ParticleField3DGaussianSplat` (OpenUSD 26.03), by usd-core.
 
-A stage that is written has /Scene/Gaussians, upright and in metres where the scale is known, with numbers of
-things (primvars), and under /Scene/Things a prim for each thing of the scene's outline and its parts: in its
-middle, with its box (`extentsHint`) and labels (`SemanticsLabelsAPI:class`).
+A written stage has /Scene/Gaussians, upright and in metres if the scale is known, with the node of each
+Gaussian at each level (primvars), and under /Scene/Things a prim for each node of the scene's outline: at its
+centre, with its box (`extentsHint`) and labels (`SemanticsLabelsAPI:class`).
 
-Read is the file's own layer alone: what it refers to is not opened, and said. usd-core's native reader gives
-way where a file is damaged, so that it works in a process of its own, with bounds on time and memory.
+Only the file's own layer is read: files that it refers to are not opened, but reported. usd-core's native
+reader may crash on a damaged file, so it runs in a process of its own, with bounds on time and memory.
 Source: https://openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html
 """
 
@@ -46,12 +46,12 @@ TYPE = "ParticleField3DGaussianSplat"
 HARMONICS = "radiance:sphericalHarmonics"
 DEGREE = f"{HARMONICS}Degree"
 COLUMNS = {"positions": 3, "scales": 3, "orientations": 4, "opacities": 1, f"{HARMONICS}Coefficients": 3}
-# Types of prims and attributes that are read, or say nothing of Gaussians; what a companion keeps of ours.
+# Types of prims and attributes that are read or irrelevant; OURS: those that a companion of our files has.
 KNOWN = {TYPE, "Xform", "Scope", "", "extent", DEGREE, "projectionModeHint", "sortingModeHint"}
 KNOWN |= {*COLUMNS, *(f"{name}h" for name in COLUMNS)}
 OURS = {*(f"primvars:{name}" for name in LEVELS), "semantics:labels:class", "extentsHint"}
 Z_TO_Y = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-MEMORY, SECONDS = 3 << 30, 60  # for reading, beside 100 bytes and a microsecond for each byte of the file
+MEMORY, SECONDS = 3 << 30, 60  # for reading, plus 100 bytes and a microsecond per byte of the file
 ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
@@ -59,7 +59,7 @@ ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 def write_usd(path: Path, scene: Scene) -> None:
     """Write a stage, atomically; rows keep their order, and numbers are as in a .glb.
 
-    A row that cannot be drawn has opacity 0. Without an encoder things are numbers alone, which is said.
+    A row that cannot be drawn has opacity 0. Without an encoder nodes have no labels, which is reported.
     """
     from pxr import Gf, Kind, Sdf, Usd, UsdGeom, Vt
 
@@ -111,7 +111,7 @@ def write_usd(path: Path, scene: Scene) -> None:
 
 
 def _add(stage: Any, above: str, middle: Array, thing: "Outline", points: tuple[Array, Any]) -> None:
-    """Add a prim, and its parts below it. middle: (3,) of what is above; points: (N, 3), and rows by node."""
+    """Add a prim and those of its parts. middle: (3,) centre of `above`; points: (N, 3), and rows by node."""
     from pxr import Gf, Kind, Tf, Usd, UsdGeom, UsdSemantics, Vt
 
     from langsplat_core.query.describe import OR
@@ -136,14 +136,14 @@ def _add(stage: Any, above: str, middle: Array, thing: "Outline", points: tuple[
 
 
 def read_usd(path: Path) -> Scene:
-    """Return all Gaussians of a stage. InputError where it cannot be opened, else FormatError."""
+    """Return all Gaussians of a stage. InputError if it cannot be opened, else FormatError."""
     file, size = hostile.open_for_reading(path)
     file.close()
     try:
         found = apart.run(_read, path, size, progress=silent, environment=ALONE)
     except LangSplatError:
         raise
-    except Exception as error:  # noqa: BLE001  whatever usd-core raises, or how it ends
+    except Exception as error:  # noqa: BLE001  usd-core may raise anything, or its process end
         said = printable_line(str(error).rpartition(" : ")[2], 120)
         raise malformed(path, f"usd-core cannot read it ({said})") from None
     parts, kept, metres, told = found
@@ -156,10 +156,10 @@ def read_usd(path: Path) -> Scene:
 def _read(
     path: Path, size: int, progress: Progress
 ) -> tuple[list[Any], Kept | None, float | None, list[str]]:
-    """Return what `placed_scene` takes, what is kept of a scene of ours, metres per unit, and losses."""
+    """Return the parts for `placed_scene`, properties kept by this program, metres per unit, and losses."""
     from pxr import Sdf, Work
 
-    Work.SetConcurrencyLimit(1)  # each thread would take of the bound on memory
+    Work.SetConcurrencyLimit(1)  # threads count against the bound on memory
     with suppress(ImportError, ValueError):  # other systems have no such bounds, or lower ones
         import resource
 
@@ -171,7 +171,7 @@ def _read(
     while waiting:
         prim = waiting.pop()
         if prim.specifier != Sdf.SpecifierDef or not prim.active or prim.typeName == "PointInstancer":
-            names.add(f"{prim.path}")  # which nobody shows, or many times
+            names.add(f"{prim.path}")  # prims that are not shown, or shown many times
             continue
         waiting += [*prim.nameChildren][::-1]
         names.update([prim.typeName, *prim.attributes.keys(), *prim.variantSets.keys()])
@@ -199,7 +199,7 @@ def _read(
 
 
 def _gaussians(layer: Any, prim: Any, path: Path, room: hostile.Allowance, told: list[str]) -> Gaussians:
-    """Return the Gaussians of a prim; halves stand in for floats that are not there."""
+    """Return the Gaussians of a prim; attributes of half floats replace missing ones of floats."""
     columns = []
     for name, width in COLUMNS.items():
         held = next((prim.attributes[own] for own in (name, f"{name}h") if own in prim.attributes), None)
@@ -219,16 +219,16 @@ def _gaussians(layer: Any, prim: Any, path: Path, room: hostile.Allowance, told:
             path, f"{prim.path}: arrays of {', '.join(map(str, rows))} rows do not fit degree {degree}"
         )
     logits = logit(opacities[:, 0].astype(np.float64))
-    with np.errstate(all="ignore"):  # whatever numbers it holds
+    with np.errstate(all="ignore"):  # invalid rows are not drawn
         log_scales = np.log(scales)
     sh = harmonics.reshape(count, SH_COUNTS[degree], 3)
     return Gaussians(positions, log_scales, orientations[:, [3, 0, 1, 2]], logits, sh)
 
 
 def _place(layer: Any, prim: Any) -> Array:
-    """Return the (4, 4) matrix from a prim's axes to the world's, y up there, by usd-core's own rules.
+    """Return the (4, 4) matrix from a prim's axes to the world's, with y up, as usd-core computes it.
 
-    Its operations are copied, without what else the prims have, into a stage of nothing else.
+    Only the transform operations of the prims are copied into a new stage.
     """
     from pxr import Sdf, Usd, UsdGeom
 

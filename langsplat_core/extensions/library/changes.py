@@ -1,11 +1,10 @@
-"""What changed between two scenes of one place: what appeared, is gone, moved or has another colour.
+"""Changes between two scenes of one place: instances that appeared, are gone, moved or have another colour.
 
-Both scenes are rendered from the training cameras of both. A pixel of one scene is *gone* where the other has
-its surface clearly farther behind, *hidden* where it has it nearer, and else *kept*; what is kept may have
-*another colour*. With the adjoint of the rasterizer these four are summed over the Gaussians that paint a
-pixel, and from them over the nodes of the scene's tree. So a node changes where most of its own pixels say
-so, however the two trees are divided; what one capture did not see, or what stands behind something new, says
-nothing.
+Both scenes are rendered from the training cameras of both. A pixel of one scene is *gone* if the other's
+surface is clearly farther away, *hidden* if it is nearer, and else *kept*; a kept pixel may have *another
+colour*. The adjoint of the rasterizer sums these over the Gaussians that paint a pixel, and these are summed
+over the nodes of the scene's tree. A node has changed if most of its own pixels have, independent of the
+other scene's tree; pixels that one capture did not see, and hidden ones, do not count.
 """
 
 from dataclasses import dataclass, replace
@@ -33,38 +32,38 @@ Kind = Literal["gone", "appeared", "moved", "recoloured"]
 KINDS: tuple[Kind, ...] = ("gone", "appeared", "moved", "recoloured")
 VIEWS = 24  # cameras of each scene
 # Chosen on rooms 201 to 203.
-FARTHER = 0.03  # of the depth: a surface so much farther behind is another one
-PLAINLY = 3  # times as far, it is whatever its colour
-OTHER = 18.0  # distance of colours in CIE L*a*b* from which a kept pixel has another
-TINT = 5.0  # and from which what is barely farther is gone
-ABSENT = 0.2  # of what is seen of a node: if more of it is gone, all of it may be, else its colour changed
-MOST_GONE, MOST_COLOURED = 0.9, 0.6  # of that, changed: from here on a node changed
-LEAST = 100  # Gaussians of a node: of fewer, at the fringe of what was photographed, the shape is a guess
-LEAST_PIXELS = 50.0  # that a node covers, of an image in which it is seen
-EMPTY = 0.05  # alpha below which nothing is there
-SIDE = 400  # pixels: the longer side of these images
-ALIKE = 0.8  # cosine of language features, from the scene's mean, of one thing in two places
-SHADE = 25.0  # distance of its mean colours at most
-GROWN = 1.7  # ratio of its sizes at most
-TOUCHING = 0.25  # of the larger one's diagonal: pieces so near each other, and alike, are of one thing
+FARTHER = 0.03  # largest difference of depths of equal surfaces, as a share of the depth
+PLAINLY = 3  # factor of it above which a pixel is gone whatever its colour
+OTHER = 18.0  # distance in CIE L*a*b* above which a kept pixel has another colour
+TINT = 5.0  # distance in CIE L*a*b* above which a farther pixel is gone
+ABSENT = 0.2  # least share of gone pixels of a node that is gone; below, its colour may have changed
+MOST_GONE, MOST_COLOURED = 0.9, 0.6  # least share of changed pixels of a node that is gone, or recoloured
+LEAST = 100  # least Gaussians of a node; the shape of smaller ones, at the border of captures, is uncertain
+LEAST_PIXELS = 50.0  # least mean pixels of a node per image that shows it
+EMPTY = 0.05  # alpha of an empty pixel
+SIDE = 400  # pixels of the longer side of images
+ALIKE = 0.8  # least cosine of mean-free language features of one instance
+SHADE = 25.0  # largest distance of its mean colours, in CIE L*a*b*
+GROWN = 1.7  # largest ratio of its sizes
+TOUCHING = 0.25  # largest gap of pieces of one instance, as a share of the larger diagonal
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """One thing that is not as it was. Places are in the first scene's frame."""
+    """A changed instance. Positions are in the first scene's frame."""
 
     kind: Kind
-    name: str | None  # its best words, "mug or cup"; None where none is likely
-    centre: Array  # (3,) world units, where it is now, or was
+    name: str | None  # its best words, "mug or cup"; None if none is likely
+    centre: Array  # (3,) world units, its present position, or the former one if it is gone
     box: Array  # (2, 3) corners, world units
-    moved: Array | None = None  # (3,) world units, of what moved
-    colours: tuple[str, str] | None = None  # before and now, of what has another
-    share: float = 0.0  # of its pixels that say so
-    pixels: float = 0.0  # in which it was looked at, over all images
+    moved: Array | None = None  # (3,) world units, displacement of what moved
+    colours: tuple[str, str] | None = None  # before and now, of what was recoloured
+    share: float = 0.0  # of its pixels that changed
+    pixels: float = 0.0  # gone and kept ones, over all images
 
     @property
     def distance(self) -> float:
-        """Length of the move, world units; 0 of what stayed."""
+        """Length of the displacement, world units; 0 if it did not move."""
         return 0.0 if self.moved is None else float(np.linalg.norm(self.moved))
 
 
@@ -76,14 +75,14 @@ class _Piece:
     gone: float  # pixels
     coloured: float
     kept: float
-    colour: Array  # (3,) mean L*a*b* as rendered
-    other: Array  # (3,) the other scene's at its kept pixels
-    meaning: Array  # (D,) unit, from the scene's mean
+    colour: Array  # (3,) mean rendered L*a*b*
+    other: Array  # (3,) that of the other scene at its kept pixels
+    meaning: Array  # (D,) unit language feature, less the scene's mean
     points: Array  # (M, 3) in the first scene's frame
 
     @property
     def is_absent(self) -> bool:
-        """True if it is gone, and has not just another colour."""
+        """True if it is gone and not only recoloured."""
         return self.gone >= ABSENT * (self.gone + self.kept)
 
     @cached_property
@@ -100,11 +99,11 @@ def changes(
     describers: tuple[Describer, Describer] | None = None,
     progress: Progress = silent,
 ) -> tuple[Change, ...]:
-    """Return what changed from the first scene to the second, the largest first of each of `KINDS`.
+    """Return the changes from the first scene to the second, by `KINDS`, the largest first.
 
-    placed: (4, 4) similarity from the second scene's frame into the first one's; None: both lie in one world.
-    describers: of both, for names. Raises InputError for a scene without cameras or language field, and for a
-    matrix that is no similarity.
+    placed: (4, 4) similarity from the second scene's frame to the first one's; None: both have one world.
+    describers: of both, for names. Raises InputError if neither scene has cameras, if one has no language
+    field, and for a matrix that is no similarity.
     """
     if placed is None:
         placed = moving(second.scene.origin - first.scene.origin).matrix
@@ -124,16 +123,16 @@ def changes(
     found += [_change("appeared", piece, 1, describers) for piece in new]
     painted = [piece for piece in gone if not piece.is_absent]
     found += [_change("recoloured", piece, 0, describers) for piece in painted]
-    for piece in appeared:  # what has a node of its own only in the second scene
+    for piece in appeared:  # recoloured pieces with a node of their own only in the second scene
         if not piece.is_absent and not any(_meet(piece.box, other.box) for other in painted):
             turned = replace(piece, colour=piece.other, other=piece.colour)
             found.append(_change("recoloured", turned, 1, describers))
     return tuple(sorted(found, key=lambda change: (KINDS.index(change.kind), -change.pixels)))
 
 
-# Evidence: what the pixels of both say about the Gaussians of each.
+# Evidence: changed pixels of both scenes, summed over the Gaussians of each.
 
-# Of each Gaussian: pixels gone, kept, of another colour; images; own colour, and the other's where kept.
+# Of each Gaussian: pixels gone, kept, recoloured; images; sums of its own colour, and of the other's if kept.
 _CHANNELS = 10
 
 
@@ -155,14 +154,14 @@ def _evidence(
         drawn = [splat_colours(view, scene.gaussians) for view, (scene, _) in zip(views, pair, strict=True)]
         looks = [to_lab(np.clip(image.colours, 0, 1)) for image in drawn]
         near, far = views[0].median_depth(), there.scale * views[1].median_depth()
-        # Where a capture looked and has nothing, nothing is; where it did not look, nobody knows.
+        # Empty pixels in a scene's own camera are empty; in the other scene's cameras they are unknown.
         if done < len(own):
             near = np.where(drawn[0].alpha < EMPTY, np.inf, near)
         else:
             far = np.where(drawn[1].alpha < EMPTY, np.inf, far)
         both, limit = (near > 0) & (far > 0), FARTHER * np.minimum(near, far)
         kept = both & (np.abs(near - far) <= limit)
-        if kept.any():  # of another exposure
+        if kept.any():  # removes a difference in exposure
             looks[1] = looks[1] - np.median((looks[1] - looks[0])[kept], axis=0)
         apart = np.linalg.norm(looks[1] - looks[0], axis=-1)
         for depth, other, view, total, look, away in (
@@ -182,14 +181,14 @@ def _evidence(
 
 
 def to_lab(colours: Array) -> Array:
-    """Map (..., 3) sRGB in [0, 1] to CIE L*a*b* of D65."""
+    """Return CIE L*a*b*, for D65, of (..., 3) sRGB in [0, 1]."""
     mixed = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
     x, y, z = np.moveaxis(linear_light(colours) @ mixed.T / (0.9505, 1.0, 1.089), -1, 0)
     x, y, z = (np.where(v > 216 / 24389, np.cbrt(v), (24389 / 27 * v + 16) / 116) for v in (x, y, z))
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
 
 
-# The basic colours of assets/vocabulary, which phrases are asked with, at typical sRGB values.
+# The basic colours of assets/vocabulary at typical sRGB values.
 _TERMS = {
     "red": (190, 35, 40), "orange": (235, 130, 40), "yellow": (240, 215, 60), "green": (60, 150, 60),
     "turquoise": (50, 180, 180), "blue": (45, 85, 180), "purple": (120, 50, 140), "pink": (235, 150, 180),
@@ -199,9 +198,9 @@ _TERMS = {
 
 
 def colour_term(lab: Array) -> str:
-    """Return the basic colour term nearest to a colour (3,) in CIE L*a*b*: in hue first, then in lightness.
+    """Return the basic colour term nearest to a colour (3,) in CIE L*a*b*, by hue more than by lightness.
 
-    Chroma is compressed, or whatever is shaded or pale would be grey; constants chosen on 63 named shades.
+    Chroma is compressed, else shaded and pale colours would be grey; constants chosen on 63 named shades.
     """
     shades = np.concatenate([lab[None], to_lab(np.array(list(_TERMS.values())) / 255)])
     chroma = np.linalg.norm(shades[:, 1:], axis=1)
@@ -210,11 +209,11 @@ def colour_term(lab: Array) -> str:
     return list(_TERMS)[int(((placed[1:] - placed[0]) ** 2).sum(1).argmin())]
 
 
-# Pieces: the largest nodes that changed, those of one thing taken together.
+# Pieces: the largest nodes that changed, merged if they are of one instance.
 
 
 def _pieces(engine: QueryEngine, evidence: Array, into: Array) -> list[_Piece]:
-    """Pieces that changed. Those of one thing are one: they meet, mean the same, and changed alike."""
+    """Return the changed pieces; those that meet, with similar features and changes, are merged."""
     tree, members = engine.tree, engine.tree.gaussians()
     inside = np.zeros(tree.count, bool)
     features = _codewords_seen(engine)
@@ -251,7 +250,7 @@ def _has_changed(size: int, sums: Array, images: float) -> bool:
 
 
 def _codewords_seen(engine: QueryEngine) -> tuple[Array, Array, Array]:
-    """Return (U, D) codewords less their mean, (N,) numbers at level whole, -1 for none, and (N,) areas."""
+    """Return (U, D) features less their mean, their (N,) numbers at level whole, -1: none, and (N,) areas."""
     field, level = engine.field, len(LEVELS) - 1
     number, areas = np.full(len(field), -1), surface_areas(engine.scene.gaussians)
     known = field.known[level]
@@ -283,13 +282,13 @@ def _piece(
 
 
 def _meet(one: Array, other: Array) -> bool:
-    """Return True if two boxes (2, 3) overlap, or nearly."""
+    """Return True if two boxes (2, 3) overlap or nearly touch."""
     room = TOUCHING * max(np.linalg.norm(one[1] - one[0]), np.linalg.norm(other[1] - other[0]))
     return bool(((one[0] - room <= other[1]) & (other[0] - room <= one[1])).all())
 
 
 def _matched(lost: list[_Piece], new: list[_Piece], comparable: bool) -> list[tuple[_Piece, _Piece]]:
-    """Pairs of what is gone and what appeared that are one thing, the likest first; each in one pair."""
+    """Return pairs of gone and appeared pieces of one instance, the most similar first; each in one pair."""
     pairs = []
     for old in lost:
         for now in new:

@@ -16,7 +16,7 @@ from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError, report_loss
 from langsplat_core.extensions.geometry.commands import read_transform, registered
 from langsplat_core.extensions.library.changes import Change, changes
-from langsplat_core.extensions.library.index import Answered, Hit, Library, find, update_library
+from langsplat_core.extensions.library.index import Answers, Hit, Library, find, update_library
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine, searchable
@@ -31,7 +31,7 @@ from langsplat_core.semantics.encoders import load_text_encoder
 class Find:
     """Find phrases in all scenes of a folder: the most certain answers first, with scene, place and box.
 
-    An index of what the scenes mean is kept in the folder and brought up to date; the first call reads all.
+    An index of the scenes is kept in the folder and updated by each call; the first call reads all scenes.
     """
 
     words: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TEXT... FOLDER")]
@@ -81,7 +81,7 @@ def _name(hit: Hit, library: Library) -> str:
     return hit.path.relative_to(library.folder).as_posix()
 
 
-def _heading(answered: Answered) -> str:
+def _heading(answered: Answers) -> str:
     counts = f"found in {answered.count('found')} of {len(answered.hits)} scenes"
     weak = answered.count("weak match")
     return f"{answered.phrase} ({answered.encoder_id}): " + (
@@ -89,7 +89,7 @@ def _heading(answered: Answered) -> str:
     )
 
 
-def _fields(answered: Answered, hits: Sequence[Hit], library: Library) -> dict[str, Any]:
+def _fields(answered: Answers, hits: Sequence[Hit], library: Library) -> dict[str, Any]:
     return {
         "phrase": answered.phrase,
         "encoder": answered.encoder_id,

@@ -1,10 +1,10 @@
-"""Search over all scenes of a folder: ranked by an index of their codebooks, the best ones asked exactly.
+"""Search over all scenes of a folder: ranked by an index of their codebooks, the best ones searched exactly.
 
-The answer to a phrase in a scene rests on the mean relevancies of its regions, which are mixtures of the
-relevancies of few codewords. So the index keeps, of every scene, its codewords in 8 bits, how each is read
-(zero and rate), the codewords of every region with their shares, and the fits of everyday phrases by chance.
-From these the fits and the verdict of `query.rule` are computed without opening the scene, up to the
-rounding of codewords. The scenes that answer best are then opened and asked by `QueryEngine`.
+The answer to a phrase in a scene depends on the mean relevancies of its regions, which are mixtures of the
+relevancies of few codewords. So the index has, for every scene, its codewords in 8 bits, the zero and rate of
+each (see `Scale`), the codewords of every region with their shares, and the fits of everyday phrases by
+chance. From these the fits and the verdict of `query.rule` are computed without opening the scene, up to the
+rounding of codewords. The scenes with the best verdicts are then opened and searched by `QueryEngine`.
 
 The index is a safetensors file: the scenes as JSON in its metadata, and for each group of scenes of one
 encoder, `N.`, its canonical vectors, the `Columns` of all its scenes and their thumbnails.
@@ -63,16 +63,16 @@ from langsplat_core.semantics.encoders import kept_calibration, same_vectors
 from langsplat_core.semantics.relevancy import fit_of
 
 log = logging.getLogger("langsplat")
-INDEX = ".langsplat-library"  # its name in the folder
-SCENES = "scenes 2"  # key of the metadata; "scenes" has bars of fits that common fits are in
-THUMBNAIL = (96, 72)  # width and height, pixels, of the picture that the index keeps of a scene
+INDEX = ".langsplat-library"  # file name in the folder
+SCENES = "scenes 2"  # key of the metadata; an older "scenes" has bars with common fits included
+THUMBNAIL = (96, 72)  # width and height, pixels
 Whole = Annotated[int, msgspec.Meta(ge=0, lt=2**62)]
 
 
 class Columns(NamedTuple):
     """The arrays of scenes, one scene after the other: of K codewords, M entries of mixtures, R regions."""
 
-    steps: Array  # (K,) float32 of the 8 bits: a codeword is step times codewords
+    steps: Array  # (K,) float32: a codeword is its step times its 8-bit row of `codewords`
     zeros: Array  # (K,) float32, see `Scale.of`
     rates: Array  # (K,) float32
     shares: Array  # (M,) float32 of a codeword in the mean of a region
@@ -88,19 +88,19 @@ ROWS = Columns(0, 0, 0, 1, 1, 1, 2, 2, 0)  # type: ignore[arg-type]  # column of
 
 
 @dataclass(frozen=True)
-class Listed:
-    """A scene of the folder, as the index describes it."""
+class Indexed:
+    """A scene of the folder in the index."""
 
     path: str  # below the folder, "/" between names
     stamp: tuple[Whole, ...]  # size and time of change, ns, of each of its files
-    codewords: Whole = 0  # 0: only the engine can answer, as for another codec than a codebook
-    mixtures: Whole = 0  # entries of them
-    regions: tuple[Whole, Whole, Whole] = (0, 0, 0)  # of each level
-    bars: Bars | None = None  # of the fits of everyday phrases; None where there are no codewords
+    codewords: Whole = 0  # number; 0: only the engine can answer, as for other codecs than codebooks
+    mixtures: Whole = 0  # number of entries
+    regions: tuple[Whole, Whole, Whole] = (0, 0, 0)  # number at each level
+    bars: Bars | None = None  # of the fits of everyday phrases; None without codewords
     calibration: Calibration | None = None  # of its encoder
     taught: tuple[str, ...] = ()  # keys of taught words
     phrases: Whole = 0  # in its phrasebook
-    unread: str = ""  # why it has no answers; one line
+    unread: str = ""  # why it cannot be searched; one line
 
     def __post_init__(self) -> None:
         """Raise ValueError for a path out of the folder, or codewords without bars."""
@@ -111,28 +111,28 @@ class Listed:
 
     @property
     def is_indexed(self) -> bool:
-        """Return False for a scene that only the engine can answer."""
+        """True if the index alone gives a verdict."""
         return self.codewords > 0
 
 
 @dataclass(frozen=True, eq=False)
 class EncoderGroup:
-    """The scenes of one encoder, and the arrays of `COLUMNS` of all of them, one after the other."""
+    """The scenes of one encoder, and the arrays of all of them, one after the other."""
 
     encoder_id: str
     canonical: Array  # (C, D) float32
-    scenes: tuple[Listed, ...]
+    scenes: tuple[Indexed, ...]
     columns: Columns
 
     @cached_property
     def starts(self) -> Array:
-        """(S + 1, 3) int64: where the codewords, mixtures and regions of each scene begin."""
+        """The (S + 1, 3) int64 offsets of the codewords, mixtures and regions of each scene."""
         sizes = [(each.codewords, each.mixtures, sum(each.regions)) for each in self.scenes]
         return np.cumsum([(0, 0, 0), *sizes], axis=0)
 
     @cached_property
     def table(self) -> RegionTable:
-        """The regions of all scenes, as the rule for answers reads them."""
+        """The regions of all scenes, for `query.rule`."""
         counts = np.array([scene.regions for scene in self.scenes], np.int64).reshape(-1, len(LEVELS))
         firsts = np.repeat(self.starts[:-1, 2], counts.sum(1))
         parents = self.columns.parents.astype(np.int64)
@@ -145,20 +145,20 @@ class Library:
 
     folder: Path
     groups: tuple[EncoderGroup, ...]
-    unread: tuple[Listed, ...] = ()  # scenes that cannot be opened
+    unread: tuple[Indexed, ...] = ()  # scenes that cannot be opened
     thumbnails: Mapping[str, Array] | None = None  # by path: (H, W, 3) uint8
 
     @property
-    def scenes(self) -> tuple[Listed, ...]:
+    def scenes(self) -> tuple[Indexed, ...]:
         """Scenes that can be searched."""
         return tuple(scene for group in self.groups for scene in group.scenes)
 
 
-# Scenes of a folder, and their digests.
+# Scenes of a folder, and their entries.
 
 
 def scenes_in(folder: Path) -> list[Path]:
-    """Every scene with a field below a folder, one a field, none hidden; InputError without the folder."""
+    """Return the scenes with a field below a folder, one per field, without hidden folders; InputError."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; name one with scenes in it")
     found: list[Path] = []
@@ -182,7 +182,7 @@ def scenes_in(folder: Path) -> list[Path]:
 
 
 def stamp_of(scene: Path) -> tuple[int, ...]:
-    """Size and time of change, ns, of each file of a scene; zeros for one that is not there."""
+    """Return size and time of change, ns, of each file of a scene; zeros for a missing file."""
     numbers: list[int] = []
     for file in scene_files(scene):
         try:
@@ -194,28 +194,28 @@ def stamp_of(scene: Path) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Digest:
+class Entry:
     """The entry of one scene in the index."""
 
-    listed: Listed
+    listed: Indexed
     encoder_id: str = ""
     canonical: Array | None = None
     columns: Columns | None = None
     thumbnail: Array | None = None  # (H, W, 3) uint8
 
 
-def digest(path: Path, name: str, load_encoder: LoadEncoder | None) -> Digest:
-    """Read a scene for the index; one that cannot be read, or has no field, is listed with the reason."""
-    listed = Listed(name, stamp_of(path))
+def read_entry(path: Path, name: str, load_encoder: LoadEncoder | None) -> Entry:
+    """Return the entry of a scene; one that cannot be read, or has no field, has the reason in `unread`."""
+    listed = Indexed(name, stamp_of(path))
     try:
         scene = load_scene(path)
         engine = QueryEngine(scene, load_encoder)
         field, picture = engine.field, np.asarray(draw(scene, THUMBNAIL))
     except LangSplatError as error:
-        return Digest(replace(listed, unread=str(error)))
+        return Entry(replace(listed, unread=str(error)))
     taught = tuple(word.key for word in field.taught)
     listed = replace(listed, taught=taught, phrases=len(field.phrasebook))
-    made = Digest(listed, field.encoder_id, field.canonical, None, picture)
+    made = Entry(listed, field.encoder_id, field.canonical, None, picture)
     if field.codec.blends or engine.bars is None or not field.known.any():
         return made
     bars = engine.bars
@@ -265,8 +265,8 @@ def update_library(
 ) -> Library:
     """Return the library of a folder, with new and changed scenes read again.
 
-    The index is written where anything is different; an interrupted call keeps what it had read. A damaged
-    index costs a warning, and is made again. Raises InputError without scenes.
+    The index is written if anything changed; an interrupted call keeps the scenes that it has read. A damaged
+    index is reported and made again. Raises InputError without scenes.
     """
     index = index_of(folder)
     paths = {path.relative_to(folder).as_posix(): path for path in scenes_in(folder)}
@@ -279,10 +279,10 @@ def update_library(
     try:
         for done, name in enumerate(fresh):
             progress("reading scenes", done / len(fresh), name)
-            kept[name] = digest(paths[name], name, load_encoder)
+            kept[name] = read_entry(paths[name], name, load_encoder)
     finally:
         if fresh or len(kept) != listed:
-            with locked(index.parent):  # what another search has read meanwhile is kept, too
+            with locked(index.parent):  # keeps entries of other processes, too
                 kept = _kept(index, folder, stamps, logging.DEBUG)[0] | kept
                 write_library(index, [kept[name] for name in paths if name in kept])
     progress("reading scenes", 1.0)
@@ -290,7 +290,7 @@ def update_library(
 
 
 def index_of(folder: Path) -> Path:
-    """Return where the index of a folder lies: in it, or in the user's cache where it cannot be written."""
+    """Return the path of a folder's index: in the folder or, if that is not writable, in the user's cache."""
     if os.access(folder, os.W_OK):
         return folder / INDEX
     digest = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:16]
@@ -299,19 +299,19 @@ def index_of(folder: Path) -> Path:
 
 def _kept(
     index: Path, folder: Path, stamps: Mapping[str, tuple[int, ...]], level: int = logging.WARNING
-) -> tuple[dict[str, Digest], int]:
-    """Return the entries of an index whose scenes are as they were, and how many there are in all."""
+) -> tuple[dict[str, Entry], int]:
+    """Return the entries of an index whose scenes did not change, and the number of all entries."""
     try:
         old = read_library(index, folder) if os.path.exists(index) else Library(folder, ())
     except FormatError as error:
         log.log(level, "%s", error)
         return {}, 0
-    found = {each.listed.path: each for each in _digests(old)}
+    found = {each.listed.path: each for each in _entries(old)}
     same = {path: each for path, each in found.items() if stamps.get(path) == each.listed.stamp}
     return same, len(old.scenes) + len(old.unread)
 
 
-def _digests(library: Library) -> Iterator[Digest]:
+def _entries(library: Library) -> Iterator[Entry]:
     """Yield the entry of every scene of a library, as views of its arrays."""
     pictures = library.thumbnails or {}
     for group in library.groups:
@@ -321,22 +321,22 @@ def _digests(library: Library) -> Iterator[Digest]:
             columns = Columns(*(
                 values[ends[0][of] : ends[1][of]] for values, of in zip(group.columns, ROWS, strict=True)
             ))  # fmt: skip
-            yield Digest(scene, group.encoder_id, group.canonical, columns, pictures[scene.path])
-    yield from map(Digest, library.unread)
+            yield Entry(scene, group.encoder_id, group.canonical, columns, pictures[scene.path])
+    yield from map(Entry, library.unread)
 
 
 @dataclass(frozen=True)
 class _Stated:
     """Metadata of an index about its scenes."""
 
-    groups: tuple[tuple[str, tuple[Listed, ...]], ...]  # encoder, and its scenes
-    unread: tuple[Listed, ...]
+    groups: tuple[tuple[str, tuple[Indexed, ...]], ...]  # encoder, and its scenes
+    unread: tuple[Indexed, ...]
 
 
-def write_library(index: Path, digests: Sequence[Digest]) -> None:
-    """Write an index, whole or not at all."""
-    groups: list[list[Digest]] = []
-    for each in digests:
+def write_library(index: Path, entries: Sequence[Entry]) -> None:
+    """Write an index, atomically."""
+    groups: list[list[Entry]] = []
+    for each in entries:
         if each.canonical is not None:
             alike = [
                 members for members in groups if members[0].encoder_id == each.encoder_id
@@ -356,14 +356,14 @@ def write_library(index: Path, digests: Sequence[Digest]) -> None:
         tensors[f"{number}.thumbnails"] = np.stack([np.asarray(each.thumbnail) for each in members])
     stated = _Stated(
         tuple((members[0].encoder_id, tuple(each.listed for each in members)) for members in groups),
-        tuple(each.listed for each in digests if each.canonical is None),
+        tuple(each.listed for each in entries if each.canonical is None),
     )
     with atomic_path(index) as temporary:
         save_file(tensors, temporary, {SCENES: msgspec.json.encode(stated, enc_hook=str).decode()})
 
 
 def read_library(index: Path, folder: Path) -> Library:
-    """Return the library that an index describes; InputError or FormatError."""
+    """Return the library in an index; InputError or FormatError."""
     open_for_reading(index)[0].close()  # the same messages for a missing file as everywhere
     try:
         with safe_open(index, framework="numpy") as file:
@@ -379,7 +379,7 @@ def read_library(index: Path, folder: Path) -> Library:
     return Library(folder, tuple(groups), stated.unread, pictures)
 
 
-def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> tuple[EncoderGroup, Array]:
+def _group(file: Any, number: int, encoder: str, scenes: tuple[Indexed, ...]) -> tuple[EncoderGroup, Array]:
     """Return a group and its (S, H, W, 3) thumbnails; ValueError for arrays that do not fit its scenes."""
     canonical, shown = file.get_tensor(f"{number}.canonical"), file.get_tensor(f"{number}.thumbnails")
     columns = Columns(*(file.get_tensor(f"{number}.{name}") for name in KINDS._fields))
@@ -403,7 +403,7 @@ def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> 
     return group, shown
 
 
-# The first pass: fits of a phrase in all scenes of a group.
+# Fits of a phrase in all scenes of a group, from the index.
 
 
 def fits_in(group: EncoderGroup, vector: Array) -> tuple[Array, Array]:
@@ -461,24 +461,24 @@ class Hit(Judged):
 
     path: Path
     judgement: Verdict
-    answer: QueryResult | None = None  # None where only the index was asked
+    answer: QueryResult | None = None  # None: only the index was searched
     metres_per_unit: float | None = None
-    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) that places are relative to
+    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) of positions in the answer
 
     @property
     def margin(self) -> float:
-        """Certainty of the answer, 0 where it begins to count as found, see `Verdict`."""
+        """Margin of the verdict, 0 at the threshold, see `Verdict`."""
         return self.judgement.margin
 
 
 @dataclass(frozen=True, eq=False)
-class Answered:
+class Answers:
     """The answers of all scenes of one encoder to a phrase."""
 
     phrase: str
     encoder_id: str
-    hits: tuple[Hit, ...]  # those asked exactly first, by margin; then the others
-    problem: str = ""  # why nothing was asked
+    hits: tuple[Hit, ...]  # found and weak ones of exact searches first, by margin; then the others
+    problem: str = ""  # why nothing was searched
     unread: tuple[tuple[str, str], ...] = ()  # scenes that could not be opened, and why
 
     def count(self, verdict: Outcome) -> int:
@@ -492,8 +492,11 @@ def find(
     load_encoder: LoadEncoder | None,
     at_most: int = 20,
     progress: Progress = silent,
-) -> list[Answered]:
-    """Return a phrase in every scene, best first; `at_most` scenes of a group are opened and asked."""
+) -> list[Answers]:
+    """Return the answers to a phrase by encoder, best scene first.
+
+    at_most: scenes of each encoder, at most, that are opened and give an answer.
+    """
     return [_ask_group(library, group, phrase, load_encoder, at_most, progress) for group in library.groups]
 
 
@@ -504,13 +507,13 @@ def _ask_group(
     load_encoder: LoadEncoder | None,
     at_most: int,
     progress: Progress,
-) -> Answered:
+) -> Answers:
     key, taught = phrase_key(phrase), {name for scene in group.scenes for name in scene.taught}
     try:
         vectors = {text: _vector(library, group, text, load_encoder) for text in heads(parse(phrase, taught))}
     except EncoderError as error:
         if key not in taught:
-            return Answered(phrase, group.encoder_id, (), str(error))
+            return Answers(phrase, group.encoder_id, (), str(error))
         vectors = {}
     rough = zip(group.scenes, rank(group, vectors), strict=True)
     hits = {scene.path: Hit(library.folder / scene.path, verdict) for scene, verdict in rough}
@@ -529,16 +532,16 @@ def _ask_group(
             unread.append((name, str(error)))
             del hits[name]
             continue
-        vars(answer)["engine"] = None  # or all scenes that are asked would stay in memory
+        vars(answer)["engine"] = None  # else all opened scenes would stay in memory
         exact[name] = Hit(hits[name].path, answer.judgement, answer, scene.metres_per_unit, scene.origin)
     found = [hit for hit in exact.values() if hit.verdict != "not here"]
     others = [hit for hit in (hits | exact).values() if hit not in found]
     ordered = (sorted(some, key=lambda hit: -hit.margin) for some in (found, others))
-    return Answered(phrase, group.encoder_id, tuple(chain(*ordered)), unread=tuple(unread))
+    return Answers(phrase, group.encoder_id, tuple(chain(*ordered)), unread=tuple(unread))
 
 
 def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[Verdict]:
-    """Return the verdict on every scene by the index alone: on the best of some phrases."""
+    """Return the best verdict on every scene, over some phrases, by the index alone."""
     best = [Verdict(False, "chance", -math.inf)] * len(group.scenes)
     kept = kept_calibration(group.encoder_id, group.canonical)
     for text, vector in vectors.items():
@@ -553,8 +556,8 @@ def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[Verdict]:
 def _vector(library: Library, group: EncoderGroup, text: str, load_encoder: LoadEncoder | None) -> Array:
     """Return the (D,) unit vector of a phrase.
 
-    It is the encoder's, checked against the group's canonical vectors, else that of the first phrasebook that
-    has it. Raises EncoderError and, for no phrase, InputError.
+    It is the encoder's, checked against the group's canonical vectors, else that of the first phrasebook with
+    the phrase. Raises EncoderError and, for an empty phrase, InputError.
     """
     dim = group.canonical.shape[1]
     codec = LinearCodec(np.eye(1, dim, dtype=np.float32))

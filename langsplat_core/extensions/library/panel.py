@@ -1,4 +1,4 @@
-"""The panel "Library": the scenes of a folder with thumbnails, ranked by a phrase."""
+"""Panel "Library": the scenes of a folder with thumbnails, ranked by a phrase."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_core.extensions.library.index import THUMBNAIL, Answered, Hit, Library, find, update_library
+from langsplat_core.extensions.library.index import THUMBNAIL, Answers, Hit, Library, find, update_library
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import LoadEncoder
 from langsplat_core.query.rule import Verdict
@@ -29,14 +29,14 @@ THUMBNAIL_EM = 3.6  # height of a thumbnail
 
 @dataclass(frozen=True, eq=False)
 class LibraryView:
-    """The scenes of a folder, as the panel lists them."""
+    """State of the panel."""
 
     library: Library
-    load_encoder: LoadEncoder  # keeps the last one
-    phrase: str = ""  # that they are ranked by; "": by name
-    hits: tuple[Hit, ...] = ()  # the first `MOST_HITS` of the ranked
-    said: str = ""  # how many scenes have it, in words
-    thumbnails: Array | None = None  # (H, W, 3) uint8 of the hits listed, one below the other
+    load_encoder: LoadEncoder  # caches the last encoder
+    phrase: str = ""  # that scenes are ranked by; "": by name
+    hits: tuple[Hit, ...] = ()  # the first `MOST_HITS` scenes
+    said: str = ""  # summary of the answers
+    thumbnails: Array | None = None  # (H, W, 3) uint8 of the listed hits, one below the other
     typed: str = ""
 
 
@@ -44,12 +44,12 @@ UNASKED = Verdict(False, "chance", -math.inf)
 
 
 def library_view(viewer: Viewer) -> LibraryView | None:
-    """Return the library that is open; None before one was chosen."""
+    """Return the state of the panel; None before a folder was chosen."""
     return viewer.state.extension_panels.get(TITLE)
 
 
 def open_library(viewer: Viewer, folder: Path) -> None:
-    """Read the index of a folder, and the scenes that are new there, in the background."""
+    """Update the library of a folder in the background, and show it."""
     load = lru_cache(maxsize=1)(viewer.services.load_encoder)
 
     def done(library: Library) -> None:
@@ -66,20 +66,20 @@ def open_library(viewer: Viewer, folder: Path) -> None:
 
 
 def ask_library(viewer: Viewer, phrase: str) -> None:
-    """Rank the scenes of the library by how certain it is that they have what a phrase names."""
+    """Rank the scenes of the library by a phrase, in the background."""
     view = library_view(viewer)
     if view is None or not phrase.strip():
         return
     library, phrase = view.library, phrase.strip()
 
-    def done(answers: list[Answered]) -> None:
+    def done(answers: list[Answers]) -> None:
         hits = sorted((hit for each in answers for hit in each.hits), key=lambda hit: -hit.margin)
         found = sum(hit.verdict == "found" for hit in hits)
         problems = [each.problem for each in answers if each.problem]
         said = "; ".join([f"'{phrase}': found in {found} of {len(hits)} scenes", *problems])
         _show_hits(viewer, replace(view, phrase=phrase, said=said), hits)
 
-    def work(progress: Progress) -> list[Answered]:
+    def work(progress: Progress) -> list[Answers]:
         return find(library, phrase, view.load_encoder, 0, progress)
 
     viewer.run(f"searching '{phrase}' in {len(library.scenes)} scenes", work, done)
@@ -92,7 +92,7 @@ def _show_hits(viewer: Viewer, view: LibraryView, hits: Sequence[Hit]) -> None:
     viewer.state.extension_panels[TITLE] = replace(view, hits=listed, thumbnails=image)
 
 
-_thumbnails = ui.Picture()  # all of the list, one below the other
+_thumbnails = ui.Picture()  # of the whole list
 
 
 def draw_library(viewer: Viewer) -> None:

@@ -21,7 +21,7 @@ from PIL import Image
 from langsplat_core import __version__
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.agents.commands import MOST_SIDE, Door, scene_files
+from langsplat_core.extensions.agents.commands import MOST_SIDE, SceneTools, scene_files
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from tests.support.fakes import PER_BLOB, named_scene
@@ -46,41 +46,41 @@ def middle(blob: int) -> Array:
 
 
 def test_scenes_of_a_folder_are_those_that_can_be_searched(folder, tmp_path):
-    assert Door(scene_files(folder)).scenes() == ["a.ply", os.path.join("blind", "b.ply")]
+    assert SceneTools(scene_files(folder)).scenes() == ["a.ply", os.path.join("blind", "b.ply")]
     with pytest.raises(InputError, match="no scene with a language field"):
         scene_files(tmp_path)
 
 
 def test_find_answers_in_metres_and_says_what_is_absent(folder):
-    door = Door(scene_files(folder))
-    answer = door.find("mug", "a.ply")
+    tools = SceneTools(scene_files(folder))
+    answer = tools.find("mug", "a.ply")
     assert (answer["verdict"], answer["unit"]) == ("found", "m")
     np.testing.assert_allclose(answer["place"], 2 * middle(0), atol=0.3)
-    assert door.count("mug", "a.ply")["least"] >= 1
-    apart = door.distance("mug", "book", "a.ply")
+    assert tools.count("mug", "a.ply")["least"] >= 1
+    apart = tools.distance("mug", "book", "a.ply")
     assert 0 < apart["distance"] < 2 * np.linalg.norm(middle(0) - middle(1))
-    without_metres = door.distance("mug", "book", os.path.join("blind", "b.ply"))
+    without_metres = tools.distance("mug", "book", os.path.join("blind", "b.ply"))
     assert apart["distance"] == pytest.approx(2 * without_metres["distance"])
     with pytest.raises(InputError, match=r"is not among these 2: a\.ply"):
-        door.find("mug", "../a.ply")
+        tools.find("mug", "../a.ply")
     with pytest.raises(InputError, match="is not among these 2"):
-        door.find("mug")  # which of them?
+        tools.find("mug")  # which of them?
 
 
 def test_images_are_of_what_was_asked_for(folder):
-    door = Door(scene_files(folder))
-    image, said = door.look(camera=1, scene="a.ply")
+    tools = SceneTools(scene_files(folder))
+    image, said = tools.look(camera=1, scene="a.ply")
     assert image.shape[:2] == (SCENE.cameras[1].height, SCENE.cameras[1].width)
-    towards, _ = door.look("mug", scene=os.path.join("blind", "b.ply"))
+    towards, _ = tools.look("mug", scene=os.path.join("blind", "b.ply"))
     assert max(towards.shape) <= MOST_SIDE
     assert towards.max() > 0
     for number, camera in enumerate(SCENE.cameras):  # the one asked for, also with a phrase
-        _, said = door.look("mug", number, "a.ply")
-        (pixel,), _ = camera.project(np.array(door.find("mug", "a.ply")["place"])[None] / 2)
+        _, said = tools.look("mug", number, "a.ply")
+        (pixel,), _ = camera.project(np.array(tools.find("mug", "a.ply")["place"])[None] / 2)
         at = re.fullmatch(rf"by camera {number} {camera.name}, .*; mug: found, .* m, pixel (\d+) (\d+)", said)
         np.testing.assert_allclose([float(at[1]), float(at[2])], pixel, atol=1)
     with pytest.raises(InputError, match="has cameras 0 to"):
-        door.look(camera=99, scene="a.ply")
+        tools.look(camera=99, scene="a.ply")
 
 
 def test_a_client_asks_over_standard_input_and_output(folder):
