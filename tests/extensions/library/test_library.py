@@ -19,9 +19,9 @@ from langsplat_core.extensions.library.changes import Change, changes, colour_te
 from langsplat_core.extensions.library.index import (
     INDEX,
     SCENES,
-    digest,
     find,
     fits_in,
+    read_entry,
     read_library,
     scenes_in,
     update_library,
@@ -416,7 +416,7 @@ LIKE = 0.1  # spreads and logits within which 8 bits of a codeword may tip a ver
 def index_verdicts(engine: QueryEngine, phrases: list[str], folder: Path) -> Iterator[tuple[Any, Any]]:
     path = folder / "scene.ply"
     save_scene(path, engine.scene)
-    write_library(folder / "index", [digest(path, path.name, load_text_encoder)])
+    write_library(folder / "index", [read_entry(path, path.name, load_text_encoder)])
     group = read_library(folder / "index", folder).groups[0]
     (scene,) = group.scenes
     for phrase in phrases:
