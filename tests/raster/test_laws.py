@@ -29,7 +29,7 @@ from langsplat_core.raster.reference import colours as true_colours
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians
 from tests.support.backends import Backend, Measure, assert_adjoint
-from tests.support.hard_cases import CASES, HUGE_IMAGE, ROW, Case, Drawing, Seen, altered, balls, crowd, draw
+from tests.support.hard_cases import CASES, ROW, Case, Drawing, Seen, altered, balls, crowd, draw
 from tests.support.scenes import DEMO, random_camera, random_gaussians, random_values, without_perspective
 
 Drawn = tuple[Gaussians, Camera, RasterSettings]
@@ -71,24 +71,6 @@ def over_random_cases(law: Callable[[Drawn], None], slow: bool, few: int = 25) -
 @pytest.fixture
 def slow(request: pytest.FixtureRequest) -> bool:
     return bool(request.config.getoption("--slow"))
-
-
-@pytest.mark.long
-def test_images_are_finite_and_alpha_is_in_0_to_1(backend: Backend, slow: bool) -> None:
-    """Values in [0, 1] give an image in [0, alpha], and the weights of a pixel add up to alpha."""
-
-    def law(case: Drawn) -> None:
-        n, view = len(case[0]), backend.raster.view(*case)
-        image, alpha = view.splat(np.column_stack([random_values(n, 2), np.ones(n, np.float32)]))
-        assert np.isfinite(image).all()
-        assert alpha.min() >= 0
-        assert alpha.max() <= (1 - 0.99e-4 if backend.stops_early else 1)
-        assert image.min() >= 0
-        assert (image.max(-1) <= alpha + 1e-6).all()
-        np.testing.assert_allclose(image[..., 2], alpha, atol=1e-12 if backend.name == "reference" else 2e-6)
-        assert np.isfinite(view.depth()).all()
-
-    over_random_cases(law, slow)
 
 
 def test_splat_is_linear(backend: Backend, slow: bool) -> None:
@@ -369,16 +351,11 @@ def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
 
 
 @pytest.mark.slow
-def test_huge_images_are_drawn(backend: Backend, measured: Measure) -> None:
-    HUGE_IMAGE.check(run_case(HUGE_IMAGE, HUGE_IMAGE.build(), backend, measured))
-
-
-@pytest.mark.slow
 def test_too_many_tile_intersections_are_refused() -> None:
     """17000 Gaussians that fill 129600 tiles each: one line, before any memory is asked for."""
     gaussians = balls(np.linspace(2.0, 3.0, 17_000), 0.1, 1e6)
     with pytest.raises(BackendError, match="smaller"):
-        load_rasterizer("cpu").view(gaussians, HUGE_IMAGE.build().camera)
+        load_rasterizer("cpu").view(gaussians, Camera(7680, 4320, 6000.0, 6000.0, 3840.0, 2160.0, np.eye(4)))
 
 
 # The bundled scene, real scenes, and the corner of a large image.
@@ -433,10 +410,12 @@ def corner_case(width: int, height: int) -> tuple[Gaussians, Camera, Camera]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("size", [(1920, 1080), pytest.param((3840, 2160), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("size", [(1920, 1080), pytest.param((7680, 4320), marks=pytest.mark.slow)])
 def test_far_corner_of_a_large_image(fast_backend: Backend, measured: Measure, size: tuple[int, int]) -> None:
     """Pixel positions are largest there, and a float32 has the fewest digits left for the fraction: gsplat
     draws what has means rounded once, OpenGL is off by 5e-8 per pixel of the image's width."""
+    if fast_backend.name == "cuda-twin" and size[0] > 1920:
+        pytest.skip("too long for this backend")
     gaussians, camera, corner = corner_case(*size)
     x = random_values(len(gaussians), 3)
     settings, start = fast_backend.expected_settings(INRIA), np.array(size) - (40, 30)

@@ -244,22 +244,6 @@ def _crop_of(width: int, height: int, left: int, top: int) -> Case:
     return Case(name, "a crop is a part of the whole", build, check)
 
 
-def _huge_image() -> Drawing:
-    camera = Camera(7680, 4320, 6000.0, 6000.0, 3840.0, 2160.0, np.eye(4))
-    x = np.array([-1.9, 1.9, -1.9, 1.9, 0.0])
-    y = np.array([-1.07, -1.07, 1.07, 1.07, 0.0])
-    return Drawing(balls([3.0] * 5, 0.9, 0.01, x, y), camera, values=np.ones((5, 1), np.float32))
-
-
-def _right_to_the_corners(seen: Seen) -> None:
-    wide = seen.drawing.camera
-    for left, top in ((0, 0), (7640, 0), (0, 4290), (7640, 4290), (3820, 2145)):
-        camera = replace(wide, width=40, height=30, cx=wide.cx - left, cy=wide.cy - top)
-        crop = seen.again(camera=camera)
-        assert crop.alpha.max() > 0.1
-        np.testing.assert_allclose(crop.alpha, seen.alpha[top : top + 30, left : left + 40], atol=2e-3)
-
-
 def _in_half(seen: Seen) -> None:
     gaussians = seen.drawing.gaussians
     half = [getattr(gaussians, field.name).astype(np.float16) for field in fields(gaussians)]
@@ -440,9 +424,4 @@ CASES: tuple[Case, ...] = (
     Case("energy at an eighth of the resolution", "antialiased 1/64, otherwise the dilation's share more",
          lambda: Drawing(balls(3.0, 0.9, 0.4, x=0.1), Camera(120, 120, 60.0, 60.0, 60.0, 60.0, np.eye(4))),
          _energy),
-)  # fmt: skip
-
-HUGE_IMAGE = Case(
-    "an image of 7680x4320", "every corner is as if drawn alone", _huge_image, _right_to_the_corners,
-    compare=False, only=("cpu", "opengl-half"),
 )  # fmt: skip

@@ -148,10 +148,7 @@ def refuse(path: Path, work: Path) -> str:
     """The one line with which `path` is refused."""
     with pytest.raises(InputError) as caught:
         load_capture(path, CONFIG, work)
-    message = str(caught.value)
-    assert message
-    assert "\n" not in message
-    return message
+    return str(caught.value)
 
 
 def write_picture(path: Path, size: tuple[int, int] = (40, 30), seed: int = 0) -> None:

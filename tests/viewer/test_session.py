@@ -502,9 +502,8 @@ def test_project_with_impossible_values_is_refused(saved):
     broken.append({**top, "intrinsics": endless})
     for content in ({"format": "other"}, {**top, "version": 3}, [], {**top, "gaussians": 10**12}, *broken):
         saved.write_text(json.dumps(content))
-        with pytest.raises(LangSplatError) as raised:
+        with pytest.raises(LangSplatError):
             read_project(saved)
-        assert "\n" not in str(raised.value)
 
 
 def test_notes_are_pinned_edited_and_removed(opened):

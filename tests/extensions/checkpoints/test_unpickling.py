@@ -59,20 +59,14 @@ def rebuilt(
 
 
 NUMBERS = {  # of NumPy, which are passed over whatever they state
-    "scalar of size -8": scalar(kind("S8", (3, "|", None, None, None, -8, 1, 0))),
     "scalar of objects": scalar(kind("O", (3, "|", None, None, None, -1, -1, 63))),
-    "scalar of a far field": scalar(
-        kind("f8", (3, "<", None, ("a",), {"a": (kind("f8"), 2**40)}, -1, -1, 0))
-    ),
     "scalar of many": scalar(kind("f8", (3, "<", (kind("f8"), (2**40,)), None, None, -1, -1, 0))),
     "scalar of the class": scalar(np.dtype),
-    "scalar of a list": scalar(Crafted(np.dtype, [("a", "O")], False, True)),
     "scalar without data": scalar(kind("f8"), None),
     "array of 2^40": Crafted(np.ndarray, (2**40,)),
     "array of addresses": array(1, (1,), kind("O"), False, EIGHT),
     "array of attributes": Crafted(np.ndarray, FIT, state={"values": 1, "shape": (2**40,)}),
     "array of less": array(1, (-4, -3), F8, False, EIGHT),
-    "text of no characters": scalar(kind("U2"), b"\xff" * 8),
 }
 TENSORS = {
     **{f"offset {offset}": rebuilt(offset=offset) for offset in (1, -1, 12, 2**62, -(2**63), 2**63)},
@@ -100,13 +94,8 @@ def sparse(layout: torch.layout, *parts: Any) -> Crafted:
 FAR = torch.tensor([[10**12, -5, 3], [7, 10**15, -1]])
 NAMES = {  # of other tensors, and of what makes them, all of which torch alone would call
     "COO": sparse(torch.sparse_coo, FAR, torch.ones(3), FIT),
-    "CSR": sparse(torch.sparse_csr, FAR.ravel()[:5], FAR.ravel()[:3], torch.ones(3), FIT),
-    "sparse class": Crafted(torch.sparse.FloatTensor, FAR, torch.ones(3), FIT),
-    "quantised": Crafted(torch._utils._rebuild_qtensor, FLOATS, 0, FIT, (3, 1), (), False, None),  # noqa: SLF001
-    "nested": Crafted(torch._utils._rebuild_nested_tensor, FLOATS, FAR, FAR, FAR[0]),  # noqa: SLF001
     "meta": torch.ones(FIT, device="meta"),
     "complex": torch.ones(FIT, dtype=torch.complex64),
-    "wide": torch.ones(FIT, dtype=torch.uint16),
     "uninitialised": Crafted(torch.FloatTensor, 4, 3),
     "huge": Crafted(bytearray, 2**40),
     "renamed": Crafted(torch._tensor._rebuild_from_type_v2, complex, torch.Tensor, (), {"numel": complex}),  # noqa: SLF001

