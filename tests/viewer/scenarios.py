@@ -369,6 +369,8 @@ def use_the_mouse_alone(s: Any) -> None:
     x, y = s.ctx.item_info("//**/Scale").rect_full.get_center()
     s.drag((x, y), (x + 60, y))
     assert s.state.edit_form.scale > 1.05
+    s.drag((x - 30, y - 60), (x + 30, y - 60))  # the first number of "Move"
+    assert 0.01 < s.state.edit_form.move[0] / s.state.extent.radius < 0.1
     (s.folder / "within").mkdir()
     s.menu("File", "Open a scene ...")
     for name in ("within\\/", ".. (the folder above)", "plain.ply", "Open"):

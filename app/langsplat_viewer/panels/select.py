@@ -195,16 +195,17 @@ def draw_transform(viewer: Viewer) -> None:
     if kind != state.edit_form.gizmo:
         editing.set_gizmo(viewer, kind)
     form = state.edit_form
-    move = _three("Move", form.move, "World units along x, y and z")
-    rotate = _three("Rotate", form.rotate, "Degrees about x, then y, then z, right-handed")
+    step = NEAR * (1.0 if state.extent is None else state.extent.radius)  # per pixel that is dragged
+    move = _three("Move", form.move, step, "World units along x, y and z")
+    rotate = _three("Rotate", form.rotate, 0.5, "Degrees about x, then y, then z, right-handed")
     ui.leave_room("Scale", 12)
     _, scale = imgui.drag_float("Scale", form.scale, 0.005, format="%.5g")
     settings.put(state, edit_form=replace(form, move=move, rotate=rotate, scale=scale))
     if ui.button("Apply", "Scale and rotate about the middle of what is transformed, then move"):
         editing.apply_form(viewer)
     imgui.separator()
-    low = _three("From", form.low, "A corner of the box, world units from the scene's origin")
-    high = _three("To", form.high, "The opposite corner")
+    low = _three("From", form.low, step, "A corner of the box, world units from the scene's origin")
+    high = _three("To", form.high, step, "The opposite corner")
     if (low, high) != (form.low, form.high):
         editing.set_box(viewer, low, high)
     if ui.button("Fit", "The box around the selection, or around everything"):
@@ -216,9 +217,9 @@ def draw_transform(viewer: Viewer) -> None:
         ui.tip(f"Delete the {outside:,} Gaussians outside the box; the file stays as it is")
 
 
-def _three(label: str, values: Point, what: str) -> Point:
+def _three(label: str, values: Point, step: float, what: str) -> Point:
     ui.leave_room(label, 16)
-    _, (x, y, z) = imgui.drag_float3(label, list(values), 0.005, format="%.5g")
+    _, (x, y, z) = imgui.drag_float3(label, list(values), step, format="%.5g")
     ui.tip(what)
     return x, y, z
 
