@@ -8,9 +8,11 @@ opens without the code of extensions. What cannot be loaded costs one warning an
 import logging
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from itertools import product
+from types import MappingProxyType
 from typing import Any, Literal
 
 from langsplat_core.errors import InputError, printable_line, shortened
@@ -24,6 +26,11 @@ Kind = Literal[
     "layouts", "mask_sources", "panels",
 ]  # fmt: skip
 References = Mapping[str, str]
+# Classes of parts by their names; commands are dataclasses with `run`, all others functions.
+CLASSES: References = MappingProxyType({
+    "formats": "SceneFormat", "importers": "Importer", "exporters": "Exporter", "encoders": "Family",
+    "panels": "Panel",
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,15 +55,27 @@ def extensions() -> Mapping[str, Extension]:
     """Return the extensions that are installed, by the names of their entry points, sorted.
 
     Those that the environment variable `LANGSPLAT_WITHOUT` names are left out, and so are, with a warning,
-    those that cannot be imported.
+    those that cannot be imported, and of two extensions or parts of one name the second.
     """
     hidden = {name.strip() for name in os.environ.get(HIDDEN, "").split(",")}
-    points = {point.name: point for point in entry_points(group=GROUP) if point.name not in hidden}
-    found = {name: _loaded(f"extension {name}", points[name]) for name in sorted(points)}
-    for name, extension in found.items():
-        if extension is not None and not isinstance(extension, Extension):
+    points: dict[str, EntryPoint] = {}
+    for point in entry_points(group=GROUP):
+        if points.setdefault(point.name, point) != point:
+            _warn(f"extension {point.name} ({point.value})", f"{points[point.name].value} has its name")
+    found: dict[str, Extension] = {}
+    for name in sorted(points.keys() - hidden):
+        extension = _loaded(f"extension {name}", points[name])
+        if isinstance(extension, Extension):
+            found[name] = extension
+        elif extension is not None:
             _warn(f"extension {name}", f"its entry point is a {type(extension).__name__}, not an Extension")
-    return {name: extension for name, extension in found.items() if isinstance(extension, Extension)}
+    owners: dict[tuple[str, str], str] = {}
+    for name, kind in product(found, (kind.name for kind in fields(Extension))):
+        for one in getattr(found[name], kind):
+            if (owner := owners.setdefault((kind, one), name)) != name:
+                has = f"extension {owner} has it among its {kind}, too"
+                _warn(f"{one!r} of extension {name}", f"{has}; {HIDDEN}={owner} hides that")
+    return found
 
 
 def references(kind: Kind) -> References:
@@ -69,11 +88,9 @@ def references(kind: Kind) -> References:
 
 def part(kind: Kind, name: str) -> Any:
     """Return one part of an extension; InputError where there is none of that name or it is broken."""
-    known = references(kind)
-    if name not in known:
+    if name not in (known := references(kind)):
         raise InputError(f"no extension has {name!r} among its {kind}; known: {shortened(known) or 'none'}")
-    found = _imported(kind, name, known[name])
-    if found is None:
+    if (found := _imported(kind, name, known[name])) is None:
         raise InputError(f"{name!r} cannot be used: its extension is broken; mend or remove it")
     return found
 
@@ -86,7 +103,14 @@ def parts(kind: Kind) -> Mapping[str, Any]:
 
 @cache
 def _imported(kind: Kind, name: str, where: str) -> Any:
-    return _loaded(f"extension's {kind} {name}", EntryPoint(name, where, GROUP))
+    what = f"extension's {kind} {name}"
+    found, wanted = _loaded(what, EntryPoint(name, where, GROUP)), CLASSES.get(kind, "function")
+    fits = type(found).__name__ == wanted if kind in CLASSES else callable(found)
+    if kind == "commands":
+        fits, wanted = is_dataclass(found) and hasattr(found, "run"), "dataclass with `run`"
+    if found is not None and not fits:
+        _warn(what, f"{where} is no {wanted}; see docs/extensions.md")
+    return found if fits else None
 
 
 def _loaded(what: str, point: EntryPoint) -> Any:

@@ -8,8 +8,10 @@ import shutil
 import subprocess
 import sys
 from contextlib import suppress
+from importlib.metadata import EntryPoint
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numba
@@ -349,6 +351,30 @@ def test_broken_part_is_refused_when_it_is_asked_for(monkeypatch: pytest.MonkeyP
     assert registry.parts("exporters") == {}
     with pytest.raises(registry.InputError, match="broken"):
         registry.part("exporters", "broken")
+
+
+def test_names_taken_and_misfits_are_said(monkeypatch: pytest.MonkeyPatch, caplog) -> None:
+    """Two extensions of one name, two parts of one, no Exporter; a group may do without a sentence."""
+    part = registry.Extension(commands={"hail": "json:load", "greet one": "json:load"})
+    other = registry.Extension(commands={"hail": "json:dump"}, exporters={"odd": "json:load"})
+    monkeypatch.setitem(sys.modules, "two", SimpleNamespace(A=part, B=other))
+    points = [EntryPoint(name, f"two:{what}", registry.GROUP) for name, what in ("aA", "aB", "bB")]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    monkeypatch.setattr(registry, "extensions", registry.extensions.__wrapped__)
+    assert [*registry.extensions()] == ["a", "b"]
+    assert [line.partition(" is left out: ")[::2] for line in caplog.messages] == [
+        ("extension a (two:B)", "two:A has its name"),
+        (
+            "'hail' of extension b",
+            "extension a has it among its commands, too; LANGSPLAT_WITHOUT=a hides that",
+        ),
+    ]
+    for kind, name in (("commands", "hail"), ("exporters", "odd")):
+        with pytest.raises(InputError, match="cannot be used: its extension is broken"):
+            registry.part(kind, name)
+    assert caplog.messages[-1].endswith("json:load is no Exporter; see docs/extensions.md")
+    with pytest.raises(InputError, match="no command 'greet two'; there are one"):
+        parse(["greet", "two"])
 
 
 @pytest.mark.parametrize("hidden", OWN)

@@ -36,7 +36,7 @@ def parse(args: list[str]) -> Runnable:
     args = [*args[1:], "--help"] if args[:1] == ["help"] else args
     check_commands(args)
     commands: dict[str, Any]
-    groups, name = registry.references("groups"), args[0] if args else ""
+    groups, name = _groups(), args[0] if args else ""
     if name == "train":
         from langsplat_core.cli.train import train_command, with_file
 
@@ -73,20 +73,25 @@ def load_command(name: str) -> type[Runnable]:
     return getattr(import_module(f"langsplat_core.cli.{module}"), kind)
 
 
+def _groups() -> Mapping[str, str]:
+    """Return what the commands of each group do, by its name; "" where no extension says it."""
+    unsaid = {name.split(" ")[0]: "" for name in registry.references("commands") if " " in name}
+    return {**unsaid, **registry.references("groups")}
+
+
 def _group(name: str, words: Sequence[str] = ()) -> Any:
     """Return a group's commands, or only the one that `words` begins with."""
     members = _members(name)
     named = [word for word in words if word in members] or members
     made = _union({member: load_command(f"{name} {member}") for member in named})
     group = make_dataclass("Group", [("command", Annotated[made, tyro.conf.arg(name="")])])
-    group.__doc__ = registry.references("groups")[name]
+    group.__doc__ = _groups()[name]
     return group
 
 
 def _members(group: str) -> list[str]:
     """Return the names of a group's commands, without the group's own."""
-    every = registry.references("commands")
-    return [name.partition(" ")[2] for name in every if name.startswith(f"{group} ")]
+    return [name.split(" ")[1] for name in registry.references("commands") if name.startswith(f"{group} ")]
 
 
 def _union(commands: Mapping[str, Any]) -> Any:
@@ -97,7 +102,7 @@ def _union(commands: Mapping[str, Any]) -> Any:
 
 def check_commands(args: Sequence[str]) -> None:
     """Raise InputError for a command that does not exist, naming those with a similar spelling."""
-    groups = registry.references("groups")
+    groups = _groups()
     known: Iterable[str] = (*(name for name in command_names() if " " not in name), *groups)
     for place, word in enumerate(args[:2]):
         if word.startswith("-"):
@@ -115,5 +120,4 @@ def check_commands(args: Sequence[str]) -> None:
 
 def entry() -> None:
     """Run the `langsplat` console script."""
-    args = sys.argv[1:] or ["--help"]
-    sys.exit(main("langsplat", lambda: parse(args)))
+    sys.exit(main("langsplat", lambda: parse(sys.argv[1:] or ["--help"])))

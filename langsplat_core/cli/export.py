@@ -151,8 +151,7 @@ class Convert:
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {described}")
 
     def _read(self) -> Scene:
-        importer = self._importer()
-        if importer is not None and self.rematch is not None:
+        if (importer := self._importer()) is not None and self.rematch is not None:
             raise InputError("--rematch is for one scene; import the checkpoints, then rematch those")
         if importer is not None:
             request = ImportRequest(self.sources, self.encoder, self.levels, self.phrases, self.codec)
@@ -189,7 +188,7 @@ class Convert:
         exporter: Exporter = registry.part("exporters", self.to)
         check_output_folder(self.out)
         scene = replace(self._read(), path=self.source)
-        report_left_out(self.out, scene, "checkpoints", exporter.loses, f"*{ORIGIN_SUFFIX}")
+        report_left_out(self.out, scene, f"files of --to {self.to}", exporter.loses, f"*{ORIGIN_SUFFIX}")
         with TerminalProgress() as progress:
             lines = exporter.write(scene, self.out, progress)
         print(*lines, sep="\n")

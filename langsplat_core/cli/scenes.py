@@ -68,8 +68,7 @@ def _lines(a: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("extra properties", ", ".join(a["extras"]) or "none"),
         ("cameras", f"{a['cameras']}" if a["cameras"] else "none"),
     ]
-    field = a["language"]
-    if field is None:
+    if (field := a["language"]) is None:
         return [*lines, ("language field", "none")]
     observed = ", ".join(f"{name} {100 * share:.1f} %" for name, share in field["observed"].items())
     megabytes = field["bytes"] / 1e6

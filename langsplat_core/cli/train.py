@@ -138,8 +138,7 @@ def train_command(args: Sequence[str]) -> type[Train]:
 
 def with_file(args: Sequence[str]) -> list[str]:
     """Return the words of `langsplat train ...` behind those of --config's file; InputError names its key."""
-    name = named(args, "--config")
-    if not name:
+    if not (name := named(args, "--config")):
         return list(args)
     text, complaint = read_text(Path(name)), io.StringIO()
     try:

@@ -53,11 +53,9 @@ def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Pr
         raise InputError(f"{shown(path)} does not exist; expected {ACCEPTED}")
     try:
         listed = [path] if path.suffix.lower() == ".json" else [path / name for name in TRANSFORMS]
-        frames = next(filter(Path.is_file, listed), None)
-        if frames is not None:
+        if (frames := next(filter(Path.is_file, listed), None)) is not None:
             return centred(load_nerfstudio(frames, config, progress))
-        model = find_model(path)
-        if model is not None:
+        if (model := find_model(path)) is not None:
             return centred(load_colmap(path, model, config, progress))
         if is_video(path):
             path = kept_frames(path, config.frames, work, progress)

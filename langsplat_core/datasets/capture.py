@@ -280,8 +280,7 @@ def _report(told: Sequence[tuple[str, str]], masks: Sequence[Array | None]) -> N
 
 def _cut_out(masks: Sequence[Array | None], alphas: Sequence[Array | None], config: DatasetConfig) -> bool:
     """Return True if transparent pixels are empty background, and report how transparency is taken."""
-    seen = sum(alpha is not None for alpha in alphas)
-    if not seen:
+    if not (seen := sum(alpha is not None for alpha in alphas)):
         return False
     cut_out = config.alpha == "background" or (
         config.alpha == "auto" and 2 * sum(map(_is_cut_out, alphas)) > len(alphas)

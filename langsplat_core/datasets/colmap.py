@@ -92,8 +92,7 @@ def model_suffix(folder: Path) -> str | None:
 
 def read_model(folder: Path) -> SparseModel:
     """Return the model in `folder`; binary is preferred. FormatError names the file that is broken."""
-    suffix = model_suffix(folder)
-    if suffix is None:
+    if (suffix := model_suffix(folder)) is None:
         raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
     lenses, images = _content(folder / f"cameras{suffix}"), _content(folder / f"images{suffix}")
     last = {image.name: image for image in images}

@@ -83,8 +83,7 @@ def coded_as(stored: Image.Image) -> tuple[float, Any] | None:
 
 def _cicp(stored: Any) -> tuple[int, int] | None:
     """Return transfer function and primaries of an opened PNG's chunk cICP, which Pillow ignores."""
-    file = stored.fp
-    if file is None:
+    if (file := stored.fp) is None:
         return None
     place = file.tell()
     file.seek(8)

@@ -150,8 +150,7 @@ def _photo_file(find: Callable[[str], Path], label: str) -> Path:
 
 def _mask_file(find: Callable[[str], Path], frame: Json) -> Path | None:
     """Return the file of a frame's "mask_path"; ValueError where there is none."""
-    label = frame.get("mask_path")
-    if label is None:
+    if (label := frame.get("mask_path")) is None:
         return None
     if not isinstance(label, str) or not os.path.isfile(find(label)):
         raise ValueError(f'"mask_path" names no file: {reprlib.repr(label)}')

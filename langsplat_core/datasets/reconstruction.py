@@ -61,8 +61,7 @@ def extract_features(folder: Path, groups: Sequence[workspace.CameraGroup], prog
         if (folder / workspace.MASKS).is_dir():
             reader.mask_path = folder / workspace.MASKS
         readers.append(reader)
-        lacking = [name for name in group.names if name not in known]
-        if lacking:
+        if lacking := [name for name in group.names if name not in known]:
             mode = pycolmap.CameraMode.SINGLE
             pycolmap.import_images(**paths, camera_mode=mode, image_names=lacking, options=reader)
     with opened(folder) as database:

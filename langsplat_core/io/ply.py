@@ -89,8 +89,7 @@ class PlyFile:
         head = file.read(HEADER_LIMIT)
         if head[:4] not in (b"ply\n", b"ply\r"):
             raise malformed(path, "is not a PLY file (it does not begin with the line 'ply')")
-        end = re.search(rb"\n[ \t]*end_header[ \t\r]*\n", head)
-        if end is None:
+        if (end := re.search(rb"\n[ \t]*end_header[ \t\r]*\n", head)) is None:
             raise malformed(path, f"truncated: no 'end_header' line in the first {len(head)} bytes")
         self.header_size = end.end()  # bytes
         self._format = ""
@@ -448,8 +447,7 @@ def _said(comments: Sequence[str], tell: Tell) -> tuple[bool, float | None]:
                 tell(f"comment {quoted(comment)} not understood")
     if any(len(set(said)) > 1 for said in (marks, lengths)):
         tell("its comments differ, and the last of a kind counts")
-    metres = lengths[-1] if lengths else None
-    if metres is not None and not 0 < metres < math.inf:
+    if (metres := lengths[-1] if lengths else None) is not None and not 0 < metres < math.inf:
         tell(f"{METRES} is no positive number, and counts as unknown")
         metres = None
     return bool(marks and marks[-1]), metres
@@ -518,8 +516,7 @@ def _read_compressed(ply: PlyFile, vertex: PlyElement, tell: Tell) -> tuple[Gaus
     tell(unread("properties", others))
     position, rotation, scale, colour = _codes(ply, vertex, PACKED, "u4").T
     rest = np.zeros((vertex.count, 3, 0))
-    element = ply.elements.get("sh")
-    if element is not None and element.numbers:
+    if (element := ply.elements.get("sh")) is not None and element.numbers:
         width = len(element.numbers)
         if element.count != vertex.count or width not in REST_COUNTS:
             what = f"element sh has {element.count} rows of {width}"

@@ -160,8 +160,7 @@ def _read(path: Path, read: Reader | None = None) -> Scene:
     """Return the content of the scene's own file, and report rows that cannot be drawn."""
     if not os.path.exists(path):
         raise InputError(f"{path}: no such file; check the spelling and the folder")
-    row = format_of(path)
-    if row is None and path.is_dir():
+    if (row := format_of(path)) is None and path.is_dir():
         inside = sorted(path.glob("**/*.ply"))
         hint = f"; perhaps {inside[-1]}" if inside else ""
         raise InputError(f"{path}: a folder without {META_NAME} is not a scene{hint}")

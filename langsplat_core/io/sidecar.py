@@ -245,8 +245,7 @@ def _field(tensors: dict[str, Array], about: dict[str, Any]) -> LanguageField:
 
 
 def _taught(tensors: dict[str, Array], about: dict[str, Any]) -> tuple[TaughtWord, ...]:
-    stated = about.get("taught", [])
-    if not stated:
+    if not (stated := about.get("taught", [])):
         return ()
     vectors, rivals = tensors["taught"], tensors["taught.rivals"]
     check_array("taught", vectors, (sum(count for *_, count in stated), "D"))

@@ -227,8 +227,7 @@ def views(scene: Scene, first: Sequence[Camera] = ()) -> tuple[Camera, ...]:
     """Return the views of a page: `first` and the scene's cameras; without any, one that holds it."""
     step = -(-len(scene.cameras) // 200)  # views at most
     others = (camera for camera in scene.cameras[:: step or 1] if camera not in first)
-    kept = tuple(camera for camera in (*first, *others) if not camera.orthographic)
-    if kept:
+    if kept := tuple(camera for camera in (*first, *others) if not camera.orthographic):
         return kept
     camera = scene.framing_camera((1280, 800))
     matrix = camera.world_to_camera.copy()

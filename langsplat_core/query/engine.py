@@ -346,8 +346,7 @@ class QueryEngine:
         if fresh:
             encoder = self.load_encoder(progress)
             with self._turn:
-                unknown = dict.fromkeys(word for key in fresh for word in encoder.unknown_words(key))
-                if unknown:
+                if unknown := dict.fromkeys(word for key in fresh for word in encoder.unknown_words(key)):
                     near = {word: encoder.near_words(word) for word in unknown}
                     raise UnknownWordError(near, "use other words, or a scene made with OpenCLIP weights")
                 self._encode(encoder, fresh)
@@ -437,8 +436,7 @@ class QueryEngine:
                 f"'{tidied[:LONGEST_NAME]}' cannot be a name; give one of at most {LONGEST_NAME} characters, "
                 "without commas and semicolons, such as 'grandma's vase'"
             )
-        known = self.taught.get(phrase_key(name))
-        if known is not None and len(known.vectors) >= MOST_SHOWN:
+        if (known := self.taught.get(phrase_key(name))) is not None and len(known.vectors) >= MOST_SHOWN:
             raise InputError(f"'{tidied}' was shown {MOST_SHOWN} times, which is the most; remove it first")
         if known is not None and level not in ("auto", LEVELS[known.level]):
             raise InputError(f"'{tidied}' was taught at level {LEVELS[known.level]}; teach it there again")

@@ -187,8 +187,7 @@ def find_wholes(
     seen, owner = surface_weights(gaussians)[every] > 0, wholes[every]
     if (owner[seen] == NO_NODE).any():
         return None
-    own = [every[seen & (owner == whole)] for whole in np.unique(owner[seen])]
-    if not own:
+    if not (own := [every[seen & (owner == whole)] for whole in np.unique(owner[seen])]):
         return ()
     label_of = np.full(int(wholes.max()) + 2, -1)  # the last entry is what -1, no whole, indexes
     label_of[[wholes[rows[0]] for rows in own]] = np.arange(len(own))

@@ -39,11 +39,8 @@ def tokens(text: str) -> tuple[str, ...]:
     """Return the words of a text, without punctuation around them, and its commas, none at the end."""
     text = "".join(" " if unicodedata.category(mark) in ("Cc", "Cs") else mark for mark in _composed(text))
     text = re.sub(r"(?<=\w)\s+'s\b", "'s", text)
-    found = []
-    for piece in re.findall(r",|[^\s,;]+", text):
-        word = "," if piece == "," else _bare(piece)
-        if word:
-            found.append(word)
+    pieces = ("," if piece == "," else _bare(piece) for piece in re.findall(r",|[^\s,;]+", text))
+    found = list(filter(None, pieces))
     while found and found[-1] == ",":
         found.pop()
     return tuple(found)

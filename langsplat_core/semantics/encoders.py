@@ -189,8 +189,7 @@ class PhraseEncoder:
     def _check(self, text: str) -> None:
         if not WORD.search(text):
             raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'blue gift'")
-        unknown = self.unknown_words(text)
-        if unknown:
+        if unknown := self.unknown_words(text):
             words = sorted(self.words or ())
             examples = ", ".join(words[:: len(words) // 12 + 1])
             raise UnknownWordError(
@@ -382,8 +381,7 @@ def _special_token(weights: Weights, tokenizer: Any, role: str, usual: tuple[str
     with suppress(OSError, ValueError, AttributeError, RecursionError):
         stated = json.loads((weights.folder / "tokenizer_config.json").read_bytes()).get(role)
     for token in (stated.get("content") if isinstance(stated, dict) else stated, *usual):
-        number = tokenizer.token_to_id(token) if isinstance(token, str) else None
-        if number is not None:
+        if (number := tokenizer.token_to_id(token) if isinstance(token, str) else None) is not None:
             return int(number)
     raise EncoderError(f"{weights.id}: its tokenizer has no {role}, such as {usual[0]}")
 

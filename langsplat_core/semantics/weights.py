@@ -60,8 +60,7 @@ def open_weights(model: str, path: Path, device: str) -> Weights:
     file = path if path.is_file() else next(path / name for name in OPEN_CLIP if (path / name).is_file())
     layouts: Mapping[str, Layout] = registry.parts("layouts")
     for layout in layouts.values():
-        converted = layout(model, file)
-        if converted is not None:
+        if (converted := layout(model, file)) is not None:
             return Weights(model, file.parent, device, converted)
     raise EncoderError(
         f"{model}: its weights are of no layout known here ({'; '.join(layouts) or 'none'}); for another "

@@ -268,8 +268,7 @@ def test_paths_are_read_leniently_and_missing_frames_reported_once(tmp_path, cap
     assert len(load(tmp_path)) == 3
     (tmp_path / "images/view_1.png").unlink()
     (tmp_path / "images/view_2.png").write_bytes(b"")
-    capture = load(tmp_path)
-    assert [camera.name for camera in capture.cameras] == ["view_0"]
+    assert [camera.name for camera in load(tmp_path).cameras] == ["view_0"]
     (record,) = caplog.records
     assert record.getMessage().startswith("2 of 3 photographs in transforms.json")
     assert "view_1.png" in record.getMessage()
@@ -388,8 +387,7 @@ def test_odd_names_in_a_model(tmp_path: Path, name: str, found: list[str]) -> No
     listed = write_colmap(tmp_path, "txt") / "images.txt"
     listed.write_text(listed.read_text().replace("a.png", name), encoding="utf-8")
     (tmp_path / "images/a.png").rename(tmp_path / "images/mon été 1.png")
-    capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
-    assert [camera.name for camera in capture.cameras] == found
+    assert [camera.name for camera in load_capture(tmp_path, CONFIG, tmp_path / "work").cameras] == found
 
 
 @pytest.mark.parametrize(

@@ -83,8 +83,7 @@ def test_every_kind_of_picture_becomes_rgb(tmp_path: Path) -> None:
 def test_a_broken_photograph_is_left_out_and_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_colmap(tmp_path)
     (tmp_path / "images/a.png").write_bytes(b"")
-    capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
-    assert [camera.name for camera in capture.cameras] == ["b"]
+    assert [camera.name for camera in load_capture(tmp_path, CONFIG, tmp_path / "work").cameras] == ["b"]
     assert "a.png" in caplog.text
 
     whole = (tmp_path / "images/b.png").read_bytes()

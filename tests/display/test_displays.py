@@ -175,8 +175,7 @@ def test_heat_keeps_the_shading_of_the_image_and_ends_in_a_line():
     values, edge = framed()
     image = compose(Channels(grey, np.ones((40, 30)), values), HEAT, ((0.0, 1.0),)) / 255
     np.testing.assert_array_equal((image == 1).all(2), edge)
-    inside = image[12:28, 15] @ (0.3, 0.6, 0.1)
-    assert (np.diff(inside) > 0).all()
+    assert (np.diff(image[12:28, 15] @ (0.3, 0.6, 0.1)) > 0).all()
     hot = lab_of(mapped(np.array(1.0), HEAT.colour_map))
     assert_allclose(image[20, 15], shaded(hot, grey[20, 15]), atol=0.003)
     assert_allclose(image[5, 5], PICTURE.dim * grey[5, 5], atol=0.003)

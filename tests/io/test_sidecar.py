@@ -279,8 +279,7 @@ def test_rematch_follows_removing_reordering_and_adding(sidecar, means):
     assert not got.latents[:, N:].any()
     assert not got.confidence[:, N:].any()
     assert got.tree.leaves.tolist()[N:] == [NO_NODE] * 2
-    nobody = rematch_language(sidecar, np.zeros((0, 3), np.float32))
-    assert nobody.tree.leaves.shape == (0,)
+    assert rematch_language(sidecar, np.zeros((0, 3), np.float32)).tree.leaves.shape == (0,)
 
 
 def test_a_sidecar_of_other_gaussians_names_the_rematch(sidecar, means, tmp_path):

@@ -150,8 +150,7 @@ def held_out(scene: Scene, photographed: World) -> list[tuple[Camera, np.ndarray
 
 
 def test_bundled_scene_is_small_and_complete(scene):
-    size = sum(path.stat().st_size for path in ASSETS.rglob("*") if path.is_file())
-    assert size < 21e6
+    assert sum(path.stat().st_size for path in ASSETS.rglob("*") if path.is_file()) < 21e6
     assert scene.language.encoder_id == "demo"
     assert scene.gaussians.valid().all()
     assert len(scene.cameras) > 40

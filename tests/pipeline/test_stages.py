@@ -194,8 +194,7 @@ def train_until(
             if not sent and report.stage == stop[0] and report.fraction >= stop[1]:
                 process.send_signal(number)
                 sent = True
-        code = process.wait()
-    return Ended(code, "".join(said), list(stages))
+    return Ended(process.wait(), "".join(said), list(stages))
 
 
 def photographs(folder: Path, kind: str) -> Path:

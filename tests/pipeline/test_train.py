@@ -185,8 +185,7 @@ def test_a_run_interrupted_in_every_stage_ends_with_the_same_bytes(room, whole, 
         assert scene_in(tmp_path) == {}
     (seconds,) = tmp_path.glob("scene.work/seconds-*.json")
     write_json(seconds, json.loads(seconds.read_bytes()) | {"radiance": 1_000.0})
-    report = train_scene(room, tmp_path / "scene.ply", tiny_settings(room))
-    assert report.seconds["radiance"] >= 1_000
+    assert train_scene(room, tmp_path / "scene.ply", tiny_settings(room)).seconds["radiance"] >= 1_000
     assert scene_in(tmp_path) == scene_in(whole)
 
 
@@ -251,8 +250,7 @@ def test_given_gaussians_are_described_and_not_trained(room, tmp_path):
     assert run("train", room, "--out", again, "--gaussians", first, *options) == 0
     assert again.read_bytes() == first.read_bytes()
     assert not list((tmp_path / "again.work").glob("radiance*"))
-    field = load_scene(again).language
-    assert field.codec.size == 9
+    assert load_scene(again).language.codec.size == 9
     assert run("train", room, "--out", again, "--gaussians", tmp_path / "missing.ply", *options) == 2
     write_metres(first, 0.25)  # as `langsplat scale` measured it; the photographs say 0.5
     assert run("train", room, "--out", again, "--gaussians", first, *options) == 0
@@ -267,8 +265,7 @@ def test_paper_profile_runs(room, tmp_path, capsys):
     assert run("train", room, "--out", out, "--profile", "paper", *options) == 0
     assert run("query", out, "red mug", "--mode", "paper") == 0
     assert "score" in capsys.readouterr().out
-    field = load_scene(out).language
-    assert field.latents.shape[2] == 3
+    assert load_scene(out).language.latents.shape[2] == 3
 
 
 # What changes around a training between its interruption and its end, and around a program that reads.
@@ -370,8 +367,7 @@ def test_captures_are_trained_whatever_becomes_of_others(room, on, tmp_path, cap
     printed = capsys.readouterr()
     rows = {line.split()[0]: line for line in printed.out.splitlines() if line[0] != " "}
     assert rows["absent"].split()[1:3] + rows["absent"].split()[-1:] == ["-", "-", "2"]
-    measured = read_report(tmp_path / f"{room.name}.work").psnr
-    assert f" 5 of 5   {measured:.2f} dB " in rows[room.name]
+    assert f" 5 of 5   {read_report(tmp_path / f'{room.name}.work').psnr:.2f} dB " in rows[room.name]
     assert rows[room.name].endswith(" 0")
     assert printed.err.splitlines()[-1] == "langsplat: 1 of 2 captures have no scene: absent"
     assert [path.name for path in tmp_path.glob("*.ply")] == [f"{room.name}.ply"]

@@ -271,8 +271,7 @@ def photograph(height: int = 48, width: int = 80) -> np.ndarray:
 
 
 def test_the_grid_is_made_of_cell_centres() -> None:
-    points = sam.grid_points(2, (40, 80))
-    assert points.tolist() == [[20, 10], [60, 10], [20, 30], [60, 30]]
+    assert sam.grid_points(2, (40, 80)).tolist() == [[20, 10], [60, 10], [20, 30], [60, 30]]
 
 
 def test_preprocessing_scales_the_longer_side_and_pads() -> None:

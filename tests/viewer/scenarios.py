@@ -161,8 +161,7 @@ def begin_at_the_start_page(s: Any) -> None:
     s.key("escape", frames=3)
     assert not s.state.show_start
     s.drop("plain.ply")
-    kept = thumbnail_of(s.folder / "settings", blobs)
-    assert np.asarray(Image.open(kept)).std() > 10
+    assert np.asarray(Image.open(thumbnail_of(s.folder / "settings", blobs))).std() > 10
 
 
 def offers_keep_still(s: Any) -> None:
@@ -763,8 +762,7 @@ def arrange_panels(s: Any) -> None:
     s.menu("View", "Show depth")
     assert s.state.session.picture.display == "depth"
     s.menu("Window", "Light theme, or dark again")
-    light = s.shot("light")
-    assert light[540, 1035].min() > 150
+    assert s.shot("light")[540, 1035].min() > 150
     whole = s.state.size
     for title in ("Timeline", "Messages"):  # tabs of one place
         s.menu("Window", title)

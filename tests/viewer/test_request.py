@@ -225,8 +225,7 @@ def test_panes_are_joined_at_the_line(opened):
         assert Split("levels").within_pane(u) == pytest.approx(inside)
         assert Split("wipe").within_pane(u) == u
     dark, light = np.zeros((2, 10, 3), np.uint8), np.full((2, 10, 3), 9, np.uint8)
-    wiped = Split("wipe", at=0.3).joined([dark, light], 10)
-    assert wiped[0, :, 0].tolist() == [0] * 3 + [9] * 7
+    assert Split("wipe", at=0.3).joined([dark, light], 10)[0, :, 0].tolist() == [0] * 3 + [9] * 7
     wide = Split("levels").joined([dark, dark, light], 32)  # two pixels are left over
     assert wide[0, :, 0].tolist() == [0] * 20 + [9] * 12
 

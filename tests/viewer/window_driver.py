@@ -298,8 +298,7 @@ def find_the_plant(s: Session, rgb: np.ndarray) -> None:
     # the colour may be another hot one.
     s.drag((600, 300), (656, 279))
     assert s.state.view is not before
-    warm = s.at(s.shot("moved"), PLANT)
-    assert is_hot(warm)
+    assert is_hot(s.at(s.shot("moved"), PLANT))
     assert not is_hot(s.at(rgb, PLANT))
 
 

@@ -56,8 +56,7 @@ def test_a_small_budget_moves_geometry_faster_and_cools() -> None:
         assert short[name] == pytest.approx(10 * full[name])  # the root of 100
     for name in ("opacity_logits", "sh_dc", "sh_rest"):
         assert short[name] == full[name] == pytest.approx(20 * last[name])
-    longer = schedule_for(RadianceConfig(steps=60_000), 2.0).learning_rates(30_000)
-    assert longer == full
+    assert schedule_for(RadianceConfig(steps=60_000), 2.0).learning_rates(30_000) == full
 
 
 @pytest.mark.parametrize("steps", [100, 300, 600, 1_000, 3_000, 7_000])
