@@ -168,9 +168,9 @@ def read_file(path: Path, limit: int) -> bytes:
         return file.read(size)
 
 
-def read_text(path: Path, limit: int = 64 * 1024 * 1024) -> str:
-    """Return the text in a file of at most `limit` bytes. Raises InputError, and as `decode_text` does."""
-    return decode_text(read_file(path, limit), path)
+def read_text(path: Path) -> str:
+    """Return the text in a file of at most 64 MiB. Raises InputError, and as `decode_text` does."""
+    return decode_text(read_file(path, 1 << 26), path)
 
 
 def decode_text(data: bytes, path: Path) -> str:

@@ -1,1 +1,1 @@
-"""Queries: phrases asked of a scene, and words for what is in it."""
+"""Queries: searches by phrases in a scene, and words for its contents."""

@@ -447,9 +447,9 @@ class QueryEngine:
         self.taught[word.key] = word
         return word
 
-    def like(self, members: Array, level: LevelChoice = "auto") -> QueryResult:
+    def like(self, members: Array) -> QueryResult:
         """Answer with all that resembles `members` (N,) bool, themselves included; no word is kept."""
-        return self._by_examples(self._word_of("more like this", members, level), "auto")
+        return self._by_examples(self._word_of("more like this", members, "auto"), "auto")
 
     def _word_of(self, name: str, members: Array, level: str) -> TaughtWord:
         members = np.asarray(members)

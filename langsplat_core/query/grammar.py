@@ -338,7 +338,7 @@ def _query(text: str) -> Phrase:
 
 
 def _exclusions(text: str) -> list[str]:
-    """Split a text into what is wanted and what is excluded, where both sides name something."""
+    """Split a text into what is wanted and what is excluded, if both sides name something."""
     for mark in re.finditer(_EXCLUDED, text):
         before, after = text[: mark.start()], text[mark.end() :]
         if _names(before) and _names(after):

@@ -42,7 +42,7 @@ class WordSpace:
     basis: Array  # (W, D) float32 orthonormal
     centres: Array  # (3, W) mean over the regions of each level
     regions: tuple[Array, ...]  # (R, W) of each level, unit; zero for a region without features
-    rival: float  # in [0, 1], see above; 0 where there is nothing to compare
+    rival: float  # in [0, 1], see above; 0 with fewer than two wholes
 
 
 def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> WordSpace:

@@ -134,7 +134,7 @@ def read_vocabulary(path: Path) -> tuple[str, ...]:
         if not (text.isprintable() and any(map(str.isalnum, phrase)) and len(phrase) <= LONGEST):
             raise InputError(
                 f"{path}, line {number}: {quoted(text, 30)} is no phrase; write plain text, one "
-                f"phrase of at most {LONGEST} letters a line, or begin with # what is none"
+                f"phrase of at most {LONGEST} letters per line, and comments after a #"
             )
         phrases[phrase] = None
     if not phrases:

@@ -56,10 +56,10 @@ PROGRESS = ContextVar("PROGRESS", default=silent)  # of the current call
 
 @dataclass(frozen=True)
 class Serve:
-    """Let an agent ask scenes: find, count, measure, describe, look. Nothing is changed."""
+    """Serve scenes to an agent: find, count, measure, describe, look. Nothing is changed."""
 
     scene: tyro.conf.Positional[Path]
-    """A trained scene, *.ply with its language field beside it, or a folder of such."""
+    """A trained scene, *.ply with its language field beside it, or a folder of scenes."""
     mcp: bool = False
     """Speak the Model Context Protocol on standard input and output; started by the agent's program."""
     encoder: EncoderOption = ""
@@ -98,13 +98,13 @@ class SceneTools:
         self._engines: dict[str, QueryEngine] = {}
 
     def scenes(self) -> list[str]:
-        """Return the names of the scenes that can be asked."""
+        """Return the names of the scenes that can be searched."""
         return list(self._scenes)
 
     def find(self, phrase: str, scene: str = "") -> dict[str, Any]:
         """Find where something is: a phrase such as 'blue gift', 'lid of the teapot' or 'duck on the table'.
 
-        The verdict is 'found', 'weak match' or 'not here'; place is the middle of the best one, box its
+        The verdict is 'found', 'weak match' or 'not here'; place is the centre of the best one, box its
         corners.
         """
         engine = self.engine(scene)
@@ -124,7 +124,7 @@ class SceneTools:
         }
 
     def count(self, phrase: str, scene: str = "") -> dict[str, Any]:
-        """Count what a phrase names, with the least and most there may be; 0 where it is not found."""
+        """Count what a phrase names, with the least and most there may be; 0 if it is not found."""
         engine = self.engine(scene)
         answer = run_phrase(engine, phrase, viewpoint=_first(engine.scene)).answer
         number = count_instances(engine, answer) if answer.found else None
@@ -132,7 +132,7 @@ class SceneTools:
         return dict(zip(("count", "least", "most"), counts, strict=True)) | {"verdict": answer.verdict}
 
     def distance(self, first: str, second: str, scene: str = "") -> dict[str, Any]:
-        """Measure how far apart the nearest points of two things are, each named by a phrase."""
+        """Measure the distance of the nearest points of two things, each named by a phrase."""
         engine = self.engine(scene)
         frame, unit = upright(engine.scene.up()), _unit(engine.scene)
         bodies = []
@@ -152,9 +152,9 @@ class SceneTools:
         return "\n".join([*lines, f"answers: {engine.basis.long}"])
 
     def look(self, phrase: str = "", camera: int | None = None, scene: str = "") -> tuple[Array, str]:
-        """Return an (H, W, 3) uint8 image, and in words by which camera it is and where in it a thing lies.
+        """Return an (H, W, 3) uint8 image, and text with its camera and the position of a thing in it.
 
-        The camera is that of the number given, else the one that shows most of what the phrase finds, else
+        The camera is that of the number given, else the nearest one that shows what the phrase finds, else
         the first.
         """
         engine = self.engine(scene)

@@ -1,4 +1,4 @@
-"""`langsplat eval ...`: a scene, or another system's maps, scored on the field's benchmarks."""
+"""`langsplat eval ...`: scores of a scene, or of another system's maps, on published benchmarks."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class _Eval:
     paths: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[SCENE] DATA")]]
-    """A scene of ours, or a folder with one NAME.ply for each of the benchmark's scenes; then the folder of
-    the benchmark, or one scene's folder of it. With --maps the latter alone."""
+    """A scene, or a folder with NAME.ply for each of the benchmark's scenes; then the folder of the
+    benchmark, or of one of its scenes. With --maps only the latter."""
     maps: Path | None = None
     """Score these maps of another system, files named VIEW/PHRASE.npy or .png, instead of a scene."""
     json: OutFile | None = None
@@ -36,11 +36,11 @@ class _Eval:
 
     @property
     def is_ours(self) -> bool:
-        """Return True where a scene is scored, False for maps of another system."""
+        """True if a scene is scored, False for maps of another system."""
         return self.maps is None
 
     def evaluate(self, read: "Callable[[Path], Benchmark]", profile: Profile) -> None:
-        """Score what was given, print the tables and write the files asked for."""
+        """Score the scene or maps, print the tables and write the JSON file."""
         from langsplat_core.extensions.benchmarks.report import Evaluated, run_benchmark, save_json, table
         from langsplat_core.semantics.encoders import load_text_encoder
 
@@ -64,12 +64,12 @@ class _Eval:
 class EvalLerfOvs(_Eval):
     """LERF-OVS: mIoU and localisation in labelled frames, by a named protocol.
 
-    DATA is the folder with label/SCENE/FRAME.json. Frames are matched to views by name; the cameras of those
-    that the scene was not trained on are taken from the dataset beside the labels.
+    DATA is the folder with label/SCENE/FRAME.json. Frames are matched to views by name; cameras of frames
+    that the scene was not trained on are read from the dataset beside the labels.
     """
 
     protocol: LerfProtocol = "langsplat-code"
-    """Whose constants: filters, cut and choice of level; docs/evaluating.md lists them."""
+    """Constants of the evaluation: filters, cut and choice of level; docs/evaluating.md lists them."""
 
     def run(self) -> None:
         from langsplat_core.extensions.benchmarks.labels import read_lerf_ovs
@@ -79,13 +79,13 @@ class EvalLerfOvs(_Eval):
 
 @dataclass(frozen=True)
 class EvalGrLerf(_Eval):
-    """GR-LERF: phrases for none, one or several things; gIoU, and whether nothing is answered rightly.
+    """GR-LERF: phrases for none, one or several things; gIoU, and accuracy for phrases that name nothing.
 
     DATA is a folder with SCENE/json/test_json/FRAME.json, or one SCENE; docs/evaluating.md has the layout.
     """
 
     protocol: LerfProtocol = "ours"
-    """Whose constants, as for lerf-ovs; langsplat's have no way to answer nothing."""
+    """Constants of the evaluation, as for lerf-ovs; those of LangSplat never give an empty answer."""
 
     def run(self) -> None:
         from langsplat_core.extensions.benchmarks.labels import read_gr_lerf
@@ -101,7 +101,7 @@ class EvalOvs3d(_Eval):
     """
 
     protocol: OvsProtocol = "langsplat-paper"
-    """Whose constants: cut and choice of level; docs/evaluating.md lists them."""
+    """Constants of the evaluation: cut and choice of level; docs/evaluating.md lists them."""
 
     def run(self) -> None:
         from langsplat_core.extensions.benchmarks.labels import read_3d_ovs

@@ -445,7 +445,7 @@ class SiglipText(TorchText):
 
         config = _siglip_config(weights).text_config
         super().__init__(Model, weights, config, "pooler_output", config.projection_size)
-        scale = _read_scalar(weights, "logit_scale")
+        scale = _logit_scale(weights)
         if not math.isfinite(scale):
             raise EncoderError(f"{weights.id}: not SigLIP weights: logit_scale is not in them")
         self.temperature = SHARE_OF_SCALE * math.exp(scale)
@@ -473,10 +473,11 @@ def _siglip_config(weights: Weights) -> Any:
     return load_config(SiglipConfig, weights, "SigLIP")
 
 
-def _read_scalar(weights: Weights, name: str) -> float:
-    """Return a number among the weights without reading the rest; NaN if missing, as in half a model."""
+def _logit_scale(weights: Weights) -> float:
+    """Return `logit_scale` without reading the other weights; NaN if missing, as in half a model."""
     from safetensors import safe_open
 
+    name = "logit_scale"
     with loading_errors(weights.id, "readable"):
         for path in weight_files(weights.folder):
             if path.suffix != ".safetensors" and name in (found := _unpickled(path)):

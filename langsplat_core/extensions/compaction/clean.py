@@ -288,14 +288,14 @@ def clean_scene(
 class Clean:
     """Remove floaters: small regions that touch nothing and veils in free space, the least visible first.
 
-    As many go as the allowed loss of PSNR lets go. It is measured on photographs that the scene was not
-    trained on where --photos has some, else derived from how far the scene's images change.
+    As many are removed as the allowed loss of PSNR permits. The loss is measured on photographs with --photos
+    (those not used in training, if there are any), else derived from the change of the scene's images.
     """
 
     scene: AnyScene
     out: WrittenScene
     photos: Path | None = None
-    """Dataset the scene was trained on: true floaters then cost nothing, and more of them go."""
+    """Dataset the scene was trained on; removing true floaters then costs nothing, so more are removed."""
     json: JsonOption = False
     config: Annotated[CleanConfig, tyro.conf.arg(name="")] = field(default_factory=CleanConfig)
 

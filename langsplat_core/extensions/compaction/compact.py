@@ -393,12 +393,12 @@ def smallest(
 class Compact:
     """Drop the Gaussians and colour harmonics that the views do not need, within an error budget.
 
-    Nothing is retrained; the language field, the cameras and extra properties are taken along.
+    Nothing is trained; language field, cameras and extra properties are kept.
     """
 
     scene: AnyScene
     out: OutFile | None = None
-    """The scene to write (default: SCENE with .compact.ply for its ending)."""
+    """The scene to write (default: SCENE with the ending .compact.ply)."""
     photos: Path | None = None
     """Dataset the scene was trained on: the loss is then measured against its photographs."""
     json: JsonOption = False

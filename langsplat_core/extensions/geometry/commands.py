@@ -51,24 +51,24 @@ TRANSFORM_LIMIT = 1 << 20  # bytes of a file with a matrix
 class WriteMesh:
     """Write the surface of a scene, or of what a phrase names, as triangles with colours.
 
-    They are fused from images rendered by the scene's cameras, or from around it, so that what no camera sees
-    has none.
+    It is fused from images rendered by the scene's cameras, or by cameras around it, so surfaces that no
+    camera sees are missing.
     """
 
     scene: AnyScene
     out: tyro.conf.Positional[OutFile]
     """File to write: .ply in world units, .glb in metres with y up."""
     phrase: str = ""
-    """Of everything that this names alone; the scene then needs its language field."""
+    """Write only what this names; the scene then needs a language field."""
     level: Annotated[LevelChoice, Needs("phrase")] = "auto"
     """Semantic level of the phrase."""
     resolution: Positive | None = None
     """Side of a voxel, in metres if the scene has a scale, else world units; by default 1/100 of the radius,
     but no less than 1.5 pixels of the images."""
     views: Count = 2
-    """Images that must agree on a surface: more leave holes, and what is left is nearer to the truth."""
+    """Images that must agree on a surface: more leave more holes and fewer errors."""
     watertight: bool = False
-    """Close all holes (Poisson), and say how much of the surface is made up so."""
+    """Close all holes (Poisson), and report how much of the surface is made up."""
     encoder: Annotated[EncoderOption, Needs("phrase")] = ""
 
     @optional_imports()
@@ -102,19 +102,19 @@ class WriteMesh:
 
 @dataclass(frozen=True)
 class Register:
-    """Find how a scene lies in the axes of another one of the same place.
+    """Find the transform from a scene to another one of the same place.
 
-    The exit code is 2 where their surfaces do not agree.
+    The exit code is 2 if their surfaces do not agree.
     """
 
     moving: tyro.conf.Positional[Path]
-    """The scene that would be moved."""
+    """The scene that is transformed."""
     fixed: tyro.conf.Positional[Path]
-    """The scene that stays."""
+    """The scene in whose axes it is placed."""
     out: OutFile | None = None
-    """File for the matrix, .json, as `langsplat merge --transform` reads it."""
+    """File for the matrix, .json, for `langsplat merge --transform`."""
     scaled: bool = False
-    """Units may differ in length; else they are the same, up to what both scenes say of metres."""
+    """Units may differ in length; else they are equal, or as metres per unit of both scenes say."""
 
     @optional_imports()
     def run(self) -> None:
@@ -136,24 +136,24 @@ class Register:
 class Merge:
     """Write two scenes as one: Gaussians, cameras, language field, tree and taught words of both.
 
-    The second is first laid onto the first, as `langsplat register` finds it, or as told. What both show as a
-    whole, on much the same surface, is kept once: as the scene has it that shows it in more photographs.
+    The second is first transformed to the axes of the first, as `langsplat register` does, or as given.
+    Instances that both show are kept once, from the scene that shows them in more photographs.
     """
 
     first: tyro.conf.Positional[Path]
-    """A scene; what is said of a whole scene is as here."""
+    """A scene, whose axes and settings the merged one has."""
     second: tyro.conf.Positional[Path]
-    """The scene that is added, and moved for that."""
+    """The scene that is transformed and added."""
     out: OutFile
     """Scene to write: .ply, .spz, .sog, .glb, .gltf, .usdc, .usda or .splat."""
     transform: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """How the second lies in the axes of the first: .json of `langsplat register`, instead of a search."""
+    """Transform of the second to the axes of the first, .json of `langsplat register`; default: a search."""
     as_is: bool = False
-    """Both are in the same axes already: nothing is moved."""
+    """Both scenes have the same axes already."""
     scaled: bool = False
-    """As of `langsplat register`."""
+    """As for `langsplat register`."""
     keep_both: bool = False
-    """Keep what both show twice."""
+    """Keep instances that both show twice."""
 
     @optional_imports()
     def run(self) -> None:
@@ -211,31 +211,31 @@ NO_SCALE = (
 
 @dataclass(frozen=True)
 class Map:
-    """Write what a robot needs to know of a scene: maps, labelled voxels and poses.
+    """Write maps of a scene for robots, with labelled voxels and poses.
 
-    There is an occupancy grid as Nav2 reads it (map.pgm, map.yaml), labelled voxels (voxels.npz), a
-    collider (collider.obj), and poses in front of things (goals.json).
+    The files are an occupancy grid for Nav2 (map.pgm, map.yaml), labelled voxels (voxels.npz), a collider
+    (collider.obj), and poses in front of things (goals.json).
     """
 
     scene: tyro.conf.Positional[Path]
-    """A trained scene with its cameras; with a language field voxels have words and goals are found."""
+    """A trained scene with its cameras; labels of voxels and goals need a language field."""
     out: tyro.conf.Positional[OutFolder]
     """Folder to write."""
     resolution: Positive = 0.05
-    """Metres of a cell."""
+    """Side of a cell, metres."""
     goal: tuple[str, ...] = ()
-    """Phrases: a free, reachable pose in front of each is found. With one that has none the exit code is 2,
-    and everything else is written."""
+    """Phrases, for each of which a free, reachable pose in front of it is found. The exit code is 2 if one
+    has none; everything else is written."""
     robot_height: Positive = 0.5
-    """Metres: what is higher is no obstacle."""
+    """Metres above which nothing is an obstacle."""
     robot_radius: Annotated[Positive, Needs("goal")] = 0.2
-    """Metres: how far from obstacles its middle stays."""
+    """Least distance of its centre from obstacles, metres."""
     step: Positive = 0.12
-    """Metres: what is lower is driven over, and the floor's own roughness."""
+    """Metres below which nothing is an obstacle; above the floor's roughness."""
     start: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="X Y"), Needs("goal")] = None
-    """Where the robot is, metres on the map; else it may be wherever most of the free floor is connected."""
+    """Position of the robot, metres on the map; by default anywhere in the largest connected free region."""
     metres_per_unit: Positive | None = None
-    """In place of what the scene says."""
+    """In place of the scene's own."""
     encoder: EncoderOption = ""
 
     @optional_imports()

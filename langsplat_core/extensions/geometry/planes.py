@@ -22,7 +22,7 @@ LEVEL = 0.9  # least cosine of a floor's normals with up
 BELOW = 0.05  # largest share of the surface below the floor: reflections and floaters
 
 
-def sample_surface(gaussians: Gaussians, count: int, seed: int = 0) -> tuple[Array, Array]:
+def sample_surface(gaussians: Gaussians, count: int) -> tuple[Array, Array]:
     """Return (count, 3) float64 points on the surface, of equal density by area, and their unit normals.
 
     Normals, (count, 3), are of either sign. A Gaussian is a disc across its shortest axis, with the density
@@ -32,7 +32,7 @@ def sample_surface(gaussians: Gaussians, count: int, seed: int = 0) -> tuple[Arr
     areas = surface_areas(gaussians)[rows]
     if len(rows) < FEWEST or not areas.sum() > 0:
         raise InputError(f"{len(rows)} opaque Gaussians have no surface; at least {FEWEST} are needed")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     chosen = rows[rng.choice(len(rows), count, p=areas / areas.sum())]
     axes = rotation_matrices(gaussians.quats_wxyz[chosen].astype(np.float64))  # columns
     lengths = np.exp(gaussians.log_scales[chosen].astype(np.float64).clip(max=np.log(np.sqrt(areas.max()))))

@@ -57,9 +57,7 @@ class Registration:
         return self.agreement >= TRUSTED
 
 
-def register(
-    moving: Scene, fixed: Scene, scaled: bool = False, seed: int = 0, progress: Progress = silent
-) -> Registration:
+def register(moving: Scene, fixed: Scene, scaled: bool = False, progress: Progress = silent) -> Registration:
     """Return the rigid motion, and with `scaled` the scale, from one scene to another.
 
     Without `scaled` both have the same unit, unless their metres per unit differ. Raises InputError for a
@@ -73,12 +71,12 @@ def register(
     centre, radius = fixed.bounds()
     # Rooms look similar after quarter turns.
     turns = [rotating(fixed.up(), -90.0 * quarter).about(centre).matrix for quarter in range(4)]
-    mine, theirs = (sample_surface(scene.gaussians, SAMPLES, seed)[0] for scene in (moving, fixed))
+    mine, theirs = (sample_surface(scene.gaussians, SAMPLES)[0] for scene in (moving, fixed))
     best: Registration | None = None
     sizes = [unit * factor for factor in SIZES] if scaled else [unit] * AGAIN
     for start, size in enumerate(sizes):
         progress(STAGE, start / len(sizes))
-        matrix, rmse = _aligned(size * mine, theirs, turns, radius, scaled, seed + start)
+        matrix, rmse = _aligned(size * mine, theirs, turns, radius, scaled, seed=start)
         found = Registration(matrix @ np.diag([size, size, size, 1.0]), rmse, 0.0)
         found = replace(found, agreement=agreement(moving, fixed, found.transform))
         if best is None or found.agreement > best.agreement:

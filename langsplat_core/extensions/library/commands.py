@@ -35,11 +35,11 @@ class Find:
     """
 
     words: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TEXT... FOLDER")]
-    """Phrases, each in quotes if it has several words, and last the folder; scenes in its folders count."""
+    """Phrases, each in quotes if it has several words, then a folder; its subfolders are searched too."""
     top: CountOrZero = 20
-    """Scenes that are opened and answered exactly, of each encoder; 0: what the index says alone."""
+    """Scenes of each encoder that are opened for exact answers; 0: answers from the index alone."""
     all: bool = False
-    """List also the scenes where it was not found."""
+    """Also list the scenes without it."""
     encoder: EncoderOption = ""
     json: JsonOption = False
 
@@ -122,22 +122,22 @@ STATED = ("kind", "name", "centre", "box", "moved", "distance", "colours", "shar
 
 @dataclass(frozen=True)
 class Changes:
-    """Say what changed between two scenes of one place: what appeared, is gone, moved, or has another colour.
+    """List changes between two scenes of one place: what appeared, is gone, moved, or has another colour.
 
-    Places are in the first scene's frame.
+    Positions are in the first scene's frame.
     """
 
     before: TrainedScene
     after: tyro.conf.Positional[Path]
-    """Another one of the same place."""
+    """Another scene of the same place."""
     transform: Path | None = None
-    """How the second lies in the axes of the first: .json of `langsplat register`; without it they are taken
-    to be in one frame."""
+    """Transform of the second to the axes of the first, .json of `langsplat register`; by default both have
+    the same axes."""
     register: bool = False
     """Find the transform from the surfaces of both."""
     encoder: EncoderOption = ""
     scale: Positive | None = None
-    """Metres per world unit of the first scene, in place of what it says."""
+    """Metres per world unit of the first scene, in place of its own."""
     json: JsonOption = False
 
     def run(self) -> None:

@@ -195,7 +195,7 @@ def evaluate_views(
 
 
 def _psnr_exposed(image: Tensor, target: Tensor, counted: Tensor) -> float | None:
-    """Return the PSNR with each half's exposure fitted on the other half; None where a half is masked."""
+    """Return the PSNR with each half's exposure fitted on the other half; None if a half is masked."""
     left = counted & (torch.arange(image.shape[1], device=counted.device) < image.shape[1] // 2)
     right = counted & ~left
     if not (left.any() and right.any()):

@@ -248,7 +248,7 @@ def fit_exposure(pairs: Sequence[tuple[Tensor, Tensor]], ridge: float = 0.1) -> 
         moments = moments + padded.T @ padded
         wanted = wanted + padded.T @ target.detach().reshape(-1, 3).double()
         count += len(padded)
-    # Black images tell nothing: the second term keeps the system solvable.
+    # The second term keeps the system solvable for black images.
     hold = max(ridge * float(moments.diagonal()[:3].mean()), 1e-9 * max(count, 1))
     none = torch.eye(4, dtype=torch.float64, device=device)
     return torch.linalg.solve(moments + hold * none, wanted + hold * none[:, :3]).float()
@@ -277,8 +277,8 @@ def fit_exposures(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, float
 # al. 2024), without a network. A photograph is compared with the render by the mean colours of patches, under
 # the exposure that fits best: details, thin things and small highlights average out. A patch differs where
 # that is several times the median over all views. It is transient where other views see the very surface that
-# is rendered there, and find it as it is rendered. What stands still and is not learnt yet, or shines,
-# differs in other views too, and what only one photograph shows is in no other. Nothing is masked for good:
+# is rendered there, and find it as it is rendered. Static surfaces that are not learnt yet, or specular ones,
+# differ in other views too; surfaces in only one photograph are in no other. No mask is permanent:
 # patches are judged anew whenever their view is rendered.
 
 GRID = 32  # patches along both sides of a view
@@ -330,7 +330,7 @@ def colour_difference(rendered: Array, photographed: Array) -> Array:
     """Return the (GRID, GRID, 3) colours rendered less those photographed, under the best exposure."""
     image, target = (torch.from_numpy(colours.reshape(-1, 3)) for colours in (rendered, photographed))
     fits = torch.isfinite(image).all(1)
-    for _ in range(3):  # the 70 % of the patches that fit best tell the exposure
+    for _ in range(3):  # the exposure is fitted to the 70 % of the patches that fit best
         exposed = with_exposure(image, fit_exposure([(image[fits], target[fits])], ridge=0.01))
         apart = (exposed - target).abs().mean(1)
         fits = apart <= apart.nanquantile(0.7)

@@ -25,8 +25,8 @@ from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.differentiable import PARAMETERS, parameters_of
 from langsplat_core.training.radiance.losses import Transients, no_transients
 
-# Fewer points are topped up to this number: features are found where there is detail, and what lies between
-# is covered from random ones better than by splitting what is elsewhere (docs/photographs.md) ...
+# Fewer points are topped up to this number: features are found where there is detail, and the space between
+# is covered better from random points than by splitting distant Gaussians (docs/photographs.md) ...
 FEWEST_POINTS = 3_000
 RANDOM_POINTS = 10_000  # ... or to this one, when they are too few to show where the scene is
 
@@ -307,7 +307,7 @@ def load_checkpoint(path: Path, made_from: str, device: torch.device) -> Trainin
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            # Copies: what is mapped into memory cannot be replaced on Windows.
+            # Copies, as files that are mapped into memory cannot be replaced on Windows.
             tensors = {name: file.get_tensor(name).to(device, copy=True) for name in file.keys()}  # noqa: SIM118
         if metadata.get("kind") != KIND:
             raise ValueError(f"kind {metadata.get('kind')!r}")

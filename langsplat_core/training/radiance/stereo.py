@@ -55,7 +55,7 @@ def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = s
     """Return depths at 320 px of unmasked pixels that another photograph confirms; views need neighbours."""
     small = capture.shrunk(indices, 320)
     masks = [np.True_ if (mask := small.mask(index)) is None else mask for index in range(len(small))]
-    # Windows reach into what is masked: it is the same in all photographs.
+    # Windows extend into masked pixels, which are equal in all photographs.
     greys = [
         np.where(mask, image.mean(2, dtype=np.float32) / 255, np.float32(0))
         for image, mask in zip(small.images, masks, strict=True)

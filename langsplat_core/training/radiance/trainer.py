@@ -218,7 +218,7 @@ class _Views:
 
 
 def _halved(camera: Camera, image: Array, mask: Array | None) -> tuple[Camera, Array, Array | None]:
-    """Return the view at half its size; one below 64 px as it is."""
+    """Return the view at half its size, unless a side is below 64 px."""
     if min(camera.width, camera.height) < 64:
         return camera, image, mask
     return shrunk_view(camera, image, mask, (camera.width // 2, camera.height // 2))
@@ -309,7 +309,7 @@ class _Run:
         return {"psnr": float(np.mean([score.psnr for score in scores]))}
 
     def find_exposures(self, state: TrainingState) -> Tensor:
-        """Return (V, 4, 3) exposures of the training views; none where they explain too little."""
+        """Return (V, 4, 3) exposures of the training views; none if they explain too little."""
         pairs, degree = [], self.schedule.active_sh_degree(state.step)
         for index in range(len(self.views)):
             camera, target, mask = self.views.at(index, coarse=True)
@@ -317,7 +317,7 @@ class _Run:
             with torch.no_grad():
                 image = self.renderer.render(state.values, camera, degree, self.views.focals[index]).image
             counted = (slice(None), slice(None)) if mask is None else mask
-            # One pixel in seven tells the exposure.
+            # One pixel in seven is enough for the exposure.
             pairs.append((image[counted].reshape(-1, 3)[::7], target[counted].reshape(-1, 3)[::7]))
         exposures, gain = losses.fit_exposures(pairs)
         return exposures if gain >= 0.35 or self.config.exposure == "on" else exposures[:0]
