@@ -125,9 +125,6 @@ def test_gpu_sections_agree_with_the_twin(sections: ModuleType, gsplat_twin: Non
     said = pieces(sections, "lifting")
     assert numbers(said, "cpu")[1] == numbers(said, "cuda")[1] > 100
     assert float(said.split("Largest difference of a weight: ")[1].split()[0]) < 1e-4
-    said = pieces(sections, "environment")
-    assert "- gsplat: 1." in said
-    assert "gsplat's first picture and its gradients" in said
 
 
 @pytest.mark.long

@@ -329,13 +329,9 @@ def test_an_unusable_sidecar_is_left_out(path, capsys, other):
 
 def test_summary_counts_faults_by_reason():
     broken = random_gaussians(10, seed=2)
-    broken.means[0, 1] = np.nan
-    broken.quats_wxyz[1] = 0
-    broken.opacity_logits[2] = np.nan
-    broken.sh[3, 0, 0] = np.inf
+    broken.means[0, 1], broken.quats_wxyz[1:3] = np.nan, 0
     found = summarise(Scene(broken))
-    assert (found["gaussians"], found["invalid_rows"]) == (10, 4)
-    assert [*found["invalid"].values()] == [1, 1, 1, 1]
+    assert (found["gaussians"], found["invalid_rows"], [*found["invalid"].values()]) == (10, 3, [1, 2])
     assert summarise(Scene(random_gaussians(0)))["bounds"] == [[0, 0, 0], [0, 0, 0]]
 
 

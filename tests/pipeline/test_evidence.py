@@ -199,9 +199,7 @@ def test_query_why_draws_a_sheet(trained, capsys):
     (trained / "photographs").rename(trained / "p")
     assert run("query", "a.ply", "mug", "--why", "new.png", "--work", "w", "--photographs", "p") == 0
     assert (trained / "new.png").exists()
-    said = capsys.readouterr().out
-    assert "5 of 7 photographs" in said
-    assert f"worst photo_{WRONG}" in said
+    assert f"worst photo_{WRONG}" in capsys.readouterr().out
 
 
 def test_photographs_answer_beside_the_field(trained, capsys, monkeypatch, shown, scene):

@@ -3,7 +3,6 @@
 import multiprocessing
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
@@ -267,35 +266,3 @@ def test_training_resumes_after_full_disks(kind: str, tmp_path: Path) -> None:
         print(f"full {filled} times")
         assert filled > STEPS / 2
         assert_same(disk / "out", tmp_path / "whole")
-
-
-@pytest.mark.slow
-def test_damaged_work_folders_give_the_same_scene_or_a_remedy(tmp_path, request):
-    """Files of a finished training, a few of them, with flipped bits or without their end."""
-    data, encoder = photographs(tmp_path / "data", "COLMAP"), tmp_path / "encoder"
-    tiny_clip(encoder)
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    assert train_until(data, encoder, whole).code == 0
-    choose = random.Random(request.config.getoption("--seed") or 0)
-    files = sorted(
-        path for path in (whole / "scene.work").rglob("*") if path.stat().st_size and path.is_file()
-    )
-    for path in choose.sample(files, 8):
-        shutil.rmtree(broken, ignore_errors=True)
-        shutil.copytree(whole, broken, ignore=shutil.ignore_patterns(*SCENE))
-        damaged, content = broken / path.relative_to(whole), bytearray(path.read_bytes())
-        if choose.random() < 0.5:
-            content[choose.randrange(len(content))] ^= 1 << choose.randrange(8)
-        else:
-            del content[choose.randrange(len(content)) :]
-        damaged.write_bytes(content)
-        ended = train_until(data, encoder, broken)
-        if ended.code:
-            assert (ended.code, "Traceback" in ended.said) == (2, False), ended.said
-            last = ended.said.splitlines()[-1]
-            assert last.endswith("; delete it and run again"), last
-            named = Path(last.removeprefix("langsplat: ").partition(": ")[0])
-            assert damaged.is_relative_to(named)
-            shutil.rmtree(named) if named.is_dir() else named.unlink()
-            assert train_until(data, encoder, broken).code == 0
-        assert_same(broken, whole)

@@ -150,13 +150,17 @@ def test_a_setting_repeats_only_what_depends_on_it(room, trained):
     assert (len(list(work.glob("codec-*.npz"))), len(list(work.glob("latents-*.npz")))) == (3, 4)
 
 
-@pytest.mark.parametrize("name", ["member*/*.npy", "member*/*.npz", "codec-*", "latents-*", "nodes-*", "bit"])
-def test_a_damaged_stage_ends_in_one_line(room, trained, name):
+CUT = [(name, True) for name in ("member*/*.npy", "member*/*.npz", "codec-*", "latents-*", "nodes-*")]
+
+
+@pytest.mark.parametrize(("name", "cut"), [*CUT, ("member*/*.npy", False), ("radiance-*.ply", False)])
+def test_a_damaged_stage_ends_in_one_line(room, trained, name, cut):
+    """Cut off, or with one bit that is another."""
     work = trained.with_name("scene.work")
-    damaged = sorted(work.glob("member*/*.npy" if name == "bit" else name))
+    damaged = sorted(work.glob(name))
     for path in damaged:
         data = path.read_bytes()
-        path.write_bytes(data[:-40] + bytes([data[-40] ^ 1]) + data[-39:] if name == "bit" else data[:100])
+        path.write_bytes(data[:100] if cut else data[:-40] + bytes([data[-40] ^ 1]) + data[-39:])
     for path in {*work.glob("*.np[yz]"), *work.glob("member*/*")} - set(damaged):
         path.unlink()
     with pytest.raises(FormatError, match="delete it and run again"):
@@ -257,14 +261,13 @@ def test_given_gaussians_are_described_and_not_trained(room, tmp_path):
     assert load_scene(again).metres_per_unit == 0.25
 
 
-def test_paper_profile_runs(room, tmp_path, capsys):
+def test_paper_profile_runs(room, tmp_path):
     out = tmp_path / "scene.ply"
     options = ["--dataset.max-side", 64, "--dataset.test-every", 4, "--radiance.steps", 10]
     options += ["--masks.source", "graph", "--clip.model", room / "encoder", "--clip.device", "cpu"]
     options += ["--codec.steps", 30, "--lift.steps", 20, "--phrases", "red mug"]
     assert run("train", room, "--out", out, "--profile", "paper", *options) == 0
     assert run("query", out, "red mug", "--mode", "paper") == 0
-    assert "score" in capsys.readouterr().out
     assert load_scene(out).language.latents.shape[2] == 3
 
 

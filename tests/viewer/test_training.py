@@ -58,8 +58,8 @@ def begin(viewer, folder, monkeypatch) -> Callable[..., None]:
     return start
 
 
-def finish(viewer, seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
+def finish(viewer) -> None:
+    end = time.monotonic() + 60
     while viewer.training is not None and time.monotonic() < end:
         opening.watch_training(viewer)
         time.sleep(0.02)

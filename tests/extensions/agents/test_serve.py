@@ -187,7 +187,7 @@ def test_malformed_lines_and_wrong_types_are_answered_in_a_line(folder):
 def test_a_signal_ends_the_server_in_a_line(folder, number, code):
     with serving(folder) as server:
         server.send_signal(number)
-        assert server.wait(20) == code
+        assert server.wait(60) == code
         assert server.stderr.read().count(b"\n") == 1
 
 
@@ -196,7 +196,7 @@ def test_a_closed_output_ends_the_server_without_a_word(folder):
     with serving(folder) as server:
         server.stdout.close()
         send(server, call(1, "scenes"))
-        assert server.wait(20) == 0
+        assert server.wait(60) == 0
         assert server.stderr.read() == b""
 
 

@@ -227,23 +227,18 @@ def test_a_scene_without_a_surface_is_refused():
             find()
 
 
-@pytest.mark.parametrize(("scale", "scaled"), [(1.0, False), (3.0, True)])
-def test_a_capture_is_laid_onto_another(scale, scaled):
+@pytest.mark.parametrize(
+    ("scale", "scaled", "metres"), [(1.0, False, None), (3.0, True, None), (3.0, False, 1.0)]
+)
+def test_a_capture_is_laid_onto_another(scale, scaled, metres):
+    """Of the same scale, of a scale that is looked for, and of one that metres decide."""
     there = similarity((0.4, -0.3, 1.2), (2.0, 1.0, -3.0), scale)
-    fixed = box_room(2)
+    fixed = replace(box_room(2), metres_per_unit=metres)
     found = register(transform_scene(fixed, there), fixed, scaled)
     assert found.trusted
     assert found.agreement > 0.9
     assert np.linalg.norm(found.transform @ there.matrix - np.eye(4)) < 0.03
     assert found.scale == pytest.approx(1 / scale, rel=0.01)
-
-
-def test_metres_decide_the_scale():
-    there = similarity((0, 0, 0.5), (0.0, 1.0, 0.0), 3.0)
-    fixed = replace(box_room(2), metres_per_unit=1.0)
-    found = register(transform_scene(fixed, there), fixed)  # of 1 / 3 metres per unit
-    assert found.scale == pytest.approx(1 / 3)
-    assert np.linalg.norm(found.transform @ there.matrix - np.eye(4)) < 0.03
 
 
 def test_agreement_tells_a_place_from_another():
@@ -350,7 +345,7 @@ test_a_few_mutants_are_read_or_refused, test_many_mutants_are_read_or_refused = 
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (500_123.25, 5_412_345.5, 0.0)], ids=["near", "UTM"])
-def test_scenes_are_laid_onto_each_other_and_merged(tmp_path, capsys, at):
+def test_scenes_are_laid_onto_each_other_and_merged(tmp_path, at):
     room = place_scene(box_room(3), moving(np.array(at)))
     turn = moving(np.array([0.7, -0.4, 0.2]))
     save_scene(tmp_path / "a.ply", room)
@@ -363,17 +358,15 @@ def test_scenes_are_laid_onto_each_other_and_merged(tmp_path, capsys, at):
     )
     told = ("--transform", tmp_path / "to.json")
     assert run("merge", tmp_path / "a.ply", tmp_path / "b.ply", "--out", tmp_path / "both.ply", *told) == 0
-    assert "as told" in capsys.readouterr().out
     both, count = load_scene(tmp_path / "both.ply"), len(room.gaussians)
     off = np.linalg.norm(both.gaussians.means[count:] - both.gaussians.means[:count], axis=1)
     assert off.max() < 0.03
     assert len(both.cameras) == 2 * len(room.cameras)
 
 
-def test_a_mesh_of_a_room_is_written(tmp_path, capsys):
+def test_a_mesh_of_a_room_is_written(tmp_path):
     save_scene(tmp_path / "a.ply", box_room(1))
     assert run("mesh", tmp_path / "a.ply", tmp_path / "mesh.ply") == 0
-    assert "triangles" in capsys.readouterr().out
     assert (tmp_path / "mesh.ply").stat().st_size > 10_000
 
 
