@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -370,6 +371,14 @@ def use_the_mouse_alone(s: Any) -> None:
     assert s.state.edit_form.scale > 1.05
     s.drag((x - 30, y - 60), (x + 30, y - 60))  # the first number of "Move"
     assert 0.01 < s.state.edit_form.move[0] / s.state.extent.radius < 0.1
+    stops, out, done = Event(), s.folder / "trained.ply", {f"stage {n}": 1.0 for n in range(200)}
+    said, by = SimpleNamespace(stages=done, left="", curves={}, said=[]), stops.set
+    s.viewer.training = SimpleNamespace(progress=said, out=out, exit_code=None, interrupt=by, end=by)
+    s.open_panel("Train", frames=3)
+    assert s.ctx.item_info("//**/Stop").rect_full.max.y < 620  # however much is done
+    s.click("//**/Stop")
+    assert stops.is_set()
+    s.viewer.training = None
     (s.folder / "within").mkdir()
     s.menu("File", "Open a scene ...")
     for name in ("within\\/", ".. (the folder above)", "plain.ply", "Open"):

@@ -14,7 +14,7 @@ from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow, D
 from langsplat_core.query.answers import FLOOR
 from langsplat_viewer.actions import opening, settings
 from langsplat_viewer.commands import BUTTONS, Button, buttons_of, is_shown
-from langsplat_viewer.panels import ui
+from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.viewer import Training, Viewer
 
 
@@ -193,6 +193,10 @@ def draw_training(viewer: Viewer) -> None:
 def _running(viewer: Viewer, process: Training) -> None:
     progress = process.progress
     imgui.text_unformatted(process.out.name)
+    if imgui.button("Stop"):  # above what grows
+        process.interrupt()
+    if ui.next_button("Look at it so far"):
+        opening.look_at_training(viewer)
     if not progress.stages:
         ui.coloured("starting")
     stages = dict(progress.stages)
@@ -200,17 +204,14 @@ def _running(viewer: Viewer, process: Training) -> None:
         ui.small_wrapped(f"done: {', '.join(done)}")
     for label in (label for label in stages if label not in done):
         ui.small_wrapped(": ".join(filter(None, [label, str(progress.left)])))
-        imgui.progress_bar(stages[label], ImVec2(-1, 0))
+        with theme.styled(plot_histogram="pressed"):  # its number is read on it
+            imgui.progress_bar(stages[label], ImVec2(-1, 0))
     for name, text in CURVES.items():
         if len(curve := progress.curves.get(name, [])) > 1:
             size = ImVec2(-1, hello_imgui.em_size(CURVE_EM))
             imgui.plot_lines(f"##{name}", np.array(curve, np.float32), graph_size=size)
             ui.coloured(text.format(curve[-1]))
     imgui.separator()
-    if imgui.button("Stop"):
-        process.interrupt()
-    if ui.next_button("Look at it so far"):
-        opening.look_at_training(viewer)
     for line in progress.said[-3:]:
         ui.small_wrapped(line)
 
