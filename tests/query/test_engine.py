@@ -152,12 +152,15 @@ def test_peak_pixel_is_the_middle_one_of_equal_means():
     assert peak_pixel(image[:1, :1], 90) == (0, 0, 0)
 
 
+def with_phrases(field: LanguageField, count: int) -> LanguageField:
+    """Whose phrasebook holds so many random ones, and no other."""
+    vectors = unit(np.random.default_rng(8).normal(size=(count, field.codec.vector_dim))).astype(np.float32)
+    return replace(field, phrasebook={f"phrase {number}": vector for number, vector in enumerate(vectors)})
+
+
 def test_many_answers_take_no_memory_per_gaussian():
-    field = random_field(30_000, "codebook")
-    vectors = unit(np.random.default_rng(8).normal(size=(60, field.codec.vector_dim))).astype(np.float32)
-    book = {f"phrase {number}": vector for number, vector in enumerate(vectors)}
-    asked = LanguageField(field.latents, field.confidence, field.codec, field.canonical, "none", book)
-    engine = QueryEngine(Scene(random_gaussians(30_000), replace(asked, everyday=field.everyday)))
+    asked = with_phrases(random_field(30_000, "codebook"), 60)
+    book, engine = asked.phrasebook, QueryEngine(Scene(random_gaussians(30_000), asked))
     engine.run_many([*book])  # what depends on the scene, and the places of regions
     tracemalloc.start()
     many = engine.run_many([*book])
@@ -172,10 +175,8 @@ def test_many_answers_take_no_memory_per_gaussian():
 @pytest.mark.parametrize("rule", ["regions", "peak"])
 @pytest.mark.parametrize("exact", [False, True])
 def test_run_many_equals_run_one_by_one(kind, rule, exact):
-    field = random_field(400, kind)
-    vectors = unit(np.random.default_rng(8).normal(size=(20, field.codec.vector_dim))).astype(np.float32)
-    book = {f"phrase {number}": vector for number, vector in enumerate(vectors)}
-    asked = LanguageField(field.latents, field.confidence, field.codec, field.canonical, "none", book)
+    asked = replace(with_phrases(random_field(400, kind), 20), everyday=None)
+    book = asked.phrasebook
     engine = QueryEngine(Scene(random_gaussians(400), asked), exact=exact, rule=rule)
     many = engine.run_many([*book, "Phrase 3"])
     assert [result.phrase for result in many] == [*book, "Phrase 3"]
