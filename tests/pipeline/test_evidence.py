@@ -31,6 +31,7 @@ from langsplat_core.scene import NO_NODE, Scene
 from langsplat_core.scene.language import Tree
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.features import ImageFeatures
+from langsplat_core.semantics.relevancy import relevancy_of
 from tests.support.fakes import (
     CENTRES,
     DIM,
@@ -119,19 +120,12 @@ def test_a_wrong_mask_is_the_worst_vote(evidence):
     assert wrong.fit < 0 < min(vote.fit for vote in right)
 
 
-def test_cosines_and_fits_are_those_of_the_masks_own_vectors(evidence, scene):
-    everyday, canonical = (
-        getattr(scene.language, name).astype(np.float64) for name in ("everyday", "canonical")
-    )
+def test_cosines_and_fits_are_those_of_the_masks_own_vectors(engine, evidence, features):
     for vote in evidence.votes:
-        vector = (
-            np.eye(DIM)[1] if vote.view == WRONG else unit(np.eye(DIM)[0] + 0.1 * vote.view * np.eye(DIM)[4])
-        )
-        by_chance = np.sort(everyday @ vector)
-        top = by_chance[-round(0.07 * len(by_chance)) :].mean()
-        zero = 0.25 * (canonical @ vector).max() + 0.75 * top
-        assert vote.cosine == pytest.approx(vector[0], abs=1e-5)
-        assert vote.fit == pytest.approx((vector[0] - zero) / by_chance.std(), rel=1e-4)
+        vector = features[vote.view].vectors[:1]
+        assert vote.cosine == pytest.approx(vector[0, 0], abs=1e-5)
+        relevancy = relevancy_of(vector[:, 0], *engine.scale.of(vector @ engine.scale.texts.T))
+        assert vote.fit == pytest.approx(engine.scale.fit(relevancy).item(), rel=1e-4)
     blank = next(vote for vote in evidence.others if vote.view == BLANK)
     assert (blank.mask, blank.cosine, blank.fit, blank.overlap) == (-1, None, None, 0.0)
 

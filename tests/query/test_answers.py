@@ -1,7 +1,6 @@
 """Answers by regions and by the peak, what is said about them, and words that are taught by showing."""
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from langsplat_core.io.sidecar import Words
 from langsplat_core.query.answers import (
     QueryResult,
     Regions,
-    build_regions,
     by_peak,
     by_regions,
     smoothed,
@@ -49,12 +47,11 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN
-from langsplat_core.scene.surface import SMALLEST, Surface, build_surface
+from langsplat_core.scene.surface import SMALLEST, build_surface
 from langsplat_core.semantics.relevancy import FLOOR, Scale, TextEncoder, fit_of
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field
 from tests.support.scenes import (
-    chain_of_levels,
     random_gaussians,
     regions_of,
     tree_of_wholes,
@@ -297,68 +294,24 @@ def test_peak_rule_answers_without_everyday_phrases():
     assert QueryEngine(replace(scene, language=few), lambda _: FakeEncoder()).rule == "peak"
 
 
-# How far an answer reaches, against the rule written out region by region.
-
-SCALE = Scale(np.eye(2, dtype=np.float32), np.eye(2, dtype=np.float32), 10.0)
-N = 300
-
-
-@pytest.fixture(scope="module")
-def surface() -> Surface:
-    return build_surface(random_gaussians(N), min_opacity=0.0)
-
-
-def regions_by(surface: Surface, sizes: tuple[int, ...]) -> Regions:
-    """Of one partition at all levels; `sizes` add up to the Gaussians of the surface."""
-    leaves = np.full(len(surface.anchors), NO_NODE, np.int32)
-    leaves[surface.rows] = np.repeat(np.arange(len(sizes)), sizes)
-    return build_regions(chain_of_levels(leaves), (leaves != NO_NODE).astype(np.float32))
-
-
-def spread_out(surface: Surface, regions: Regions, fits) -> Array:
-    """Return (3, N) relevancy that has the given fits, of each level and region."""
-    relevancy = np.zeros((3, len(surface.anchors)), np.float32)
-    for level, row in enumerate(fits):
-        of = regions.everywhere[level, surface.rows]
-        relevancy[level, surface.rows] = sigmoid(np.asarray(row, np.float64))[of]
-    return relevancy
-
-
-def plain_extent(fits, sizes, level: str, named: Named) -> tuple[int, list[bool]]:
-    """The level and the regions that answer."""
-    solid = [n for n, size in enumerate(sizes) if size >= SMALLEST] or list(range(len(sizes)))
-    best = [max(row[n] for n in solid) for row in fits]
-    given = [value + more for value, more in zip(best, RULE.advantage[named], strict=True)]
-    chosen = given.index(max(given)) if level == "auto" else LEVELS.index(level)
-    limit = best[chosen] - min(max(RULE.reach * best[chosen], RULE.nearest), RULE.farthest)
-    return chosen, [value >= limit for value in fits[chosen]]
-
-
-@pytest.mark.parametrize(("level", "named"), [*product(["auto"], RULE.advantage), *product(LEVELS, ["part"])])
-@pytest.mark.parametrize("middle", [-2.0, 0.0, 1.0])
-def test_extent_equals_that_of_the_rule_written_out(surface, level, named, middle):
-    rng = np.random.default_rng(0)
-    count, means = len(surface.rows), rng.normal(size=(N, 3))
-    for _ in range(30):
-        sizes = rng.integers(3, 30, 9).tolist()
-        sizes = (*sizes, count - sum(sizes))
-        fits = middle + rng.normal(size=(3, len(sizes)))
-        regions = regions_by(surface, sizes)
-        got = by_rule(spread_out(surface, regions, fits), regions, means, SCALE, named, level)
-        solid = np.array(sizes) >= SMALLEST  # every region has one part, all of it; of crumbs it says nothing
-        fits[1:, solid] = (1 - RULE.part_share) * fits[1:, solid] + RULE.part_share * fits[:-1, solid]
-        chosen, answering = plain_extent(fits, sizes, level, named)
-        of = regions.everywhere[chosen, surface.rows]
-        assert got.level == chosen
-        np.testing.assert_array_equal(got.members[surface.rows], np.array(answering)[of])
-        np.testing.assert_allclose(got.fits, fits[:, solid].max(1), atol=1e-5)
-        np.testing.assert_allclose(got.scores, sigmoid(fits[:, solid].max(1)), atol=1e-6)
-        np.testing.assert_allclose(got.even[surface.rows], sigmoid(fits[chosen])[of], atol=1e-6)
-        assert got.members.any()
-
+# How far an answer reaches, and where.
 
 # Two wholes, each with one part of one subpart. A part that fits better than all is on the second one.
 TWO = RegionTable(np.array([[2, 2, 2]]), np.array([2, 3, 4, 5, -1, -1]), np.ones(6, bool))
+
+
+@pytest.mark.parametrize(("best", "reach"), [(-1.0, 0.15), (0.1, 0.15), (1.0, 0.45), (4.0, 1.0)])
+@pytest.mark.parametrize("level", LEVELS)
+def test_an_answer_reaches_further_below_a_better_best(best, reach, level):
+    for below, second in ((reach - 1e-3, True), (reach + 1e-3, False)):
+        found = decide(TWO, [np.tile([best, best - below], 3)], "thing", level, BARS, None)
+        assert (LEVELS[found.level], found.inside.tolist()) == (level, [True, second])
+        assert found.fits == pytest.approx((best,) * 3)
+
+
+def test_the_best_part_of_a_region_counts_a_quarter():
+    own = np.array([4.0, 0.0, 2.0, 0.0, 1.0, 1.0])
+    np.testing.assert_allclose(region_fits(TWO, own), [4, 0, 2.5, 0, 1.25, 0.75])
 
 
 @pytest.mark.parametrize(
