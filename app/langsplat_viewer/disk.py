@@ -26,7 +26,7 @@ MOST_OFFERED = 1000
 def completions(typed: str, folder: Path, suffixes: tuple[str, ...] = ()) -> list[str]:
     """Return the folder above, and the first folders, and files with these suffixes, that begin as typed."""
     begun = os.path.join(folder, os.path.expanduser(typed))
-    above, found = os.path.dirname(os.path.dirname(begun)), glob(f"{escape(begun)}*")  # no hidden ones
+    above, found = os.path.dirname(os.path.normpath(begun)), glob(f"{escape(begun)}*")  # no hidden ones
     paths = ((path, os.path.isdir(path)) for path in sorted(found) if is_utf8(Path(path)))
     offered = (path + os.sep * is_dir for path, is_dir in paths if is_dir or path.lower().endswith(suffixes))
     return [os.path.join(above, ""), *islice(offered, MOST_OFFERED)]

@@ -381,7 +381,7 @@ def use_the_mouse_alone(s: Any) -> None:
     s.viewer.training = None
     (s.folder / "within").mkdir()
     s.menu("File", "Open a scene ...")
-    for name in ("within\\/", ".. (the folder above)", "plain.ply", "Open"):
+    for name in ("within\\/", up := ".. (the folder above)", "blobs.ply", up, "plain.ply", "Open"):
         s.click(f"//**/{name}")
     s.shows("plain.ply")
     glfw.set_window_size(glfw_window_hello_imgui(), 400, 300)

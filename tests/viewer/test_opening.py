@@ -165,7 +165,7 @@ def test_typed_path_is_completed_by_folders_and_scenes(folder):
     above, *offered = completions("", folder, kinds)
     assert (above, offered) == (f"{folder.parent}/", [f"{folder}/{n}" for n in ("A.SPZ", "a.ply", "all/")])
     assert completions("all/../a.", folder, kinds)[1:] == [f"{folder}/all/../a.ply"]
-    assert completions(f"{folder}/al", Path("/gone"), kinds) == [above, f"{folder}/all/"]
+    assert completions(f"{folder}/al", Path("/gone"), kinds) == [f"{folder}/", f"{folder}/all/"]
     assert completions("/", folder, kinds)[0] == "/"
     for typed in ("b", "gone/", "a.ply/", "[a]", "x" * 5000):
         assert completions(typed, folder, kinds)[1:] == []
