@@ -15,8 +15,9 @@ import numpy as np
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError
-from langsplat_core.query.answers import QueryResult, Regions, feature_sums
-from langsplat_core.query.rule import Verdict, triple
+from langsplat_core.query.answers import QueryResult, Regions, by_regions, feature_sums
+from langsplat_core.query.lookup import Relevancy
+from langsplat_core.query.rule import Decision, Verdict, triple
 from langsplat_core.scene import LEVELS, LanguageField, TaughtWord
 from langsplat_core.scene.surface import SMALLEST
 
@@ -140,26 +141,19 @@ def by_examples(
     fits, above = likeness(word, space)
     every = [sigmoid(row) for row in fits]
     solid = [sizes >= min(SMALLEST, sizes.max(initial=0)) for sizes in regions.sizes]
-    peaks = triple(np.array([row[some].max(initial=0) for row, some in zip(every, solid, strict=True)]))
     best = np.where(solid[chosen], fits[chosen], -np.inf)
     excess = float(np.where(solid[chosen], above[chosen], -np.inf).max(initial=LEAST))
-    inside = solid[chosen] & (best >= min(0.0, best.max(initial=-np.inf)))
-    nothing = np.zeros(regions.everywhere.shape[1], np.float32)
-    relevancy = np.stack(
-        [regions.spread(at, row.astype(np.float32), nothing) for at, row in enumerate(every)]
-    )
-    place, box = regions.place(means, chosen, int(best.argmax()) if len(best) else -1)
-    return QueryResult(
-        phrase=word.name,
+    decision = Decision(
         level=chosen,
-        scores=peaks,
-        relevancy=relevancy,
-        even=relevancy[chosen],
-        peak=peaks[chosen],
+        scores=triple(np.array([row[some].max(initial=0) for row, some in zip(every, solid, strict=True)])),
         fits=triple(np.array([row[some].max(initial=LEAST) for row, some in zip(fits, solid, strict=True)])),
-        judgement=Verdict(excess >= 0, "example", excess),
-        members=regions.spread(chosen, inside, nothing > 0),
-        place=place,
-        box=box,
-        points=means,
+        common=0.0,
+        relevancies=every[chosen].astype(np.float32),
+        inside=solid[chosen] & (best >= min(0.0, best.max(initial=-np.inf))),
+        best=int(best.argmax()) if len(best) else -1,
+        verdict=Verdict(excess >= 0, "example", excess),
     )
+    firsts = np.cumsum([0, *map(len, every)])  # the last: of Gaussians in no region
+    rows = np.where(regions.everywhere < 0, firsts[-1], regions.everywhere + firsts[:-1, None])
+    relevancy = Relevancy(np.append(np.concatenate(every), 0).astype(np.float32), rows)
+    return by_regions(word.name, relevancy, decision, means, regions)
