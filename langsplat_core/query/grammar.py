@@ -103,7 +103,7 @@ def named(phrase: str) -> Named:
     *before, last = phrase.split() or [""]
     if not is_part(last):
         return "thing"
-    return "part" if only(ADJECTIVES | ARTICLES, before) else "part of a thing"
+    return "part" if only(_EMPTY, before) else "part of a thing"
 
 
 def thing_and_part(phrase: str) -> tuple[str, str]:

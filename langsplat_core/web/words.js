@@ -64,12 +64,12 @@ function forms(word) {
 }
 
 // The kind of a phrase: "thing", "part" or "part of a thing". lists: Sets of words by name.
-export function namedBy(phrase, { parts, adjectives, articles }) {
+export function namedBy(phrase, { parts, adjectives, stop_words: stops }) {
   const words = phrase.toLowerCase().split(" ");
   if (!forms(words.pop()).some((form) => parts.has(form))) {
     return "thing";
   }
-  return words.every((word) => adjectives.has(word) || articles.has(word)) ? "part" : "part of a thing";
+  return words.every((word) => adjectives.has(word) || stops.has(word)) ? "part" : "part of a thing";
 }
 
 // Thing and part of a "part of a thing": "red mug" and "handle" of "red mug handle"; else "".
@@ -78,11 +78,11 @@ export function thingAndPart(phrase, lists) {
   return [words.slice(0, -1).join(" "), words[words.length - 1]];
 }
 
-const AND = / (?:and|&|as well as) /iu;
+const AND = /(?:^| )(?:and|&|as well as)(?= |$)/iu;
 // Beginnings of questions: "where is the mug".
 const QUESTION = /^(?:(?:where|which)(?:'s| is| are)|(?:is|are) there|find(?: me)?|show me|look for) (?=.)/iu;
-const OR = / or /iu;
-const EXCLUDE = /,? (?:(?:but|and) )?(?:not|without|except|other than) /iu;
+const OR = /(?:^| )or(?= |$)/iu;
+const EXCLUDE = /,?(?: (?:but|and))? (?:not|without|except|other than)(?= |$)/giu;
 const SEPARATE = /[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)/iu;
 
 // Whether words name a thing: not only stop words and adjectives.
@@ -99,8 +99,19 @@ export function splitPhrases(line) {
 
 // A text split at separators, or undivided if one side would name nothing.
 function sidesOf(text, separator, lists) {
-  const sides = text.split(separator);
+  const sides = text.split(separator).map((side) => side.trim());
   return sides.every((side) => names(side, lists)) ? sides : [text];
+}
+
+// A text split into what is wanted and what is excluded, if both sides name something.
+function exclusions(text, lists) {
+  for (const { index, 0: mark } of text.matchAll(EXCLUDE)) {
+    const [before, after] = [text.slice(0, index), text.slice(index + mark.length).trim()];
+    if (names(before, lists) && names(after, lists)) {
+      return [before, ...exclusions(after, lists)];
+    }
+  }
+  return [text];
 }
 
 // The tree of a phrase: { text }, { kind, what, anchor }, { kind: "counted", count, what } or, for several, { kind,
@@ -111,7 +122,7 @@ export function parse(text, lists) {
   const both = (side) => group("both", sidesOf(side, AND, lists).map(one));
   const either = (side) => group("either", sidesOf(side, OR, lists).map(both));
   const isPart = (tree) => tree.text && namedBy(tree.text, lists) !== "thing";
-  const [what, ...others] = sidesOf(text.replace(QUESTION, ""), EXCLUDE, lists).map(either);
+  const [what, ...others] = exclusions(text.replace(QUESTION, ""), lists).map(either);
   const own = what.text && !isPart(what); // "mug without handle"
   const ofIt = (tree) => (own && isPart(tree) ? { kind: "inside", what: tree, anchor: what } : tree);
   return others.length ? { kind: "without", what, anchor: group("either", others.map(ofIt)) } : what;
@@ -122,8 +133,8 @@ function clause(text, lists) {
   const [first, second, ...others] = bare.split(" ");
   const [rest, more] = [[second, ...others], others].map((words) => words.join(" "));
   const kind = lists.superlatives.get(first.toLowerCase());
-  if (kind && lists.numbers.has(second?.toLowerCase()) && names(more, lists)) {
-    return clause(`${second} ${first} ${more}`, lists);
+  if (kind && lists.numbers.has(second?.toLowerCase())) {
+    return clause(`${second} ${first} ${more}`.trim(), lists);
   }
   if (kind && names(rest, lists)) {
     const what = related(rest, lists);

@@ -213,7 +213,8 @@ toy not penguin not teddy bear,picture of a boat on the wall,orange or apple,
 nearest toy near to the biggest toy,teapot and lid of the teapot,candle and banana,the bear's hat,
 9 toys or teddy bear,toy without penguin and teddy bear,lid of the teapot or candle,
 toy and painting but not the penguin,the penguin's candle,where is the teapot,show me the biggest toy,
-lid on the table,handle near the teapot,leaf near the laptop,leg below the table,lid above the table"""
+lid on the table,handle near the teapot,leaf near the laptop,leg below the table,lid above the table,
+with handle"""
 
 
 def test_page_reads_phrases_with_structure_as_python_does(tab: Tab, engine: QueryEngine) -> None:

@@ -126,7 +126,7 @@ def test_heads_exclude_what_they_are_related_to():
 
 NAMED = {
     "thing": ("", "mug", "red mug", "handle of", "handle mug"),
-    "part": ("handle", "Handles", "the red handle"),
+    "part": ("handle", "Handles", "the red handle", "with handle"),
     "part of a thing": ("mug handle", "the red mug handles", "lamp shade"),
 }
 
