@@ -387,6 +387,13 @@ def use_the_mouse_alone(s: Any) -> None:
     glfw.set_window_size(glfw_window_hello_imgui(), 400, 300)
     s.until(lambda: 200 < s.state.size[0] < 400)
     assert s.ctx.item_info("//**/Train one ...").rect_full.max.x < scene_area().corners[1].x
+    for number in range(12):
+        (s.folder / f"within {number}").mkdir()
+    opening.ask_for_file(s.viewer)
+    s.rest(4)
+    assert s.ctx.item_info("//**/Cancel").rect_full.max.y < 300
+    s.click("//**/Cancel")
+    assert s.state.choice is None
     glfw.set_window_size(glfw_window_hello_imgui(), 1040, 620)
     s.until(lambda: s.state.size[0] == wide)
 

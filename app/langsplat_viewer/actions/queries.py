@@ -100,8 +100,10 @@ def _answer_of(composed: ComposedResult, members: Array | None, has_evidence: bo
     """Return the answer with all that is shown of it; members: (N,) bool that were given it as a name."""
     # A copy has its arrays: they are made here, and not by the thread that draws.
     found = like = replace(composed.answer)
-    if members is not None:
-        found = _alone(like, members)
+    if members is not None:  # the answer is the thing that was given the name
+        place, box = place_of(like.points[members])
+        judgement = Verdict(True, like.judgement.reached, max(like.judgement.margin, 0.0))
+        found = replace(like, members=members, place=place, box=box, judgement=judgement)
     if found.verdict != "not here":
         _ = found.smooth  # kept with it, for the first image that shows it
     return QueryAnswer(
@@ -111,13 +113,6 @@ def _answer_of(composed: ComposedResult, members: Array | None, has_evidence: bo
         has_evidence=has_evidence,
         like=like if members is not None and (like.members & ~members).any() else None,
     )
-
-
-def _alone(like: QueryResult, members: Array) -> QueryResult:
-    """Return the answer to a name restricted to the thing that was given the name."""
-    place, box = place_of(like.points[members])
-    judgement = Verdict(True, like.judgement.reached, max(like.judgement.margin, 0.0))
-    return replace(like, members=members, place=place, box=box, judgement=judgement)
 
 
 def _tell_apart(viewer: Viewer, engine: QueryEngine, phrase: str, result: QueryResult) -> None:

@@ -275,7 +275,9 @@ def _path_box(viewer: Viewer, choice: FileChoice) -> None:
         settings.choose(viewer, typed)
         drafts["##path"] = typed
     offers = completions(drafts.get("##path", ""), folder, _offered(choice))
-    if ui.begin_list("offers", MOST_ROWS):
+    below = imgui.get_main_viewport().size.y - imgui.get_cursor_screen_pos().y
+    rows = below / imgui.get_frame_height_with_spacing() - 2  # the last row is that of Cancel
+    if ui.begin_list("offers", max(min(MOST_ROWS, rows), 2)):
         for offer in offers[saves:]:  # a name to save under stays when folders are looked through
             name = Path(offer).name + os.sep * offer.endswith(os.sep) if offer != offers[0] else ABOVE
             if imgui.selectable(name, False, imgui.SelectableFlags_.no_auto_close_popups)[0]:
