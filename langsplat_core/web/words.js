@@ -12,7 +12,7 @@ export function tokens(text) {
     .replace(APOSTROPHES, "'")
     .normalize("NFKC")
     .replace(CONTROL, " ")
-    .replace(/([\p{L}\p{N}_])\s+'s\b/gu, "$1's");
+    .replace(/(?<=[\p{L}\p{N}_])\s+'s(?![\p{L}\p{N}_])/gu, "'s");
   const found = (plain.match(/,|[^\s,;]+/gu) || [])
     .map((piece) => (piece === "," ? piece : bareWord(piece)))
     .filter(Boolean);

@@ -269,6 +269,7 @@ def without_encoder(demo: Scene, **field: Any) -> tuple[Scene, QueryEngine]:
 
 def test_page_without_encoder_answers_phrasebook_and_taught_words(browser, demo, engine, tmp_path):
     book = dict(zip(PHRASES[:60], engine.text_vectors(PHRASES[:60]), strict=True))
+    book["duck sœur"] = engine.text_vectors(["duck"])[0]  # a quoted word of other letters is no possessive
     word = QueryEngine(demo).teach("bruno", engine.run("teddy bear").members)
     words = word, replace(word, name="bear of anna")
     scene, other = without_encoder(demo, phrasebook=book, taught=words)
@@ -280,6 +281,7 @@ def test_page_without_encoder_answers_phrasebook_and_taught_words(browser, demo,
             expected = other.run(phrase, level)
             same(tab.ask(phrase, level), expected, int(expected.members[visible].sum()))
         same_reading(tab, other, "lid of the teapot,nose of bruno,laptop and bear of anna,two brunos")
+        same_reading(tab, other, "duck 'sœur'")
         tab.page.fill("#phrase", "zebra")
         tab.page.press("#phrase", "Enter")
         assert "zebra" in tab.page.inner_text("#verdict")
