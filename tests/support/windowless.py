@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from langsplat_core.errors import FormatError
 from langsplat_core.scene import Scene
@@ -77,6 +78,11 @@ def render_image(request: RenderRequest, backend: Backend = "auto") -> np.ndarra
     """Return the (H, W, 3) uint8 image, row 0 on top, (H, W, 4) of a transparent one."""
     with open_renderer(backend) as renderer:
         return renderer.read(request)
+
+
+def picture(path: Path) -> np.ndarray:
+    """Return (H, W, 3), of a transparent one (H, W, 4), numbers of an image file."""
+    return np.asarray(Image.open(path)).astype(int)
 
 
 def load(path: Path) -> Scene:

@@ -37,7 +37,7 @@ from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight, write_flight
 from langsplat_viewer.rendering.request import RenderRequest, plain_request
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import errors, flight, open_scene, recorded, render_image
+from tests.support.windowless import errors, flight, open_scene, picture, recorded, render_image
 
 # Through their keyframes, smooth between them, at rest where nothing changes.
 
@@ -417,10 +417,6 @@ def shot(away: float = 0.0, **changed) -> Shot:
     return Shot(request(), cameras_of(flight(away), extent_of(blob_scene()), given["fps"], SIZE), **given)
 
 
-def picture(path: Path) -> np.ndarray:
-    return np.asarray(Image.open(path).convert("RGB")).astype(int)
-
-
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder, with a scene and two paths in it."""
@@ -527,10 +523,8 @@ def test_film_of_nothing_is_refused(folder):
         (["--path", "path.json", "--out", "a.png"], "a film is .mp4"),
         (["--fps", "9", "--out", "a.png"], "--fps: is only used with --path or --turntable"),
         (["--path", "broken.json", "--out", "a.mp4"], "broken.json"),
-        (["--path", "nope.json", "--out", "a.mp4"], "nope.json: no such file"),
         (["--turntable", "0", "--out", "a.mp4"], "--turntable 0"),
         (["--turntable", "36000", "--fps", "240", "--out", "a.mp4"], "lower --fps"),
-        (["--turntable", "1", "--out", "blobs.ply/film"], "is a file"),
         (["--turntable", "1", "--size", "33x24", "--out", "a.mp4"], "choose 32x24"),
     ],
 )

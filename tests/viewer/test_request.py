@@ -1,11 +1,9 @@
 """Render requests: what they depend on, their panes, the edited scene; and that every image is one."""
 
 from dataclasses import MISSING, fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.raster.reference import ReferenceRasterizer
@@ -39,6 +37,7 @@ from tests.support.windowless import (
     go,
     on_screen,
     open_scene,
+    picture,
     recorded,
     rest,
     result,
@@ -69,10 +68,6 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     viewer.change(split=split)
 
 
-def image(path: Path) -> np.ndarray:
-    return np.asarray(Image.open(path)).astype(int)
-
-
 @pytest.mark.parametrize("mode", ["wipe", "levels"])
 @pytest.mark.parametrize("backend", ["cpu", "opengl"])
 def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backend):
@@ -93,18 +88,18 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
 
     rest(canvas, state, 1.0)
     screen = state.session.split.joined(on_screen(canvas), state.size[0]).astype(int)
-    images = {"screen": screen, "saved": image(saving.save_picture(opened, tmp_path))}
+    images = {"screen": screen, "saved": picture(saving.save_picture(opened, tmp_path))}
     settings.put(opened.state.record, size=state.size)
     saving.save_sized_picture(opened, tmp_path)
     recorded(opened)
-    images["sized"] = image(next(tmp_path.glob("*-160x120*.png")))
+    images["sized"] = picture(next(tmp_path.glob("*-160x120*.png")))
     viewpoint.turn_around(opened)
     viewpoint.set_path_seconds(opened, 1.0)
     opened.state.record.fps = 2.0
     opened.state.record.film_file = "film"
     saving.save_film(opened, tmp_path)
     recorded(opened)
-    images["film"] = image(tmp_path / "film" / "frame-00000.png")
+    images["film"] = picture(tmp_path / "film" / "frame-00000.png")
     expected = ArrayRenderer(ReferenceRasterizer()).read(request).astype(int)
     bare = ArrayRenderer(ReferenceRasterizer()).read(replace(request, scene=edited_scene(state.scene)))
     assert np.abs(bare - expected).max() > 60  # the edits are seen

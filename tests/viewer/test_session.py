@@ -74,9 +74,7 @@ def test_undo_and_redo_restore_queries(opened):
 NAMED = {
     "select 360 Gaussians": editing.select_all,
     "search 'mug'": lambda viewer: ask(viewer, "mug"),
-    "delete 360 Gaussians": lambda viewer: editing.select_all(viewer) or editing.delete_selected(viewer),
     "transform": lambda viewer: editing.transform(viewer, moving(np.ones(3))),
-    "note": lambda viewer: settings.pin_at(viewer, 0.5, 0.5),
     "display": lambda viewer: settings.set_display(viewer, "depth"),
 }
 

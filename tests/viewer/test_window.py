@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.io.cameras import write_cameras
@@ -25,6 +24,7 @@ from langsplat_viewer.options import load_text_encoder, parse_size
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.processes import Cast, play, python, surroundings
 from tests.support.scenes import with_tree
+from tests.support.windowless import picture
 
 MUG, BOOK, PLANT = CENTRES
 
@@ -47,10 +47,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "empty.json").write_text("[]")
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def picture(path: Path) -> np.ndarray:
-    return np.asarray(Image.open(path)).astype(int)
 
 
 def draw(run_viewer, out: str, *arguments: str) -> list[str]:
@@ -141,13 +137,10 @@ REFUSED = [  # words, and why
         ([*arguments, *IMAGE], reason)
         for arguments, reason in [
             (["nope.ply"], "nope.ply: no such file"),
-            (["."], "is a folder"),
-            (["x" * 5000 + ".ply"], "cannot be opened"),
             (["truncated.ply"], "truncated.ply: truncated"),
             (["nothing.ply"], "the scene holds no Gaussians"),
             (["edited.ply", "--query", "mug"], "edited.langsplat.safetensors"),
             (["blobs.ply", "--query", "sofa"], "'sofa'"),
-            (["blobs.ply", "--query", " "], "empty"),
             (["blobs.ply", "--camera", "3"], "cameras 0 to 2"),
             (["blobs.ply", "--camera", "nope.json"], "nope.json: no such file"),
             (["blobs.ply", "--camera", "broken.json"], "broken.json"),
@@ -170,8 +163,6 @@ REFUSED = [  # words, and why
             (["--headless"], "add --out"),
             (["--headless", "--out", "a.jpg"], "end the name in .png"),
             (["--headless", "--out", "folder.png"], "is a folder"),
-            (["--headless", "--out", "blobs.ply/a.png"], "is a file, not a folder"),
-            (["--headless", "--out", "x" * 5000 + ".png"], "choose another"),
             (["--out", "a.png"], "with --headless"),
             (["--transparent"], "with --headless"),
         ]

@@ -87,13 +87,9 @@ TENSORS = {
 }  # fmt: skip
 
 
-def sparse(layout: torch.layout, *parts: Any) -> Crafted:
-    return Crafted(torch._utils._rebuild_sparse_tensor, layout, parts)  # noqa: SLF001
-
-
-FAR = torch.tensor([[10**12, -5, 3], [7, 10**15, -1]])
+FAR = torch.tensor([[10**12, -5, 3], [7, 10**15, -1]]), torch.ones(3), FIT
 NAMES = {  # of other tensors, and of what makes them, all of which torch alone would call
-    "COO": sparse(torch.sparse_coo, FAR, torch.ones(3), FIT),
+    "COO": Crafted(torch._utils._rebuild_sparse_tensor, torch.sparse_coo, FAR),  # noqa: SLF001
     "meta": torch.ones(FIT, device="meta"),
     "complex": torch.ones(FIT, dtype=torch.complex64),
     "uninitialised": Crafted(torch.FloatTensor, 4, 3),
