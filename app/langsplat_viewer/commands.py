@@ -239,6 +239,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             apart=True,
         ),
         Command("pin a note to what is clicked", settings.toggle_pinning, ("N",), is_on=_is("pins_notes")),
+        Command("click the middle of the image", editing.click_middle, ("X",)),
     ),
     "Camera": (
         Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Reset"),
@@ -299,6 +300,7 @@ HELD: tuple[tuple[str, str], ...] = (
     ("W A S D, Q E", "fly ahead, left, back, right, down, up"),
     ("Shift, Alt", "fly faster, slower"),
     ("[ ]", "roll"),
+    ("Keypad 4 6 8 2, + -", "turn around the centre, nearer, farther"),
     ("Tab, arrows, Enter", "travel in a panel; the box of the search completes by Tab, recalls by arrow up"),
     ("Ctrl + Tab", "to the next panel, the strip of icons, or the menus"),
     ("Menu, Shift + F10", "what can be done with a row of the outline"),

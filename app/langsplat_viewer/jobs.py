@@ -163,10 +163,8 @@ class Worker:
     @property
     def current(self) -> tuple[str, float] | None:
         """Label and fraction of the present job, for the status line; None when idle or being cancelled."""
-        for job in self._jobs:
-            if not job.stopped.is_set():
-                return job.reached.text or job.label, job.reached.fraction
-        return None
+        job = next((job for job in self._jobs if not job.stopped.is_set()), None)
+        return None if job is None else (job.reached.text or job.label, job.reached.fraction)
 
     @property
     def is_running(self) -> bool:

@@ -9,15 +9,7 @@ import numpy as np
 import tyro
 
 from langsplat_core.cli.arguments import Needs
-from langsplat_core.config import (
-    ColourMap,
-    Display,
-    HeatOf,
-    LevelChoice,
-    PictureConfig,
-    Range,
-    Share,
-)
+from langsplat_core.config import ColourMap, Display, HeatOf, LevelChoice, PictureConfig, Range, Share
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError
 from langsplat_core.io.cameras import read_cameras
@@ -96,9 +88,8 @@ class ViewerOptions:
     @property
     def shown_display(self) -> Display:
         """Relevancy when something is searched, colours otherwise, unless a display is named."""
-        if self.display == "auto":
-            return "relevancy" if self.query else "rgb"
-        return self.display
+        found: Display = "relevancy" if self.query else "rgb"
+        return found if self.display == "auto" else self.display
 
     @property
     def picture(self) -> PictureConfig:

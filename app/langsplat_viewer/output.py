@@ -35,10 +35,8 @@ MOST_FRAMES = 100_000
 
 def free_name(folder: Path, stem: str, suffix: str, companions: tuple[str, ...] = ()) -> Path:
     """Return the first of stem-001, stem-002, ... that is free in `folder`, with each of `companions`."""
-    for number in count(1):
-        name = f"{stem}-{number:03d}"
-        if not any((folder / f"{name}{ending}").exists() for ending in (suffix, *companions)):
-            break
+    names, endings = (f"{stem}-{number:03d}" for number in count(1)), (suffix, *companions)
+    name = next(name for name in names if not any((folder / f"{name}{end}").exists() for end in endings))
     return folder.absolute() / f"{name}{suffix}"
 
 

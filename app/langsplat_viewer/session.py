@@ -27,8 +27,7 @@ from langsplat_viewer.rendering.request import Clip, Splats, Split, widget
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
 LONGEST_NAME, LONGEST_NOTE = 80, 500  # characters
-MOST_BOOKMARKS = 50
-MOST_NOTES = 1000
+MOST_BOOKMARKS, MOST_NOTES = 50, 1000
 
 Coordinate = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]  # world units
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -255,10 +254,9 @@ class Session:
     def without(self, phrases: Collection[str]) -> "Session":
         """Return the session without some queries; for the chosen one the latest is chosen, and shown."""
         left = tuple(query for query in self.queries if query.phrase not in phrases)
-        session = replace(self, queries=left)
         if self.chosen not in phrases:
-            return session
-        session = replace(session, chosen=left[-1].phrase if left else "")
+            return replace(self, queries=left)
+        session = replace(self, queries=left, chosen=left[-1].phrase if left else "")
         return session if session.in_order_of_showing() else session.showing(session.chosen)
 
     def answering(self, phrase: str, painted: bool, beside: Collection[str]) -> "Session":
@@ -275,8 +273,7 @@ class Session:
 
     def undone(self, now: "Session") -> "Session":
         """Return this earlier session with what is never undone as it is `now`."""
-        ruler = now.ruler if now.moves == self.moves else replace(now.ruler, points=())
-        return replace(self, ruler=ruler)
+        return replace(self, ruler=now.ruler if now.moves == self.moves else replace(now.ruler, points=()))
 
     def of_next_scene(self) -> "Session":
         """Return the session that another scene begins with: settings of the window stay."""
@@ -290,8 +287,7 @@ class Session:
         """
         kept: dict[str, Any] = {name: getattr(now, name) for name in OF_WINDOW}
         kept |= {"picture": replace(now.picture, display=self.picture.display)}
-        kept |= {"latent_level": self.latent_level}
-        return replace(self, **kept, marks=Marked(), moves=())
+        return replace(self, **kept | {"latent_level": self.latent_level}, marks=Marked(), moves=())
 
 
 # What led from a session to the next, for undo to name it.

@@ -26,7 +26,7 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 import glfw  # isort: skip
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import viewpoint
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.canvas import MOVING_BUDGET
 from langsplat_viewer.options import ViewerOptions
@@ -273,6 +273,13 @@ def typing(window: Window) -> Iterator[None]:
     assert (state.drafts["##phrase"], state.show_panel) == ("book", True)
     yield from press(window, "up_arrow")
     assert state.drafts["##phrase"] == "plant"
+    yield from press(window, "escape")
+    settings.turn_panel(window.viewer, "Transform", is_open=True)
+    settings.open_panel(window.viewer, "Transform")
+    for _ in range(8):
+        yield
+    yield from press(window, *["tab"] * 7, "2", "tab", "1", "tab", "escape")
+    assert (state.edit_form.move, state.session.picture.display) == ((2.0, 1.0, 0.0), "relevancy")
     print("PASSED", flush=True)
 
 

@@ -853,3 +853,75 @@ def travel_by_keys(s: Any) -> None:
         s.key("down_arrow", frames=2)
     s.key("enter", frames=3)
     assert s.state.session.picture.display == "depth"
+
+
+def do_without_a_mouse(s: Any) -> None:
+    """Tab leads to a field from the first frame on, and from where something is gone."""
+    s.key("tab", frames=3)
+    assert imgui.get_io().want_text_input  # the box of the search
+    s.key("escape", frames=2)
+    for name in ("one", "two"):
+        viewpoint.add_bookmark(s.viewer, name)
+    s.open_panel("Bookmarks", frames=3)
+    for _ in range(7):  # to what takes the second off
+        s.key("tab", frames=2)
+    s.key("space", frames=3)
+    assert [mark.name for mark in s.state.session.bookmarks] == ["one"]
+    s.key("tab", frames=4)
+    assert imgui.internal.get_focus_id() == s.ctx.item_info("//Inspector/Display").id_
+    s.open_panel("Search", frames=3)
+    assert imgui.get_current_context().nav_window.name == "Search"
+    s.key("f1", frames=3)
+    s.click("//Help/pages/Keys", frames=2)
+    top = imgui.internal.find_window_by_name("Help").scroll.y
+    s.key("page_down", frames=3)
+    assert imgui.internal.find_window_by_name("Help").scroll.y > top + 100
+    s.key("escape", frames=2)
+    click_with_a_key(s)
+    turn_with_keys(s)
+
+
+def click_with_a_key(s: Any) -> None:
+    """X clicks the middle of the image, for the ruler, a note and a tool, and to turn around it."""
+    queries.ask(s.viewer, "plant")
+    s.settle()
+    s.key("F")
+    s.key("M", frames=2)
+    s.key("X")
+    viewpoint.move(s.viewer, lambda view: pan(view, 10, 0, s.state.size))
+    s.settle()
+    s.key("X")
+    assert 0 < s.state.session.ruler.length < 0.5
+    s.key("N", frames=2)
+    s.key("X")
+    s.wait(lambda: imgui.get_io().want_text_input)
+    s.type("a fern")
+    s.key("escape", frames=2)
+    (note,) = s.state.session.notes
+    assert note.text == "a fern", note.text
+    assert np.linalg.norm(note.at - PLANT) < 0.5
+    s.key("escape", frames=2)
+    before = s.state.view
+    s.key("X")
+    assert s.state.view.distance < before.distance  # the surface, not the middle of the plant
+    editing.use_tool(s.viewer, "thing")
+    s.key("X")
+    assert marked(s.viewer)[0] == "plant"
+    s.key("escape", frames=2)
+
+
+def turn_with_keys(s: Any) -> None:
+    """The keypad turns around the centre and goes nearer; the line of a comparison is moved by a number."""
+    before = s.state.view
+    for key in (imgui.Key.keypad6, imgui.Key.keypad_add):
+        s.ctx.key_down(key)
+        s.ctx.yield_(8)
+        s.ctx.key_up(key)
+    np.testing.assert_allclose(s.state.view.target, before.target)
+    assert s.state.view.distance < before.distance
+    assert s.state.view.rotation[2] @ before.rotation[2] < 0.9999
+    s.key("V")
+    s.open_panel("Display")
+    s.ctx.item_input_value("//**/Line", 0.25)
+    s.settle()
+    assert s.state.session.split.at == 0.25

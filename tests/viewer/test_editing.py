@@ -69,6 +69,13 @@ def test_hidden_and_deleted_are_never_selected(opened):
         assert marked(opened) == expected, action
 
 
+def test_selecting_what_is_hidden_says_so(opened):
+    take(opened, blob("mug"))
+    editing.hide_selected(opened)
+    take(opened, blob("mug"))
+    assert "hidden" in opened.state.messages[-1].text
+
+
 @pytest.mark.parametrize(
     ("mode", "selected"),
     [("replace", "book plant"), ("add", "mug book plant"), ("remove", "mug"), ("intersect", "book")],

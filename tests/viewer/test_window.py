@@ -250,7 +250,8 @@ SCENARIOS = [
     "reload_what_changed", "search_a_library", "see_the_evidence", "large_letters", "use_the_toolbar",
     "drag_the_crop_box", "pin_a_note", "open_many_scenes", "use_the_outline", "compare_two_scenes",
     "offers_keep_still", "say_what_is_not_here", "begin_at_the_start_page", "toasts_offer_what_follows",
-    "choose_in_the_systems_dialog", "export_from_the_menu", "broken_panel", "use_the_mouse_alone",
+    "choose_in_the_systems_dialog", "export_from_the_menu", "do_without_a_mouse", "broken_panel",
+    "use_the_mouse_alone",
 ]  # fmt: skip
 
 

@@ -515,6 +515,7 @@ OPENED = {  # scene and request of the scenarios that do not just open "blobs.pl
 KEEPS_SEARCH = {  # open, as it is at first
     *("without_field", "begin_at_the_start_page", "find_settings", "offers_keep_still", "many_queries"),
     *("arrange_panels", "leave_settings", "travel_by_keys", "use_shortcuts", "large_letters"),
+    "do_without_a_mouse",
 }
 
 

@@ -22,7 +22,8 @@ from langsplat_core.scene import LEVELS
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
 from langsplat_viewer import marks
 from langsplat_viewer.actions.queries import ask_listed, forget_unlisted, teach, teach_given
-from langsplat_viewer.actions.settings import open_panel
+from langsplat_viewer.actions.settings import measure_at, open_panel, pin_at
+from langsplat_viewer.actions.viewpoint import focus_pixel
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.marks import Drawn, Marks, Mode, Stroke, Tool
 from langsplat_viewer.rendering.request import UNCLIPPED
@@ -51,6 +52,8 @@ def put_marks(viewer: Viewer, marks: Marks) -> None:
 def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
     """Combine the selection with `found` (N,) bool, by `mode` or, None, the mode that is set."""
     state = viewer.state
+    if found.any() and not (found & state.marks.shown).any():
+        state.say("all of it is hidden or deleted, which is not selected")
     mark(viewer, marks.combined(state.marks, found, mode or state.tools.mode))
 
 
@@ -209,6 +212,15 @@ def begin_stroke(viewer: Viewer, u: float, v: float) -> None:
             return
     state.glide = None
     set_tools(viewer, stroke=Stroke(((u, v),), centre))
+
+
+def click_middle(viewer: Viewer) -> None:
+    """Click the middle of the image, for ruler, note or tool; without one, turn around what is there."""
+    act = focus_pixel if viewer.state.tools.tool is None else begin_stroke
+    act = pin_at if viewer.state.pins_notes else act
+    act = measure_at if viewer.state.session.ruler.measures else act
+    act(viewer, 0.5, 0.5)
+    end_stroke(viewer)  # where one has begun
 
 
 def extend_stroke(viewer: Viewer, u: float, v: float) -> None:

@@ -89,11 +89,8 @@ def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = (), *, alike
         elif found.result is not None and found.result.found:
             _tell_apart(viewer, engine, phrase, found.result)
 
-    def failed(reason: str) -> None:
-        done(QueryAnswer(problem=reason))
-
     state.answers[phrase] = replace(state.answers.get(phrase, QueryAnswer()), pending=True)
-    viewer.run(f"searching '{phrase}'", work, done, failed)
+    viewer.run(f"searching '{phrase}'", work, done, lambda reason: done(QueryAnswer(problem=reason)))
 
 
 def _answer_of(composed: ComposedResult, members: Array | None, has_evidence: bool) -> QueryAnswer:

@@ -31,13 +31,7 @@ from langsplat_viewer.actions.viewpoint import bookmarked_view, path_seconds
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import say_compiling
-from langsplat_viewer.projects import (
-    PATHS,
-    PROJECTS,
-    Project,
-    write_flight,
-    write_project,
-)
+from langsplat_viewer.projects import PATHS, PROJECTS, Project, write_flight, write_project
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.session import Bookmark, Session
 from langsplat_viewer.state import ExportForm, FileChoice, Leaving, SceneState, flight_of
@@ -178,10 +172,9 @@ def save_edited(viewer: Viewer, folder: Path, then: Callable[[Viewer], None] = l
         _count_as_saved(viewer, shown, marked)
         then(viewer)
 
-    def failed(reason: str) -> None:
-        viewer.say_error(f"not saved: {reason}")
-
-    state.writing = viewer.run("saving the scene", work, done, failed).future
+    state.writing = viewer.run(
+        "saving the scene", work, done, lambda reason: viewer.say_error(f"not saved: {reason}")
+    ).future
 
 
 def _count_as_saved(viewer: Viewer, shown: Scene, session: Session) -> None:
@@ -376,10 +369,7 @@ def _page(viewer: Viewer) -> Callable[[Path, Scene, Progress], str]:
 
 def save(viewer: Viewer) -> None:
     """Save the project to its file; where it has none yet, a dialog asks for one."""
-    if viewer.state.project is None:
-        save_as(viewer)
-    else:
-        save_project(viewer)
+    (save_as if viewer.state.project is None else save_project)(viewer)
 
 
 def save_as(viewer: Viewer) -> None:
@@ -410,9 +400,7 @@ def save_project(viewer: Viewer, to: Path = Path(), of: SceneState | None = None
     )
     written: list[tuple[str, Path | None]] = []
 
-    def apart() -> Path:
-        return output.free_name(path.parent, f"{path.name.removesuffix(PROJECTS)}-other", PROJECTS)
-
+    apart = partial(output.free_name, path.parent, f"{path.name.removesuffix(PROJECTS)}-other", PROJECTS)
     if viewer.save(path, lambda: written.append(write_project(path, project, apart, known))) is None:
         return None
     ((state.project_digest, kept),) = written

@@ -445,5 +445,4 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
 def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
     """Return the view of a bookmark."""
     view = flight.view_of(bookmark.pose, extent)
-    target = view.eye + bookmark.distance * view.rotation[2]
-    return replace(view, target=target, distance=bookmark.distance)
+    return controls.focus(view, view.eye + bookmark.distance * view.rotation[2], bookmark.distance)

@@ -203,12 +203,10 @@ class Docks:
         foot = ImVec2(0, menus.STATUS_EM if shown else 0)  # room for the status line
         params.imgui_window_params.full_screen_window_margin_bottom_right = foot
         if wanted and shown:  # in front of those that it shares its place with
-            docked = wanted in self._shown
-            is_section = not docked and any(p.title == wanted and p.dock for p in all_panels())
-            if docked or is_section:
-                docking.focus_dockable_window(wanted if docked else INSPECTOR)
-            if not is_section:  # which is scrolled to when it is drawn
+            if docked := wanted in self._shown:  # the others take it when they are drawn
                 settings.take(state, "wanted_panel")
+            if wanted != search.TITLE:
+                docking.focus_dockable_window(wanted if docked else INSPECTOR)
 
 
 def draw_titles(viewer: Viewer) -> None:
@@ -280,6 +278,9 @@ def _float_search(viewer: Viewer, area: ui.Area, left: float) -> ui.Area:
             width = imgui.get_window_width()
         return area.right_of(left + margin + width)
     imgui.set_next_window_size_constraints(ImVec2(width, 0), ImVec2(width, area.height - 2 * margin))
+    if viewer.state.wanted_panel == search.TITLE:
+        settings.take(viewer.state, "wanted_panel")
+        imgui.set_next_window_focus()  # for Tab and arrows
     with ui.floating(search.TITLE, at, padding_em=0.9):
         search.draw(viewer)
     return area.right_of(left + margin + width)

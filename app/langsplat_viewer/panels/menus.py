@@ -234,6 +234,8 @@ def draw_help(viewer: Viewer) -> None:
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Help", True, flags)
     settings.put(viewer.state, show_help=bool(still_open))
+    pages = imgui.is_key_pressed(imgui.Key.page_down) - imgui.is_key_pressed(imgui.Key.page_up)
+    imgui.set_scroll_y(imgui.get_scroll_y() + pages * imgui.get_window_height() / 2)
     imgui.text_disabled(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
     if imgui.begin_tab_bar("pages"):
         keys = [(", ".join(command.keys), command.does) for command in COMMANDS if command.keys]

@@ -28,6 +28,7 @@ class Keyboard:
         self._state = state
         self._kept = imgui.ImVector_InputEvent()
         self._waited = 0  # frames
+        self._tabbed = self._is_lost = False  # in the last frame: Tab was pressed, nothing had the focus
 
     @property
     def is_waiting(self) -> bool:
@@ -37,9 +38,10 @@ class Keyboard:
     def feed(self) -> None:
         """Give imgui the keys that belong to the next frame; before it begins."""
         queue, typing = imgui.get_current_context().input_events_queue, imgui.get_io().want_text_input
-        keeps = self._state.awaits_keyboard and self._waited < FOCUS_FRAMES[not typing]
-        self._state.awaits_keyboard, self._waited = keeps, self._waited + 1 if keeps else 0
-        now, has_text = imgui.ImVector_InputEvent(), False
+        self._is_lost = not imgui.get_current_context().nav_id_is_alive
+        waits = self._state.awaits_keyboard and self._waited < FOCUS_FRAMES[not typing]
+        self._state.awaits_keyboard, self._waited = waits, self._waited + 1 if waits else 0
+        keeps, now, has_text = waits or self._tabbed, imgui.ImVector_InputEvent(), False
         for event in sorted(queue, key=lambda event: event.event_id):
             keeps |= has_text and event.type == KEY  # not what a held key repeats: that would pile up
             (self._kept if keeps and event.type in (KEY, TEXT) else now).push_back(event)
@@ -53,14 +55,17 @@ class Keyboard:
         for event in self._kept:
             imgui.get_current_context().input_events_queue.push_back(event)
         self._kept.clear()
+        self._tabbed, window = imgui.is_key_pressed(imgui.Key.tab), imgui.get_current_context().nav_window
+        if self._tabbed and self._is_lost and window is not None:
+            imgui.internal.nav_init_window(window, True)  # else Tab would lead nowhere
+            imgui.set_nav_cursor_visible(True)
 
 
 # Pressed keys run commands.
 
 NAMED = {  # keys whose name in imgui is another
     "Esc": "escape",
-    "PageUp": "page_up",
-    "PageDown": "page_down",
+    **{f"Page{way}": f"page_{way.lower()}" for way in ("Up", "Down")},
     **{name: f"{name.lower()}_arrow" for name in ("Left", "Right", "Up", "Down")},
 }
 MODIFIERS = {name: imgui.Key[f"mod_{name.lower()}"] for name in ("Ctrl", "Shift", "Alt")}
@@ -110,7 +115,7 @@ def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool
 
 # Mouse and held keys over the scene.
 
-ROLL_SPEED = 1.0  # radians per second
+TURN_SPEED = 1.0  # radians per second, of keys
 LONGEST_FRAME = 0.1  # seconds; a stalled frame must not throw a flying camera across the scene
 WHEEL_STEP = 0.88  # factor of the distance per notch
 
@@ -184,6 +189,11 @@ def _fly(viewer: Viewer) -> None:
         factor = 4.0 if io.key_shift else 0.25 if io.key_alt else 1.0
         step = factor * viewer.state.preferences.fly_speed * extent.radius * seconds
         viewpoint.move(viewer, lambda view: controls.fly(view, right * step, up * step, ahead * step))
-    turn = held(key.right_bracket, key.left_bracket)
-    if turn:
-        viewpoint.move(viewer, lambda view: controls.roll(view, turn * ROLL_SPEED * seconds))
+    turn = TURN_SPEED * seconds
+    if roll := held(key.right_bracket, key.left_bracket):
+        viewpoint.move(viewer, lambda view: controls.roll(view, roll * turn))
+    yaw, pitch = held(key.keypad6, key.keypad4), held(key.keypad2, key.keypad8)
+    if yaw or pitch:
+        viewpoint.move(viewer, lambda view: controls.orbit(view, yaw * turn, pitch * turn))
+    if nearer := held(key.keypad_add, key.keypad_subtract):
+        viewpoint.zoom_by(viewer, WHEEL_STEP ** (10 * nearer * turn))

@@ -15,6 +15,7 @@ from langsplat_core.query.answers import FLOOR
 from langsplat_viewer.actions import opening, settings
 from langsplat_viewer.commands import BUTTONS, Button, buttons_of, is_shown
 from langsplat_viewer.panels import theme, ui
+from langsplat_viewer.rendering.request import AT_RANGE
 from langsplat_viewer.viewer import Training, Viewer
 
 
@@ -74,7 +75,9 @@ def draw_display(viewer: Viewer) -> None:
     for _, group in groupby(DISPLAYS.values(), lambda row: row.name if row.by_level else row.needs_query):
         _display_line(viewer, tuple(group))
     _compared(viewer)
-    picture = viewer.state.session.picture
+    picture, split = viewer.state.session.picture, viewer.state.session.split
+    if split.has_line:
+        settings.move_line(viewer, ui.slider("Line", split.at, AT_RANGE))
     needs_query = DISPLAYS[picture.display].needs_query
     if needs_query and not viewer.state.shown():
         ui.small_wrapped("search for something to see where it is")

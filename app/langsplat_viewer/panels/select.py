@@ -103,7 +103,7 @@ HINTS: dict[Tool, str] = {
     "sphere": "drag from the middle outwards, or click",
     "box": "drag from the middle outwards, or click",
 }
-TOOL_KEYS = "Shift adds, Ctrl removes, both intersect; Esc leaves"
+TOOL_KEYS = "Shift adds, Ctrl removes, both intersect; X clicks the middle, Esc leaves"
 LIGHT, DARK = (1.0, 1.0, 1.0, 0.95), (0.0, 0.0, 0.0, 0.6)  # a line in two colours is seen on every image
 PAINT = (*SELECTED, 0.35)
 
@@ -160,15 +160,18 @@ def draw_hint(viewer: Viewer, area: ui.Area) -> None:
     """Say what a click on the scene does, while it does not turn the view."""
     state, tool = viewer.state, viewer.state.tools.tool
     if state.session.ruler.measures:
-        text = "Ruler: click two points on the surface; Esc ends it"
+        text = "Ruler: click two points on the surface, or X: the middle; Esc ends it"
         if state.scene is not None and state.scene.metres_per_unit is None:
             text += ". langsplat scale gives the scene metres"
     elif state.pins_notes:
-        text = "Note: click what it is about; Esc leaves"
+        text = "Note: click what it is about, or X: the middle; Esc leaves"
     elif tool is not None:
         text = f"{tool.capitalize()}: {HINTS[tool]}. {TOOL_KEYS}"
     else:
         return
+    if tool not in marks.ON_SCREEN:  # where X clicks
+        low, high = ui.scene_area().corners
+        imgui.get_foreground_draw_list().add_circle((low + high) / 2, 4.0, imgui.get_color_u32(LIGHT))
     say(text, area, "tool", hello_imgui.em_size(0.7 if state.session.split.mode == "off" else 3))
 
 

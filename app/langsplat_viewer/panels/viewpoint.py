@@ -117,11 +117,11 @@ def _keyframes(viewer: Viewer) -> None:
         viewpoint.set_path(viewer, ())
     _chosen(viewer, record.chosen)
     flags = imgui.WindowFlags_.horizontal_scrollbar
-    if imgui.begin_child("keyframes", ImVec2(0, 0), 0, flags):
+    if imgui.begin_child("keyframes", ImVec2(0, 0), imgui.ChildFlags_.nav_flattened, flags):
         if not keyframes:
             ui.small_wrapped("Add the current view; the path goes smoothly from one keyframe to the next")
         images = viewpoint.thumbnails(viewer)
-        drawn = viewer.state.record.thumbnails[0]
+        drawn = record.thumbnails[0]
         for number, key in enumerate(keyframes):
             with imgui_ctx.push_id(str(number)):
                 _card(viewer, number, key, drawn.index(key) if key in drawn else None, images)
