@@ -394,6 +394,11 @@ def use_the_mouse_alone(s: Any) -> None:
     assert s.ctx.item_info("//**/Cancel").rect_full.max.y < 300
     s.click("//**/Cancel")
     assert s.state.choice is None
+    written = Event()
+    s.viewer.recorder.submit("writing", lambda _: written.wait(60), lambda _: None, s.viewer.say_error)
+    s.rest(4)
+    assert imgui.internal.find_window_by_name("toasts").pos.x >= 0
+    written.set()
     glfw.set_window_size(glfw_window_hello_imgui(), 1040, 620)
     s.until(lambda: s.state.size[0] == wide)
 

@@ -142,7 +142,8 @@ class Toasts:
                 for number, (message, _) in enumerate(self._shown):
                     with imgui_ctx.push_id(str(number)):
                         self._toast(viewer, message)
-            if writes is not None and ui.stoppable(*writes, BAR_EM, "##recorder"):
+            wide = min(BAR_EM, widest / hello_imgui.em_size(1) - 5)  # beside Cancel
+            if writes is not None and ui.stoppable(*writes, wide, "##recorder"):
                 viewer.recorder.cancel()
                 viewer.state.say("stopped: nothing was written")
             if imgui.is_window_hovered():
