@@ -38,6 +38,8 @@ class Range:
 
 def check_settings(settings: object, option: str = "--") -> None:
     """InputError for the first number out of its field's range; `option`: before names, as ``--codec.``."""
+    if not dataclasses.is_dataclass(settings):
+        raise InputError(f"expected settings such as TrainConfig(), got {type(settings).__name__}")
     for name, value, hint in named_values(settings, option):
         if problem := _problem(value, hint):
             raise InputError(f"{name} {_shown(value)}: {problem}")

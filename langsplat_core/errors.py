@@ -88,6 +88,12 @@ def unread(what: str, names: Iterable[object]) -> str:
     return listed and f"{what} {listed} not read".lstrip()
 
 
+def expect(value: object, kind: type, hint: str) -> None:
+    """Raise InputError unless a value that a caller gave is of a kind."""
+    if not isinstance(value, kind):
+        raise InputError(f"expected a {kind.__name__}, got {type(value).__name__}; {hint}")
+
+
 class BackendError(LangSplatError):
     """A rasterizer, driver or optional library that cannot be loaded on this machine."""
 

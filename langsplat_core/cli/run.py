@@ -31,6 +31,7 @@ from langsplat_core.interrupts import SAID, Terminated, raised
 from langsplat_core.io.files import NO_ROOM, shown
 
 log = logging.getLogger("langsplat")
+HOME = re.compile(r"^(--[\w.-]+=|)~(?=/)")  # in quotes, after = or in a file, where a shell leaves it
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 _CONTINUES = "; the same command goes on from what was finished"
 _ROOM = "make room, or choose another place; what was finished is kept"
@@ -93,6 +94,7 @@ def parsed(program: str, kind: Any, args: Sequence[str], description: str | None
     """
     if len(args) > 1 and args[0].startswith("--tyro-") and args[1] not in SHELLS:
         raise InputError(f"{args[0]} {args[1]}: there is {', '.join(SHELLS)}")
+    args = [HOME.sub(lambda found: f"{found[1]}{os.path.expanduser('~')}", word) for word in args]
     line = make_dataclass(
         "Line",
         [
@@ -126,7 +128,7 @@ def main(program: str, parser: Callable[[], Runnable]) -> int:
 
 @optional_imports()
 def _run(program: str, parser: Callable[[], Runnable]) -> None:
-    if sys.argv[1:] == ["--version"]:
+    if sys.argv[-1] == "--version":
         print(f"{program} {__version__}")
         return
     log.setLevel(Verbosity().level)

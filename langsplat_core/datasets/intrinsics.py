@@ -56,8 +56,7 @@ class FisheyeDistortion:
         theta = np.arctan(r)
         t2 = theta * theta
         distorted = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
-        scale = np.divide(distorted, r, out=np.ones_like(r), where=r > 1e-12)
-        return xy * scale[:, None]
+        return xy * np.divide(distorted, r, out=np.ones_like(r), where=r > 1e-12)[:, None]
 
 
 Distortion = BrownDistortion | FisheyeDistortion

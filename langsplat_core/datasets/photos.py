@@ -243,8 +243,7 @@ def read_photo(path: Path, upright: bool, tell: Tell = lambda _: None) -> Image.
     with hostile.opened(path, most=hostile.MOST_PIXELS_REDUCED) as stored:
         image: Image.Image = stored
         coded = coded_as(stored)
-        large = stored.width * stored.height > hostile.MOST_PIXELS
-        if large:
+        if large := stored.width * stored.height > hostile.MOST_PIXELS:
             stored.draft(None, (stored.width // 2, stored.height // 2))
         if upright:
             stored.load()  # so that nothing but the EXIF data can fail below
@@ -273,8 +272,7 @@ def _of_8_bits(image: Image.Image, path: Path, tell: Tell) -> Image.Image:
     if 255 < most <= 4095:
         tell("no value is above 4095 of 65535, and 12 bits are taken for white")
     white = 4095 if 255 < most <= 4095 else 65535
-    shades = (values.astype(np.uint32) * 255 + white // 2) // white
-    grey = Image.fromarray(shades.astype(np.uint8))
+    grey = Image.fromarray(((values.astype(np.uint32) * 255 + white // 2) // white).astype(np.uint8))
     grey.info = image.info
     return grey
 
@@ -283,8 +281,7 @@ def over_black(image: Image.Image) -> Image.Image:
     """Return an RGB image without its transparency."""
     if image.mode != "RGBA":
         return image
-    black = Image.new("RGBA", image.size, (0, 0, 0, 255))
-    return Image.alpha_composite(black, image).convert("RGB")
+    return Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image).convert("RGB")
 
 
 def _read_for(photo: Photo, tell: Tell) -> tuple[Image.Image, PhotoIntrinsics]:

@@ -57,8 +57,7 @@ def oklab(colours: Array) -> Array:
 
     Squares stand for sRGB's curve, which is close and costs nothing.
     """
-    cones = np.square(colours) @ _CONES.T
-    return np.asarray(np.cbrt(cones) @ _OKLAB.T)
+    return np.asarray(np.cbrt(np.square(colours) @ _CONES.T) @ _OKLAB.T)
 
 
 _CONES = np.array(

@@ -546,8 +546,7 @@ def _read_compressed(ply: PlyFile, vertex: PlyElement, tell: Tell) -> tuple[Gaus
 
 def _codes(ply: PlyFile, element: PlyElement, names: Sequence[str], kind: str) -> Array:
     """Return (rows, names) whole numbers; FormatError if they are of another type than `kind`."""
-    others = [name for name in names if element.numbers.get(name, kind) != kind]
-    if others:
+    if others := [name for name in names if element.numbers.get(name, kind) != kind]:
         raise malformed(ply.path, f"{others[0]!r} is not of the type {TYPE_NAMES[kind][0]}")
     return ply.read(element, (names, kind))[0]
 

@@ -22,7 +22,7 @@ from msgspec import Meta, Struct
 from langsplat_core import registry
 from langsplat_core.arrays import Array
 from langsplat_core.config import CodecConfig
-from langsplat_core.errors import STRICTNESS, InputError, report_loss
+from langsplat_core.errors import STRICTNESS, InputError, expect, report_loss
 from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import sidecar as language_files
 from langsplat_core.io.files import atomic_path, check_output_file, locked, shown, write_json
@@ -274,6 +274,7 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer 
     see `report_left_out`. write: in place of the format's writer.
     """
     path = Path(path)
+    expect(scene, Scene, "Scene(gaussians) makes one")
     if scene.unread:
         raise InputError(f"not written without what lies beside it; mend or remove that: {scene.unread[0]}")
     row = check_writable(path)
@@ -321,8 +322,7 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
     scene = Path(scene)
     if any(scene.name == row.folder_file for row in formats()):
         scene = scene.parent
-    row = None if os.path.isdir(scene) else format_of(scene)
-    if row is None:
+    if (row := None if os.path.isdir(scene) else format_of(scene)) is None:
         scene = Path(os.path.abspath(scene))  # "." has no name of its own
     beside = scene.with_name((scene.stem if row and not row.own_companions else scene.name) + suffix)
     linked = os.path.islink(scene) and not os.path.lexists(beside)

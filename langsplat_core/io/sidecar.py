@@ -295,8 +295,7 @@ def _save(path: Path | str, kind: _Format, tensors: dict[str, Array], about: dic
 
 def means_checksum(means: Array) -> str:
     """Return the BLAKE2b-128 of (N, 3) float32 positions, which changes with any edit and reordering."""
-    data = np.ascontiguousarray(means, dtype="<f4")
-    return hashlib.blake2b(data.tobytes(), digest_size=16).hexdigest()
+    return hashlib.blake2b(np.ascontiguousarray(means, dtype="<f4").tobytes(), digest_size=16).hexdigest()
 
 
 def write_language(path: Path | str, field: LanguageField, means: Array, origin: Array = NO_ORIGIN) -> None:
@@ -414,8 +413,7 @@ def rematch_language(sidecar: Path | str, new_means: Array) -> LanguageField:
         distance, nearest = points.query(new_means[new_rows])
         found = distance <= np.median(spacing) + stored.precision
         match[new_rows[found]] = old_rows[nearest[found]]
-    tree = field.tree
-    if tree is not None:
+    if (tree := field.tree) is not None:
         tree = replace(tree, leaves=np.pad(tree.leaves, (0, 1), constant_values=NO_NODE))
     latents = np.pad(field.latents, ((0, 0), (0, 1), (0, 0)))
     confidence = np.pad(field.confidence, ((0, 0), (0, 1)))

@@ -237,8 +237,7 @@ def write_sog(path: Path | str, scene: Scene) -> None:
         return name
 
     def known(values: Array, other: Any = 0) -> Array:
-        there = valid.reshape(-1, *[1] * (values.ndim - 1))
-        return np.where(there, values, other).astype(np.float64)
+        return np.where(valid.reshape(-1, *[1] * (values.ndim - 1)), values, other).astype(np.float64)
 
     means = known(gaussians.means)
     logs = np.sign(means) * np.log1p(np.abs(means))
@@ -301,8 +300,7 @@ def _coded(values: Array, counts: Array) -> tuple[Array, Array]:
         edges = np.concatenate([[0], np.searchsorted(known, (book[1:] + book[:-1]) / 2), [len(known)]])
         sizes = np.diff(edges)
         book = np.sort(np.where(sizes > 0, np.diff(sums[edges]) / np.maximum(sizes, 1), book))
-    codes = np.searchsorted((book[1:] + book[:-1]) / 2, values)
-    return codes.astype(np.uint8), book
+    return np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8), book
 
 
 def _palette(values: Array, counts: Array) -> tuple[Array, Array]:

@@ -252,8 +252,7 @@ def _scene(header: _Header, blocks: dict[str, Array], axes: int, tell: Tell) -> 
         opacity_logits=logit(blocks["alphas"][:, 0] / 255),
         sh=np.concatenate([base[:, None], (rest.astype(np.float32) - 128) / 128], axis=1),
     )
-    turned = mirrored(gaussians, _signs_to_rdf(axes))
-    return Scene(turned, antialiased=bool(header.flags & ANTIALIASED))
+    return Scene(mirrored(gaussians, _signs_to_rdf(axes)), antialiased=bool(header.flags & ANTIALIASED))
 
 
 def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub") -> None:

@@ -16,9 +16,10 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats
+from langsplat_core.errors import expect
 from langsplat_core.pipeline.webpage import PageReport, make_page
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import encoded_texts
+from langsplat_core.query.compose import ComposedResult, encoded_texts
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import parse
 from langsplat_core.raster.render import render
@@ -71,13 +72,17 @@ def show(
     return NotebookPage(*make_page(scene, asked, title, phrase=phrase, at_most=at_most), height)
 
 
-def draw(scene: Scene, size: tuple[int, int] = (960, 540), answer: QueryResult | None = None) -> Image.Image:
+def draw(
+    scene: Scene, size: tuple[int, int] = (960, 540), answer: QueryResult | ComposedResult | None = None
+) -> Image.Image:
     """Return an image of a scene; an `answer` as heat, from the nearest camera that has it in its image."""
     fitted = [camera.fitted(*size) for camera in scene.cameras]
     camera = fitted[0] if fitted else scene.framing_camera(size)
+    answer = answer.answer if isinstance(answer, ComposedResult) else answer
     if answer is None:
         drawn = render(scene, camera)
         return Image.fromarray(compose(Channels(drawn.colours, drawn.alpha), PictureConfig()))
+    expect(answer, QueryResult, 'run_phrase(engine, "cup") returns one')
     if answer.place is not None:
         camera = min(fitted, key=partial(view_distance, place=answer.place), default=camera)
     drawn = render(scene, camera, heats(Subject(len(scene.gaussians), answers=[answer])))

@@ -216,8 +216,7 @@ class Describer:
         shares = names.mixture(latents, weights)
         best = np.argsort(-shares[: len(names.phrases)], kind="stable")[: max(top, 0)]
         words = tuple(Word(names.phrases[i], float(shares[i])) for i in best)
-        other = float(shares[len(names.phrases) :].sum())
-        return LevelWords(level, words, other, seen / total)
+        return LevelWords(level, words, float(shares[len(names.phrases) :].sum()), seen / total)
 
 
 @dataclass(frozen=True, eq=False)

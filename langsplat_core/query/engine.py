@@ -222,8 +222,7 @@ class QueryEngine:
     @property
     def field(self) -> LanguageField:
         """The scene's language field; InputError if it has none."""
-        field = self.scene.language
-        if field is None:
+        if (field := self.scene.language) is None:
             raise InputError(no_field(self.scene))
         return field
 

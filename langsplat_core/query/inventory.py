@@ -203,8 +203,7 @@ def scene_outline(describer: Describer) -> tuple[Outline, ...]:
     named after N * DEEPEST Gaussians were read.
     """
     tree, members, areas = describer.engine.tree, describer.engine.tree.gaussians(), describer.areas
-    every = max(float(areas.sum()), 1e-300)
-    totals = members.sums(areas) / every
+    totals = members.sums(areas) / max(float(areas.sum()), 1e-300)
     large = np.flatnonzero((totals >= LEAST_SHARE) & (members.sizes >= LEAST_COUNT))
     parts: dict[int, list[int]] = {}
     for node in sorted(large.tolist(), key=lambda node: -totals[node]):

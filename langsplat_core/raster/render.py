@@ -20,6 +20,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import RasterSettings
+from langsplat_core.errors import expect
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, protocol
 from langsplat_core.scene import Camera, Gaussians, Scene
 
@@ -46,6 +47,7 @@ def view_of(
     rasterizer: by default that of the CPU, whose views can lift; settings of image formation: by default
     those that the scene was trained with.
     """
+    expect(camera, Camera, "scene.cameras has those of a scene, look_at makes one")
     formed = scene.raster_settings() if settings is None else settings
     return (rasterizer or _cpu()).view(scene.gaussians, camera, formed)
 
@@ -64,6 +66,9 @@ class Rendering:
     alpha: Array  # (H, W) in [0, 1]
     values: Array  # (H, W, C) the further values that were asked for; C may be 0
 
+    def __repr__(self) -> str:
+        return f"<Rendering of {self.alpha.shape[1]}x{self.alpha.shape[0]} pixels>"
+
 
 def render(
     scene: Scene,
@@ -80,6 +85,7 @@ def render(
     scene's antialiasing applies to both. Raises InputError for an unknown backend, BackendError for one
     that cannot load here, ValueError for values of another shape.
     """
+    expect(scene, Scene, "load_scene(path) returns one")
     if values is not None:
         check_array("values", np.asarray(values), ("N", "C"), {"N": len(scene.gaussians.means)})
     rasterizer = _cpu() if backend == "cpu" else load_rasterizer(backend)

@@ -49,6 +49,9 @@ class Gaussians:
             if step > np.exp(np.median(self.log_scales[some].max(1))):
                 report_loss("positions so far from zero are rounded to %g units: give Scene an origin", step)
 
+    def __repr__(self) -> str:
+        return f"<{len(self):,} Gaussians, SH degree {self.sh_degree}>"
+
     def __len__(self) -> int:
         return len(self.means)
 

@@ -298,6 +298,9 @@ class LanguageField:
         for phrase, vector in known.items():
             check_array(f"phrasebook[{phrase!r}]", vector, (big,), dtype=np.float32)
 
+    def __repr__(self) -> str:
+        return f"<language field of {len(self):,} Gaussians, {self.codec.kind}, by {self.encoder_id}>"
+
     def __len__(self) -> int:
         return int(self.latents.shape[1])
 

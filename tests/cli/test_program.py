@@ -63,12 +63,26 @@ def test_unknown_commands_and_shells_are_named(words, said):
 
 
 @pytest.mark.parametrize(("program", "begin"), [("langsplat", entry), ("langsplat-viewer", viewer_entry)])
-def test_version_is_printed(program, begin, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", [program, "--version"])
+@pytest.mark.parametrize("words", [[], ["train"]])
+def test_version_is_printed(program, begin, words, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [program, *words, "--version"])
     with pytest.raises(SystemExit) as stop:
         begin()
     assert not stop.value.code
     assert capsys.readouterr().out == f"{program} {__version__}\n"
+
+
+def test_home_is_meant_where_no_shell_says_so(tmp_path, monkeypatch):
+    """As after "=", in quotes, and in a file of settings; a name that only begins with ~ is a name."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "a.toml").write_text('work = "~/w"\n')
+    train = parse(["train", "~/photos", "--out=~/a.ply", f"--config={tmp_path / 'a.toml'}"])
+    assert (train.dataset, train.out, train.work) == (
+        (tmp_path / "photos",),
+        tmp_path / "a.ply",
+        tmp_path / "w",
+    )
+    assert viewer_parse(["~old.ply"]).scene == Path("~old.ply")
 
 
 @pytest.mark.parametrize(("flag", "level"), [("-q", "ERROR"), ("--verbose", "DEBUG")])

@@ -17,6 +17,9 @@ import pytest
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.pipeline.notebook import draw
+from langsplat_core.pipeline.train import train_scene
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import (
@@ -141,6 +144,28 @@ def test_answers_reach_other_processes_and_say_where_in_the_world():
     again = pickle.loads(pickle.dumps(answer))
     np.testing.assert_array_equal(again.members, answer.members)
     assert repr(answer).endswith(f"near {scene.in_world(answer.place)}>")
+
+
+def test_wrong_kinds_are_named_and_arrays_are_not_printed():
+    scene = blob_scene()
+    for wrong, said in (
+        (lambda: render(scene, 0), "expected a Camera, got int; scene.cameras has those of a scene"),
+        (lambda: render("a.ply", scene.cameras[0]), "expected a Scene, got str; load_scene"),
+        (lambda: save_scene("a.ply", scene.gaussians), "expected a Scene, got Gaussians; Scene\\(gaussians"),
+        (lambda: draw(scene, answer="mug"), "expected a QueryResult, got str; run_phrase"),
+        (
+            lambda: train_scene("photographs", "a.ply", {}),
+            "expected settings such as TrainConfig.*, got dict",
+        ),
+    ):
+        with pytest.raises(InputError, match=said):
+            wrong()
+    found = run_phrase(QueryEngine(scene, FakeEncoder()), "mug")
+    drawn = [np.asarray(draw(scene, (64, 48), answer)) for answer in (found, found.answer)]
+    np.testing.assert_array_equal(*drawn)
+    shown = repr((scene.gaussians, scene.language, render(scene, scene.cameras[0])))
+    assert "array" not in shown
+    assert "<360 Gaussians, SH degree 0>, <language field of 360 Gaussians" in shown
 
 
 def test_peak_pixel_is_the_middle_one_of_equal_means():

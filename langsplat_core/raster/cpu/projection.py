@@ -418,7 +418,6 @@ def colours_backward(
     check_array("means", means, ("N", 3), n, dtype=np.float32)
     check_array("colour_grad", colour_grad, ("N", 3), n)
     sh_grad, means_grad = np.empty(sh.shape, np.float32), np.zeros(means.shape, np.float32)
-    position = np.array(camera_position, np.float64)
-    inputs = (plain(sh), plain(means), position, plain(colour_grad))
+    inputs = (plain(sh), plain(means), np.array(camera_position, np.float64), plain(colour_grad))
     shared_workers().run(_backward, len(sh), *inputs, sh_grad, means_grad)
     return sh_grad, means_grad

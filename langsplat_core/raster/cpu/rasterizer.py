@@ -211,8 +211,7 @@ def label_weights(
     workers.run(_gather_regions, number, tiles, maps, met.labels, lines, offsets, sums)
     # Sums of each intersection by label, added up in float64 in the order of a Gaussian's intersections.
     columns = [np.tile(met.labels[t, : lines[t]], here[t]) for t in range(number)]
-    ends = np.concatenate([[0], np.cumsum(np.repeat(lines, here))])
-    entries = sums, np.concatenate(columns), ends
+    entries = sums, np.concatenate(columns), np.concatenate([[0], np.cumsum(np.repeat(lines, here))])
     by_intersection = scipy.sparse.csr_matrix(entries, (len(tiles.met), shape[1]))
     by_intersection.eliminate_zeros()
     drawn, ones = len(order), np.ones(len(tiles.slots))

@@ -121,8 +121,7 @@ def train_autoencoder(vectors: Array, config: CodecConfig, progress: Progress = 
     for width, size in pairwise((config.latent_dim, *DECODER_WIDTHS)):
         layers += [nn.Linear(width, size), nn.ReLU()]
     decoder = nn.Sequential(*layers, nn.Linear(DECODER_WIDTHS[-1], data.shape[1]))
-    parameters = [*encoder.parameters(), *decoder.parameters()]
-    optimiser = torch.optim.Adam(parameters, lr=config.lr, fused=True)
+    optimiser = torch.optim.Adam([*encoder.parameters(), *decoder.parameters()], lr=config.lr, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps)
     generator = torch.Generator().manual_seed(config.seed)
     with one_torch_thread():
@@ -185,8 +184,7 @@ def fit_codebook(
         return rounded(spherical_kmeans(fitted, size, 8 if start is None else 4, start, generator))
 
     def error(codewords: Array) -> float:
-        made = codewords[nearest_centres(judged, codewords)[0]]
-        return relevancy_error(made, judged, vocabulary)[0]
+        return relevancy_error(codewords[nearest_centres(judged, codewords)[0]], judged, vocabulary)[0]
 
     if config.size:
         codewords = grow(config.size, None)

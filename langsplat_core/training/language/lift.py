@@ -187,8 +187,7 @@ def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> 
     for first, pairs in zip(firsts, mask_weights.pairs, strict=False):
         here = pairs[(pairs["level"] == level) & (chosen[pairs["row"]] >= 0)]
         row = chosen[here["row"]]
-        total = np.bincount(row, here["weight"], len(sample))
-        strong = here["weight"] > 0.5 * total[row]
+        strong = here["weight"] > 0.5 * np.bincount(row, here["weight"], len(sample))[row]
         rows.append(row[strong])
         columns.append(first + here["mask"][strong].astype(np.int64))
     places = np.concatenate(rows), np.concatenate(columns)
@@ -400,8 +399,7 @@ def lift_by_gradient(
             order = generator.permutation(len(views))
         index = int(order[step % len(views)])
         camera, labels, latents = targets[index]
-        view = kept.get(index)
-        if view is None:  # the geometry is fixed
+        if (view := kept.get(index)) is None:  # the geometry is fixed
             view = rasterizer.view(gaussians, camera, settings)
             if sum(one.nbytes for one in (view, *kept.values())) <= KEPT_BYTES:
                 kept[index] = view
