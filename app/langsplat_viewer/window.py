@@ -286,7 +286,8 @@ class Window:
         except InputError as error:
             viewer.say_error(str(error))
         if (span := options.orthographic) is not None:
-            viewpoint.move(viewer, lambda view: spanning(view, span))
+            # Of the image in the window, whose sides are others than the photograph's.
+            viewpoint.move(viewer, lambda view: spanning(view, span * view.span / view.span_in(*state.size)))
         wanted = options.picture
         settings.set_picture(
             viewer, replace(state.session.picture, heat=wanted.heat, heat_scale=wanted.heat_scale)
