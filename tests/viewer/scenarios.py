@@ -399,6 +399,8 @@ def use_the_mouse_alone(s: Any) -> None:
     s.rest(4)
     assert imgui.internal.find_window_by_name("toasts").pos.x >= 0
     written.set()
+    s.open_panel("Timeline")
+    assert s.ctx.item_info("//Timeline/Loop").rect_full.max.x < scene_area().corners[1].x
     glfw.set_window_size(glfw_window_hello_imgui(), 1040, 620)
     s.until(lambda: s.state.size[0] == wide)
 

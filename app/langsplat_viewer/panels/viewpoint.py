@@ -97,7 +97,7 @@ def draw_timeline(viewer: Viewer) -> None:
         imgui.same_line()
         if (wanted := _number("Duration", seconds, 1.0)) is not None:
             viewpoint.set_path_seconds(viewer, wanted)
-    imgui.same_line()
+    ui.beside("Loop", imgui.get_frame_height())
     settings.put(record, loops=imgui.checkbox("Loop", record.loops)[1])
     _keyframes(viewer)
 
