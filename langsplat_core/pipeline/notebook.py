@@ -38,7 +38,7 @@ class NotebookPage:
     def _repr_html_(self) -> str:
         """Return a frame that may run the page's own script and nothing else."""
         return (
-            f'<iframe srcdoc="{html.escape(self.text)}" sandbox="allow-scripts allow-downloads" '
+            f'<iframe srcdoc="{html.escape(self.text)}" sandbox="allow-scripts allow-forms allow-downloads" '
             f'allow="fullscreen" style="width: 100%; height: {self.height}px; border: 0"></iframe>'
         )
 

@@ -260,6 +260,7 @@ def language_tables(
         "codes": codes[:, rows].astype(np.uint16),
         "regions": np.where(inside < 0, -1, inside + first[:, None]),
         "palette": to_bytes(255 * palette),
+        "surface": (regions.weights[rows] > 0).astype(np.uint8),
         "chance": np.array(() if engine.chance is None or is_calibrated else engine.chance, np.float16),
         **_region_tables(engine, codes),
     }
@@ -277,7 +278,7 @@ def language_tables(
         "grammar": {name.lower(): sorted(getattr(grammar, name)) for name in LISTS}
         | {name.lower(): getattr(grammar, name) for name in TABLES},
         "space": {name.lower(): getattr(relations, name) for name in NUMBERS}
-        | {"half": HALF, "inner": INNER, "visible": float(regions.weights[regions.counts].min())},
+        | {"half": HALF, "inner": INNER},
         "frame": relations.upright(engine.scene.up()).ravel().tolist(),
         "examples": suggested.examples,
         "phrases": suggested.phrases,

@@ -15,7 +15,7 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array, sigmoid
 from langsplat_core.scene.codec import Codec
 
-_SEPARATE = re.compile(r"[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)", re.IGNORECASE)
+_SEPARATE = re.compile(r"(?i)[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except|other\s+than)\b)")
 _APOSTROPHES = str.maketrans(dict.fromkeys("’‘ʼ′＇´`", "'"))
 
 

@@ -5,11 +5,7 @@
 // [page]
 export const add = (a, b, times = 1) => a.map((value, i) => value + times * b[i]);
 export const inner = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-export const cross = (a, b) => [
-  a[1] * b[2] - a[2] * b[1],
-  a[2] * b[0] - a[0] * b[2],
-  a[0] * b[1] - a[1] * b[0],
-];
+export const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b * x];
 export const unit = (a) => a.map((value) => value / (Math.hypot(...a) || 1));
 export const axes = ({ rotation }) => [rotation.slice(0, 3), rotation.slice(3, 6), rotation.slice(6, 9)];
 
@@ -64,7 +60,7 @@ export class Controls {
     };
     element.addEventListener("wheel", wheel, { passive: false });
     element.addEventListener("contextmenu", (event) => event.preventDefault());
-    addEventListener("keyup", (event) => this.held.delete(event.key));
+    addEventListener("keyup", (event) => this.held.delete(event.key.toLowerCase()));
     addEventListener("blur", () => this.held.clear());
   }
 
@@ -122,8 +118,8 @@ export class Controls {
       this.zoom(1.15);
     } else if (event.key === "-") {
       this.zoom(1 / 1.15);
-    } else if (FLYING[event.key]) {
-      this.held.add(event.key);
+    } else if (FLYING[event.key.toLowerCase()]) {
+      this.held.add(event.key.toLowerCase());
       this.run();
     } else {
       return false;

@@ -100,9 +100,8 @@ export class Painter {
       i % 4 === 3 ? 255 : maps[3 * (i >> 2) + (i % 4)],
     );
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 256, maps.length / 768, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
-    this.programs = Object.fromEntries(
-      Object.entries(meta.shaders).map(([name, pair]) => [name, this.program(...pair)]),
-    );
+    const programs = Object.entries(meta.shaders).map(([name, pair]) => [name, this.program(...pair)]);
+    this.programs = Object.fromEntries(programs);
     this.quads = gl.createVertexArray();
     this.order = gl.createBuffer();
     gl.bindVertexArray(this.quads);
@@ -114,9 +113,8 @@ export class Painter {
     this.drawn = 0; // Gaussians in `order`
     const code = URL.createObjectURL(new Blob([`(${sortWorker})()`], { type: "text/javascript" }));
     this.worker = new Worker(code);
-    this.worker.postMessage({ means: scene.means, large: large(scene.geometry, count, texels) }, [
-      scene.means.buffer,
-    ]);
+    const given = { means: scene.means, large: large(scene.geometry, count, texels) };
+    this.worker.postMessage(given, [scene.means.buffer]);
     this.worker.onmessage = ({ data }) => this.sorted(data);
     this.ticket = 0;
     this.waiting = [];
@@ -125,11 +123,8 @@ export class Painter {
   program(vertex, fragment) {
     const { gl } = this;
     const program = gl.createProgram();
-    for (const [kind, source] of [
-      [gl.VERTEX_SHADER, vertex],
-      [gl.FRAGMENT_SHADER, fragment],
-    ]) {
-      const made = gl.createShader(kind);
+    for (const source of [vertex, fragment]) {
+      const made = gl.createShader(source === vertex ? gl.VERTEX_SHADER : gl.FRAGMENT_SHADER);
       gl.shaderSource(made, source);
       gl.compileShader(made);
       gl.attachShader(program, made);

@@ -24,10 +24,7 @@ export function dot(a, firstOfA, b, size, firstOfB = 0) {
 export class ClipText {
   // described: { words, config, begin, end }; weight(name): values of a tensor; dim: length of vectors.
   constructor(described, weight, dim) {
-    Object.assign(this, described);
-    this.weight = weight;
-    this.dim = dim;
-    this.width = this.config.hidden_size;
+    Object.assign(this, described, { weight, dim, width: described.config.hidden_size });
   }
 
   // The unit vector of a phrase. PhraseError for words that it was never taught.
@@ -113,9 +110,7 @@ export class ClipText {
   attention(name, states, length) {
     const { width } = this;
     const size = width / this.config.num_attention_heads;
-    const [query, key, value] = ["q", "k", "v"].map((part) =>
-      this.linear(`${name}${part}_proj`, states, width),
-    );
+    const [query, key, value] = [..."qkv"].map((part) => this.linear(`${name}${part}_proj`, states, width));
     const mixed = new Float32Array(states.length);
     for (let head = 0; head < width; head += size) {
       for (let row = 0; row < length; ++row) {

@@ -154,19 +154,21 @@ export class Language {
 
   // Groups of regions by the whole that they are in, the largest first, each with its Gaussians.
   things(regions) {
-    const { places } = this;
-    const { fewest, speck, visible } = this.meta.space;
+    const { fewest, speck } = this.meta.space;
+    const { regions: own, surface } = this.tensors;
     const groups = [...Map.groupBy(regions, (region) => wholeOf(this.regions, region)).values()];
     const found = groups.map((inside) => {
-      const within = this.covered(inside);
-      const rows = Array.from(within.keys()).filter((row) => within[row] && places[4 * row + 3] >= visible);
       const size = inside.reduce((sum, region) => sum + this.regions.sizes[region], 0); // in the whole scene
-      const points = rows.map((row) => places.subarray(4 * row, 4 * row + 3));
-      return { inside, within, rows, points, size };
+      return { inside, size, rows: new Set() };
     });
+    const rowsOf = []; // by region
+    found.forEach(({ inside, rows }) => inside.forEach((region) => (rowsOf[region] = rows)));
+    own.forEach((region, i) => surface[i % this.gaussians] && rowsOf[region]?.add(i % this.gaussians));
     found.sort((a, b) => b.size - a.size);
     const least = Math.max(fewest, speck * found[0]?.size);
-    return found.filter(({ points, size }) => points.length && size >= least);
+    const point = (row) => this.places.subarray(4 * row, 4 * row + 3);
+    const things = found.filter(({ rows, size }) => rows.size && size >= least);
+    return things.map((thing) => ({ ...thing, points: Array.from(thing.rows, point) }));
   }
 
   // The least fit of a member of an answer with another factor `share` of the reach.
@@ -236,11 +238,8 @@ export class Language {
     const inside = [...new Set(counting.flatMap((one) => one.inside))];
     const peak = (all ? Math.min : Math.max)(...counting.map((one) => one.peak));
     const best = strongest(inside, regionFits);
-    const verdict = combined(
-      this.meta.rule,
-      Array.from(counting, (one) => one.verdict),
-      all,
-    );
+    const verdicts = counting.map((one) => one.verdict);
+    const verdict = combined(this.meta.rule, verdicts, all);
     return { ...counting[0], inside, regionFits, best, members, values, even, peak, verdict };
   }
 
@@ -269,10 +268,8 @@ export class Language {
     const { rule, bars, calibration } = this.meta;
     const on = thing && onThings(rule, this.regions, thing);
     const fits = thing && part ? [own, part] : [own];
-    const coloured = key
-      .split(" ")
-      .slice(0, -1)
-      .some((word) => this.lists.colours.has(word));
+    const before = key.split(" ").slice(0, -1);
+    const coloured = before.some((word) => this.lists.colours.has(word));
     const evidence = { bars, scaling: scalingOf(calibration, named, coloured) };
     const decision = decide(rule, this.regions, fits, named, level, evidence, on);
     return this.answer(phrase, decision, relevancies);
@@ -337,8 +334,8 @@ export class Language {
     const { level, inside, regionFits, scores } = decision;
     const row = (tensor) => tensor.subarray(level * this.gaussians, (level + 1) * this.gaussians);
     const relevancies = regionRelevancies(this.meta.rule, regionFits);
-    const even = Float32Array.from(row(this.tensors.regions), (region) => relevancies[region] ?? 0);
-    const values = codes ? Float32Array.from(row(this.tensors.codes), (code) => codes[code]) : even;
+    const even = new Float32Array(row(this.tensors.regions)).map((region) => relevancies[region] ?? 0);
+    const values = codes ? new Float32Array(row(this.tensors.codes)).map((code) => codes[code]) : even;
     return { ...decision, phrase, peak: scores[level], values, even, members: this.covered(inside) };
   }
 
@@ -346,7 +343,7 @@ export class Language {
   drawn(answer) {
     const { places, boxes } = this.tensors;
     const { best, members, peak, values } = answer;
-    const rows = Uint32Array.from(members.keys()).filter((row) => members[row]);
+    const rows = new Uint32Array(members).map((_, row) => row).filter((row) => members[row]);
     const own = Float32Array.from(rows, (row) => values[row]);
     const smooth = smoothed((i, axis) => this.places[4 * rows[i] + axis], own);
     const hottest = smooth.reduce((most, value) => Math.max(most, value), 0);
@@ -362,10 +359,11 @@ export class Language {
 
   // Whether each Gaussian is in one of the given regions.
   covered(regions) {
-    const [among, { regions: own }] = [new Set(regions), this.tensors];
-    const isIn = (_, row) =>
-      this.meta.levels.some((_, level) => among.has(own[level * this.gaussians + row]));
-    return Uint8Array.from({ length: this.gaussians }, isIn);
+    const { gaussians: count, tensors } = this;
+    const [subpart, part, whole] = [0, 1, 2].map((k) => tensors.regions.subarray(k * count, (k + 1) * count));
+    const among = new Uint8Array(this.regions.sizes.length);
+    regions.forEach((region) => (among[region] = 1));
+    return new Uint8Array(count).map((_, row) => among[subpart[row]] | among[part[row]] | among[whole[row]]);
   }
 
   // Values of the Gaussians as in `heats` of display/displays.py: from `base` to 1 for members of an answer, by the

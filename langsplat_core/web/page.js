@@ -30,16 +30,8 @@ const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((corner) => {
 
 class Page {
   constructor(meta, tensors) {
-    Object.assign(this, {
-      meta,
-      level: "auto",
-      display: "rgb",
-      answers: [],
-      share: COARSEST, // of the pixels in a row
-      coarse: true, // only large Gaussians
-      moving: true,
-      shown: [],
-    });
+    Object.assign(this, { meta, level: "auto", display: "rgb", answers: [], shown: [] });
+    Object.assign(this, { share: COARSEST, coarse: true, moving: true }); // of the pixels; only large Gaussians
     this.painter = new Painter(byId("scene"), meta, tensors);
     this.painter.onorder = () => this.redraw();
     this.language = meta.language && new Language(meta.language, tensors, this.painter.places);
@@ -85,9 +77,11 @@ class Page {
       about = `${asked} Answers: ${language.basis}.`;
     }
     byId("about").textContent = `${gaussians}. ${about} Made with the LangSplat viewer.`;
-    for (const id of ["search", "examples", "levels", "displays", "labels"]) {
-      byId(id).hidden = !language;
+    for (const part of document.querySelectorAll(".asks")) {
+      part.hidden = !language;
     }
+    byId("labels").hidden = !language && !this.meta.notes.length;
+    byId("about").parentElement.open = !language; // says why
     const examples = language?.examples ?? [];
     if (examples.length) {
       byId("phrase").placeholder = `${examples.slice(0, 2).join(", ")} …`;
@@ -157,18 +151,19 @@ class Page {
 
   key(event) {
     const typing = event.target.matches("select, input[type=text]");
+    const key = event.key.toLowerCase();
     if (event.ctrlKey || event.metaKey || event.altKey || typing) {
       return;
     }
-    if (BUTTONS[event.key]) {
-      byId(BUTTONS[event.key]).click();
-    } else if (this.language && event.key === "/") {
+    if (BUTTONS[key]) {
+      byId(BUTTONS[key]).click();
+    } else if (this.language && key === "/") {
       byId("phrase").focus();
       byId("phrase").select();
-    } else if (this.language && "0123".includes(event.key)) {
-      this.choose("levels", ["auto", ...this.meta.language.levels][event.key]);
-    } else if (this.language && KEYS[event.key]) {
-      this.choose("displays", KEYS[event.key]);
+    } else if (this.language && "0123".includes(key)) {
+      this.choose("levels", ["auto", ...this.meta.language.levels][key]);
+    } else if (this.language && KEYS[key]) {
+      this.choose("displays", KEYS[key]);
     } else if (event.target.matches("input") || !this.controls.key(event)) {
       return; // arrows choose among radio buttons
     }
@@ -222,6 +217,7 @@ class Page {
     if (location.hash === this.address) {
       return;
     }
+    this.address = location.hash;
     const said = new URLSearchParams(location.hash.slice(1) || this.meta.address);
     const [level, show, view] = ["level", "show", "view"].map((name) => said.get(name));
     this.level = Object.hasOwn(LEVELS, level) ? level : "auto";
@@ -292,22 +288,19 @@ class Page {
     const hot = this.hot();
     const said = byId("verdict");
     const levels = this.meta.language?.levels ?? [];
-    for (const [id, value] of [
-      ["levels", this.level],
-      ["displays", this.display],
-    ]) {
-      for (const input of document.querySelectorAll(`#${id} input`)) {
-        input.checked = input.value === value;
-        input.disabled = id === "displays" && OF_ANSWERS.includes(input.value) && !answers.length;
-      }
+    for (const input of document.querySelectorAll("fieldset input")) {
+      input.checked = [this.level, this.display].includes(input.value);
+      input.disabled = OF_ANSWERS.includes(input.value) && !answers.length;
     }
     for (const button of byId("examples").children) {
       button.ariaPressed = String(answers.length > 0 && button.textContent === this.phrase);
     }
     said.replaceChildren(...answers.map((answer) => this.said(answer)));
     byId("answer").hidden = !this.shown.length;
-    byId("legend").style.visibility = hot.length === 1 ? "visible" : "hidden"; // several have their own colours
-    byId("looks").hidden = !hot.length || this.display !== "relevancy";
+    const heated = this.display === "relevancy";
+    byId("legend").style.visibility = heated && hot.length === 1 ? "visible" : "hidden";
+    byId("looks").hidden = !heated || !hot.length;
+    byId("map").disabled = hot.length > 1; // they have their own colours
     if (hot.length === 1) {
       this.legend(hot[0]);
     }
@@ -328,9 +321,8 @@ class Page {
 
   // The answers that have a heat map: found ones and weak matches.
   hot() {
-    return this.answers.filter(
-      ({ best, verdict }) => best >= 0 && this.meta.picture.strength[verdict.outcome] > 0,
-    );
+    const { strength } = this.meta.picture;
+    return this.answers.filter(({ best, verdict }) => best >= 0 && strength[verdict.outcome] > 0);
   }
 
   // A verdict for the panel.
@@ -340,11 +332,12 @@ class Page {
     const share = 100 * Math.max(byChance ?? 0, 0.001); // never 0 %
     const chance = byChance === null ? "" : `, by chance ${share.toFixed(share >= 1 ? 0 : 1)} %`;
     const sure = probability === null ? chance : `, ${Math.round(100 * probability)} %`;
-    const unit = this.meta.metres_per_unit === 1 ? " m" : "";
-    const digits = Math.min(Math.max(2 - Math.floor(Math.log10(this.meta.radius)), 2), 20);
-    const place = answer.place?.map((length) => length.toFixed(digits)).join(" ");
+    const { metres_per_unit: metres, radius } = this.meta;
+    const [scale, unit] = metres ? [metres, "\u00a0m"] : [1, ""];
+    const digits = Math.min(Math.max(2 - Math.floor(Math.log10(scale * radius)), 2), 20);
+    const place = answer.place?.map((length) => (scale * length).toFixed(digits)).join(" ");
     const count = this.boxes(answer).length;
-    const places = `${count} ${count > 1 ? "places" : "place"}`;
+    const places = `${count < MOST_BOXES ? "" : "at least "}${count} ${count > 1 ? "places" : "place"}`;
     const where = `${places}, level ${levels[answer.level]}; at ${place}${unit}`;
     const absent = this.answers.length > 1 ? "" : answer.phrase;
     const detail = outcome === "not here" ? absent : where;
@@ -497,17 +490,12 @@ class Page {
     if (print) {
       context.drawImage(byId("scene"), 0, 0, width, height); // transparent pixels are printed white
     }
-    for (const { text, at } of notes) {
-      const seen = project(camera, at);
-      if (seen[2] >= this.meta.raster.near) {
-        this.tag(context, text, [seen], dots);
-      }
-    }
-    for (const { corners, name } of this.shown) {
-      const seen = cornersOf(corners).map((corner) => project(camera, corner));
-      if (seen.some(([, , z]) => z < this.meta.raster.near)) {
-        continue;
-      }
+    const marks = [
+      ...this.shown.map(({ corners, name }) => [name, cornersOf(corners)]),
+      ...notes.map(({ text, at }) => [text, [at]]),
+    ].map(([name, points]) => ({ name, seen: points.map((point) => project(camera, point)) }));
+    const ahead = marks.filter(({ seen }) => seen.every(([, , z]) => z >= this.meta.raster.near));
+    for (const { name, seen } of ahead.filter(({ seen }) => seen.length > 1)) {
       context.beginPath();
       for (const [a, b] of EDGES) {
         context.moveTo(seen[a][0], seen[a][1]);
@@ -520,24 +508,27 @@ class Page {
         Object.assign(context, { lineWidth: width * dots, strokeStyle: colour });
         context.stroke();
       }
-      if (name) {
-        this.tag(context, name, seen, dots);
-      }
+    }
+    for (const { name, seen } of ahead.filter(({ name }) => name)) {
+      this.tag(context, name, seen, dots);
     }
   }
 
   tag(context, text, seen, dots) {
+    const { width, height } = context.canvas;
     const [x, y] = seen.reduce((top, point) => (point[1] < top[1] ? point : top));
     context.font = `600 ${13 * dots}px system-ui, "DejaVu Sans", sans-serif`;
     const shown = text.length > 40 ? `${text.slice(0, 39)}…` : text;
-    const width = context.measureText(shown).width;
-    const pad = 7 * dots;
+    const wide = context.measureText(shown).width + 14 * dots;
+    const inside = seen.some(([x, y]) => x >= 0 && x < width && y >= 0 && y < height); // then all of the tag is
+    const left = inside ? Math.max(Math.min(x - wide / 2, width - wide), 0) : x - wide / 2;
+    const top = inside ? Math.max(y - 30 * dots, 0) : y - 30 * dots;
     context.fillStyle = "#10141ce6";
     context.beginPath();
-    context.roundRect(x - width / 2 - pad, y - 30 * dots, width + 2 * pad, 22 * dots, 6 * dots);
+    context.roundRect(left, top, wide, 22 * dots, 6 * dots);
     context.fill();
     context.fillStyle = "#ffb454";
-    context.fillText(shown, x - width / 2, y - 14.5 * dots);
+    context.fillText(shown, left + 7 * dots, top + 15.5 * dots);
   }
 }
 

@@ -7,10 +7,18 @@ import { quantile } from "./rule.js";
 // Distances from points to the nearest of others, without zero distances of a point to itself.
 const distances = (points, others) =>
   points.map((point) => {
-    const square = ([x, y, z]) => (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2;
-    const squares = others.map((other) => (other === point ? Infinity : square(other)));
-    return Math.sqrt(Math.min(...squares));
+    let least = Infinity;
+    for (const other of others) {
+      const square = (other[0] - point[0]) ** 2 + (other[1] - point[1]) ** 2 + (other[2] - point[2]) ** 2;
+      least = square < least && other !== point ? square : least;
+    }
+    return Math.sqrt(least);
   });
+// What boxes are apart at least.
+const apart = (one, other) =>
+  Math.hypot(
+    ...[0, 1, 2].map((k) => Math.max(one.least[k] - other.most[k], other.least[k] - one.most[k], 0)),
+  );
 const gap = (one, other) => Math.min(...distances(one.points, other.points));
 const between = (low, value, high) => low <= value && value <= high;
 
@@ -27,9 +35,10 @@ export class Space {
     const some = points.filter((_, i) => i % step === 0);
     const own = some.map((point) => rows.map((axis) => inner(axis, point)));
     const columns = [0, 1, 2].map((k) => own.map((point) => point[k]));
-    const [low, high] = this.inner.map((share) => columns.map((column) => quantile(column, share)));
+    const shares = [0, ...this.inner, 1];
+    const [least, low, high, most] = shares.map((share) => columns.map((column) => quantile(column, share)));
     const sides = add(high, low, -1);
-    return { points: own, low, high, centre: add(low, sides, 0.5), size: Math.hypot(...sides) };
+    return { points: own, least, low, high, most, centre: add(low, sides, 0.5), size: Math.hypot(...sides) };
   }
 
   // A body's centre in a camera's axes: right, down, ahead.
@@ -48,7 +57,7 @@ export class Space {
   on(what, anchor) {
     anchor.spacing ??= quantile(distances(anchor.points, anchor.points), 0.5);
     const reach = this.touch * Math.min(what.size, anchor.size) + anchor.spacing;
-    const away = distances(what.points, anchor.points);
+    const away = apart(what, anchor) < reach ? distances(what.points, anchor.points) : [];
     const heights = what.points.filter((_, i) => away[i] < reach).map((point) => point[2]);
     const above = what.centre[2] > anchor.low[2] && this.over(what, anchor);
     const foot = what.low[2] + this.foot * (what.high[2] - what.low[2]);
@@ -80,11 +89,12 @@ export class Space {
     const reach = (what.size + anchor.size) / 2;
     const [z, anchorZ] = [what, anchor].map((body) => this.seen(body, camera)[2]);
     const aside = (this.right(what, camera) - this.right(anchor, camera)) * anchorZ;
+    const close = this.near * Math.min(what.size, anchor.size);
     const facing = Math.abs(aside) <= reach;
     const ways = {
       on: () => this.on(what, anchor),
       in: () => this.in(what, anchor),
-      near: () => gap(what, anchor) <= this.near * Math.min(what.size, anchor.size),
+      near: () => apart(what, anchor) <= close && gap(what, anchor) <= close,
       above: () => this.above(what, anchor),
       below: () => this.above(anchor, what),
       "left of": () => -aside > this.aside * reach,
@@ -115,9 +125,9 @@ export class Space {
     }[kind] ?? [null, 0];
     if (!most) {
       const same = ({ rows }, other) =>
-        rows.filter((row) => other.within[row]).length >= this.half * rows.length;
+        [...rows].filter((row) => other.rows.has(row)).length >= this.half * rows.size;
       return things.filter((thing) =>
-        others.some((other) => !same(thing, other) && this.stands(kind, thing, other, camera)),
+        others.some((other) => this.stands(kind, thing, other, camera) && !same(thing, other)),
       );
     }
     const value = (thing) => {

@@ -83,11 +83,12 @@ const AND = /(?:^| )(?:and|&|as well as)(?= |$)/iu;
 const QUESTION = /^(?:(?:where|which)(?:'s| is| are)|(?:is|are) there|find(?: me)?|show me|look for) (?=.)/iu;
 const OR = /(?:^| )or(?= |$)/iu;
 const EXCLUDE = /,?(?: (?:but|and))? (?:not|without|except|other than)(?= |$)/giu;
-const SEPARATE = /[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)/iu;
+const UNWANTED = /^(?:(?:but|and) )?(?:not|without|except|other than)(?: .*)?$/iu;
+const SEPARATE = /[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except|other\s+than)\b)/iu;
 
-// Whether words name a thing: not only stop words and adjectives.
-function names(text, { stop_words: stops, adjectives, also_nouns: nouns }) {
-  const words = text.toLowerCase().split(" ").filter(Boolean);
+// Whether words name a thing: not only stop words and adjectives, or one of `nouns` at the end.
+function names(text, { stop_words: stops, adjectives, also_nouns }, nouns = also_nouns) {
+  const words = text.toLowerCase().split(/[ ,]+/u).filter(Boolean);
   return words.some((word) => !stops.has(word) && !adjectives.has(word)) || nouns.has(words.at(-1));
 }
 
@@ -120,9 +121,10 @@ export function parse(text, lists) {
   const group = (kind, items) => (items.length > 1 ? { kind, items } : items[0]);
   const one = (side) => clause(side, lists);
   const both = (side) => group("both", sidesOf(side, AND, lists).map(one));
-  const either = (side) => group("either", sidesOf(side, OR, lists).map(both));
+  const either = (side) => group("either", sidesOf(side.replaceAll(",", ""), OR, lists).map(both));
   const isPart = (tree) => tree.text && namedBy(tree.text, lists) !== "thing";
-  const [what, ...others] = exclusions(text.replace(QUESTION, ""), lists).map(either);
+  const asked = text.replace(QUESTION, "").replace(UNWANTED, ""); // of "not the cup" nothing
+  const [what, ...others] = exclusions(asked, lists).map(either);
   const own = what.text && !isPart(what); // "mug without handle"
   const ofIt = (tree) => (own && isPart(tree) ? { kind: "inside", what: tree, anchor: what } : tree);
   return others.length ? { kind: "without", what, anchor: group("either", others.map(ofIt)) } : what;
@@ -131,10 +133,10 @@ export function parse(text, lists) {
 function clause(text, lists) {
   const bare = text.replace(lists.leading, "");
   const [first, second, ...others] = bare.split(" ");
-  const [rest, more] = [[second, ...others], others].map((words) => words.join(" "));
+  const rest = bare.slice(first.length + 1);
   const kind = lists.superlatives.get(first.toLowerCase());
   if (kind && lists.numbers.has(second?.toLowerCase())) {
-    return clause(`${second} ${first} ${more}`.trim(), lists);
+    return clause([second, first, ...others].join(" "), lists);
   }
   if (kind && names(rest, lists)) {
     const what = related(rest, lists);
@@ -181,7 +183,7 @@ function related(text, lists) {
       const [before, after] = [words.slice(0, at), words.slice(next)].map((side) => side.join(" "));
       const isOf = kind === "of";
       const measures = isOf && forms(words[at - 1]).some((form) => lists.measures.has(form));
-      const holds = measures && !names(words.slice(0, at - 1).join(" "), lists);
+      const holds = measures && !names(words.slice(0, at - 1).join(" "), lists, new Set());
       const named = names(before, lists) || (isOf && namedBy(before, lists) !== "thing");
       if (kind && named && names(after, lists) && !holds) {
         return { kind: isOf ? "inside" : kind, what: thing(before, lists), anchor: clause(after, lists) };
