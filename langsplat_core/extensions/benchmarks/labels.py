@@ -197,21 +197,24 @@ def _stated(path: Path, kind: type[T], benchmark: str) -> T:
 
 
 def _read_frame(path: Path) -> tuple[Frame, list[str]]:
-    """Return the frame, and the categories of it that have no polygon with an inside."""
+    """Return the frame, and the categories of its objects that have no polygon with an inside."""
     content = _stated(path, _LabelFile, "LERF-OVS")
     size = content.info.width, content.info.height
     drawn: dict[str, list[tuple[PolygonMask, Array]]] = {}  # each with its box
+    without: list[str] = []
     for number, item in enumerate(content.objects):
         own = drawn.setdefault(item.category.strip(), [])
         corners = _corners(item.segmentation, size, f"{path}: object {number}")
         if len(corners) >= 3:
             own.append((PolygonMask(size, corners), _box(item.bbox, corners)))
+        else:
+            without.append(item.category.strip())
     labels = tuple(
         LabelledPhrase(phrase, tuple(outline for outline, _ in own), np.stack([box for _, box in own]))
         for phrase, own in drawn.items()
         if own
     )
-    return Frame(path.stem, size, labels), [phrase for phrase, own in drawn.items() if not own]
+    return Frame(path.stem, size, labels), without
 
 
 def _corners(stored: list[tuple[float, float]], size: Size, where: str) -> Array:

@@ -52,7 +52,7 @@ from tests.support.scenes import random_camera, random_gaussians, random_values
 def lerf(tmp_path):
     """One scene, two frames; the first has two mugs and a label without extent."""
     labels = tmp_path / "label" / "kitchen"
-    mugs = [("mug", rectangle(1, 2, 5, 6)), ("mug", rectangle(20, 10, 29, 19))]
+    mugs = [("mug", rectangle(1, 2, 5, 6)), ("mug", rectangle(20, 10, 29, 19)), ("mug", [])]
     lerf_frame(labels, "frame_00002", [*mugs, ("old camera", rectangle(8, 8, 9, 9)), ("nothing", [])])
     lerf_frame(labels, "frame.00041", [("mug", rectangle(0, 0, 3, 3))])
     return tmp_path
@@ -82,7 +82,7 @@ def only_scene(benchmark):
 def test_polygons_of_one_category_are_joined(lerf):
     scene = only_scene(read_lerf_ovs(lerf))
     assert [frame.name for frame in scene.frames] == ["frame.00041", "frame_00002"]
-    assert scene.left_out == ("frame_00002: nothing (no outline)",)
+    assert scene.left_out == ("frame_00002: mug (no outline)", "frame_00002: nothing (no outline)")
     mug, camera = scene.frames[1].labels
     assert (scene.frames[1].size, mug.phrase, camera.phrase) == (SIZE, "mug", "old camera")
     mask = mug.truth(SIZE)
