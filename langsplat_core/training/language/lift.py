@@ -32,7 +32,7 @@ from langsplat_core.training.language.codec_fit import nearest_centres, spherica
 class MaskGroups:
     """G groups of masks with similar vectors.
 
-    The hundred masks that show a Gaussian have few distinct meanings: its median is taken over their groups.
+    Of a hundred masks that show a Gaussian few are distinct: its median is taken over groups of them.
     """
 
     of_mask: Array  # group of every mask, one view after the other
