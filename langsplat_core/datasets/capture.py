@@ -68,7 +68,8 @@ class Capture:
             check_array(f"photograph {camera.name}", self.images[index], (*shape, 3), dtype=np.uint8)
             if mask is not None:
                 check_array(f"mask of {camera.name}", mask, shape, dtype=np.bool_)
-        check_array("colours", self.colours, ("M", 3), check_array("points", self.points, ("M", 3)))
+        dims = check_array("points", self.points, ("M", 3))
+        check_array("colours", self.colours, ("M", 3), dims)
 
     def __len__(self) -> int:
         return len(self.cameras)

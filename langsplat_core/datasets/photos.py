@@ -272,7 +272,8 @@ def _of_8_bits(image: Image.Image, path: Path, tell: Tell) -> Image.Image:
     if 255 < most <= 4095:
         tell("no value is above 4095 of 65535, and 12 bits are taken for white")
     white = 4095 if 255 < most <= 4095 else 65535
-    grey = Image.fromarray(((values.astype(np.uint32) * 255 + white // 2) // white).astype(np.uint8))
+    shades = (values.astype(np.uint32) * 255 + white // 2) // white
+    grey = Image.fromarray(shades.astype(np.uint8))
     grey.info = image.info
     return grey
 

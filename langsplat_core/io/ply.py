@@ -447,7 +447,8 @@ def _said(comments: Sequence[str], tell: Tell) -> tuple[bool, float | None]:
                 tell(f"comment {quoted(comment)} not understood")
     if any(len(set(said)) > 1 for said in (marks, lengths)):
         tell("its comments differ, and the last of a kind counts")
-    if (metres := lengths[-1] if lengths else None) is not None and not 0 < metres < math.inf:
+    metres = lengths[-1] if lengths else None
+    if metres is not None and not 0 < metres < math.inf:
         tell(f"{METRES} is no positive number, and counts as unknown")
         metres = None
     return bool(marks and marks[-1]), metres

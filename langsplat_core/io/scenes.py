@@ -322,7 +322,8 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
     scene = Path(scene)
     if any(scene.name == row.folder_file for row in formats()):
         scene = scene.parent
-    if (row := None if os.path.isdir(scene) else format_of(scene)) is None:
+    row = None if os.path.isdir(scene) else format_of(scene)
+    if row is None:
         scene = Path(os.path.abspath(scene))  # "." has no name of its own
     beside = scene.with_name((scene.stem if row and not row.own_companions else scene.name) + suffix)
     linked = os.path.islink(scene) and not os.path.lexists(beside)

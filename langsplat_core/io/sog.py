@@ -237,7 +237,8 @@ def write_sog(path: Path | str, scene: Scene) -> None:
         return name
 
     def known(values: Array, other: Any = 0) -> Array:
-        return np.where(valid.reshape(-1, *[1] * (values.ndim - 1)), values, other).astype(np.float64)
+        there = valid.reshape(-1, *[1] * (values.ndim - 1))
+        return np.where(there, values, other).astype(np.float64)
 
     means = known(gaussians.means)
     logs = np.sign(means) * np.log1p(np.abs(means))

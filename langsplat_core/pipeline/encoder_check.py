@@ -225,7 +225,8 @@ def _geometry(
     words = engine.text_vectors([*there, *absent])
     cosines = (images @ words.T).astype(np.float64)
     own, other = cosines[:, : len(there)], cosines[:, len(there) :]
-    pairs = (images @ images.T)[room.owners[nodes][:, None] != room.owners[nodes]]
+    apart = room.owners[nodes][:, None] != room.owners[nodes]
+    pairs = (images @ images.T)[apart]
     second, best = np.sort(cosines, axis=1)[:, -2:].T
     margins = own - (images @ engine.field.canonical.T).max(1, keepdims=True)
     figures = {

@@ -340,7 +340,8 @@ def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, 
     members = surface.connected(inside, peak)
     highest = members[smoothed[members] >= smoothed[peak] - 1e-3]
     centre = surface.positions[highest].mean(0)
-    near = surface.neighbours[highest[((surface.positions[highest] - centre) ** 2).sum(1).argmin()]]
+    middle = highest[((surface.positions[highest] - centre) ** 2).sum(1).argmin()]
+    near = surface.neighbours[middle]
     weights = surface.weights[near] * smoothed[near]
     position = (surface.positions[near] * weights[:, None]).sum(0) / weights.sum()
     return position, axis_aligned_box(surface.positions[members])

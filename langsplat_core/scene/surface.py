@@ -264,7 +264,8 @@ def _divided(
     told = (things[a] != NO_NODE) & (things[b] != NO_NODE)
     within = 0 if above is None else steps  # a thing is one whole
     steps = np.where(told, np.where(things[a] == things[b], within, steps + BORDER * typical), steps)
-    order = np.argsort(np.round(steps * STEPS).astype(np.uint16), kind="stable").astype(np.int32)
+    ranks = np.round(steps * STEPS).astype(np.uint16)
+    order = np.argsort(ranks, kind="stable").astype(np.int32)
     if above is not None:
         order = order[above[a[order]] == above[b[order]]]
     return divide(surface, steps, order, SCALE * typical, SMALLEST)

@@ -381,7 +381,8 @@ def _special_token(weights: Weights, tokenizer: Any, role: str, usual: tuple[str
     with suppress(OSError, ValueError, AttributeError, RecursionError):
         stated = json.loads((weights.folder / "tokenizer_config.json").read_bytes()).get(role)
     for token in (stated.get("content") if isinstance(stated, dict) else stated, *usual):
-        if (number := tokenizer.token_to_id(token) if isinstance(token, str) else None) is not None:
+        number = tokenizer.token_to_id(token) if isinstance(token, str) else None
+        if number is not None:
             return int(number)
     raise EncoderError(f"{weights.id}: its tokenizer has no {role}, such as {usual[0]}")
 

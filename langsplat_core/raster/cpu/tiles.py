@@ -274,7 +274,8 @@ def bin_tiles(
     columns = -(-size[0] // TILE)
     number = columns * -(-size[1] // TILE)
     counts = np.stack([counts[:number] for _, _, counts in found], 1)
-    places = np.ascontiguousarray((np.cumsum(counts).reshape(counts.shape) - counts).T)
+    ends = np.cumsum(counts).reshape(counts.shape)
+    places = np.ascontiguousarray((ends - counts).T)
     least = math.log2(max(settings.alpha_min, 2.0**-100))
     golden = max(int(number * 0.6180339887), 1)  # every stretch of tiles then samples the whole image evenly
     tiles = Tiles(

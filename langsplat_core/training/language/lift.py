@@ -187,7 +187,8 @@ def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> 
     for first, pairs in zip(firsts, mask_weights.pairs, strict=False):
         here = pairs[(pairs["level"] == level) & (chosen[pairs["row"]] >= 0)]
         row = chosen[here["row"]]
-        strong = here["weight"] > 0.5 * np.bincount(row, here["weight"], len(sample))[row]
+        total = np.bincount(row, here["weight"], len(sample))
+        strong = here["weight"] > 0.5 * total[row]
         rows.append(row[strong])
         columns.append(first + here["mask"][strong].astype(np.int64))
     places = np.concatenate(rows), np.concatenate(columns)

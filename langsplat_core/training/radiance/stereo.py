@@ -150,7 +150,8 @@ def window_moments(grey: Array) -> Array:
     parts = np.ones(grey.shape), grey.astype(np.float64), grey.astype(np.float64) ** 2
     share, mean, squares = (uniform_filter(part, size, mode="constant") for part in parts)
     mean /= share
-    return np.stack([mean, (squares / share - mean**2).clip(0), 1 / (size**2 * share)]).astype(np.float32)
+    moments = mean, (squares / share - mean**2).clip(0), 1 / (size**2 * share)
+    return np.stack(moments).astype(np.float32)
 
 
 @kernel
