@@ -205,11 +205,7 @@ class Page {
     if (this.address === (location.hash || "#") || location.protocol === "about:") {
       return; // a page in a notebook has no own address
     }
-    if (step) {
-      location.hash = this.address;
-    } else {
-      location.replace(this.address);
-    }
+    location[step ? "assign" : "replace"](this.address);
   }
 
   // Take the state from the address.
@@ -307,7 +303,9 @@ class Page {
     const left = answers.left?.join(", ");
     said.append(problem?.message ?? (left ? element("small", `Three at a time; not asked: ${left}`) : ""));
     if (problem?.near) {
-      const meant = this.phrase.toLowerCase().replace(problem.word, problem.near);
+      const inner = problem.word.replace(/[^\p{L}\p{N}]+/gu, "[^\\p{L}\\p{N}]+"); // between words: as typed
+      const whole = new RegExp(`(?<![\\p{L}\\p{N}])${inner}(?![\\p{L}\\p{N}])`, "gu");
+      const meant = this.phrase.toLowerCase().replace(whole, () => problem.near);
       said.append(" ", this.searchButton(`Did you mean “${meant}”?`, meant));
     }
     if (this.display === "latent") {

@@ -256,12 +256,12 @@ def test_several_phrases_are_answered_side_by_side(browser: Any, thin: Path) -> 
         assert tab.page.inner_text("#verdict").startswith("Type what to look for")  # not only what not
         tab.run("async () => (await langsplat).page.search('teddy bear, duck, candle, laptop')")
         assert tab.page.inner_text("#verdict").endswith("not asked: laptop")
-        tab.page.fill("#phrase", "teddy bera on the tabble")
+        tab.page.fill("#phrase", "table, teddy bera on the tabl")  # whole words are replaced
         for _ in range(2):
             tab.page.press("#phrase", "Enter")
             tab.page.click("#verdict button")  # did you mean
-        assert tab.page.input_value("#phrase") == "teddy bear on the table"
-        assert tab.page.inner_text("#verdict").startswith("found")
+        assert tab.page.input_value("#phrase") == "table, teddy bear on the table"
+        assert tab.page.inner_text("#verdict").startswith("● table: found")
         marks = tab.page.locator("#marks")
         assert tab.page.get_attribute("#phrase", "placeholder") != "what to look for"  # what is here
         for phrase, visible in (("teddy bear", True), ("banana", False), ("teddy bear", True), ("", False)):
@@ -305,6 +305,9 @@ def test_page_without_encoder_answers_phrasebook_and_taught_words(browser, demo,
         tab.page.press("#phrase", "Enter")
         assert "zebra" in tab.page.inner_text("#verdict")
         assert tab.page.locator("#answer").is_hidden()
+        tab.page.fill("#phrase", "Bruno, teddy  baer")  # two spaces
+        tab.page.press("#phrase", "Enter")
+        assert tab.page.inner_text("#verdict").endswith("Did you mean “bruno, teddy bear”?")
 
 
 def test_page_without_small_encoder_knows_encoded_phrases(browser: Any, demo: Scene, tmp_path: Path) -> None:
