@@ -74,13 +74,12 @@ def photo_folder(folder: Path) -> tuple[Path, list[Path]]:
 
 def count_photographs(dataset: Path) -> int:
     """Return the number of photographs in a dataset, 0 where it cannot be read; of a video the default."""
-    try:
+    with suppress(OSError):
         if hostile.is_video(dataset):
             return DatasetConfig.frames
         folder = dataset if dataset.is_dir() else dataset.parent
         return len(find_photos(folder / "images") or photo_folder(folder)[1])
-    except OSError:
-        return 0
+    return 0
 
 
 def say_unread(folder: Path, photos: Sequence[Path]) -> None:
@@ -111,12 +110,11 @@ def finder(folder: Path) -> Callable[[str], Path]:
 
     @cache
     def listed(inside: Path) -> dict[str, str]:
-        try:
+        with suppress(OSError, ValueError):
             return {
                 normalize("NFC", hostile.decode_name(os.fsencode(name))): name for name in os.listdir(inside)
             }
-        except (OSError, ValueError):
-            return {}
+        return {}
 
     def find(label: str) -> Path:
         path = folder / label
@@ -176,18 +174,16 @@ def optics(path: Path) -> Image.Exif:
     the size of the image, which is another for a copy.
     """
     kept = Image.Exif()
-    try:
-        with hostile.opened(path) as image:
-            source = image.getexif()
-            kept.update({tag: source[tag] for tag in (_MAKER, _MODEL) if tag in source})
-            inner = source.get_ifd(ExifTags.IFD.Exif)
-            lens = {tag: inner[tag] for tag in (_FOCAL, _FOCAL_ON_FILM) if inner.get(tag)}
-            lens = _on_film(inner, image.size) | lens
-            kept.get_ifd(ExifTags.IFD.Exif).update(lens)
-            kept.tobytes()
-    except hostile.PictureError:
-        return Image.Exif()
-    return kept
+    with suppress(hostile.PictureError), hostile.opened(path) as image:
+        source = image.getexif()
+        kept.update({tag: source[tag] for tag in (_MAKER, _MODEL) if tag in source})
+        inner = source.get_ifd(ExifTags.IFD.Exif)
+        lens = {tag: inner[tag] for tag in (_FOCAL, _FOCAL_ON_FILM) if inner.get(tag)}
+        lens = _on_film(inner, image.size) | lens
+        kept.get_ifd(ExifTags.IFD.Exif).update(lens)
+        kept.tobytes()
+        return kept
+    return Image.Exif()
 
 
 def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:

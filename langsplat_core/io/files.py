@@ -223,7 +223,6 @@ def _checked(target: Path) -> int:
 
 def _mode(path: Path) -> int:
     """Return the mode of what is at `path`, 0 for nothing; OSError for an impossible name."""
-    try:
+    with suppress(FileNotFoundError, NotADirectoryError):
         return os.stat(path).st_mode
-    except (FileNotFoundError, NotADirectoryError):
-        return 0
+    return 0

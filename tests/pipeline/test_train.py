@@ -135,6 +135,16 @@ def test_the_same_command_repeats_no_stage(room, trained):
     assert_same_tree(load_scene(trained).language.tree, tree)
 
 
+def test_replacing_a_scene_of_another_training_is_said(room, tmp_path, caplog):
+    out, settings = tmp_path / "scene.ply", tiny_settings(room)
+    shutil.copytree(room, tmp_path / "other")
+    rooms, works = (*[room] * 4, tmp_path / "other"), ("one", "one", "two", "one", "one")
+    for dataset, work, said in zip(rooms, works, (0, 0, 1, 1, 1), strict=True):
+        caplog.clear()
+        train_scene(dataset, out, settings, tmp_path / work, until="gaussians")
+        assert caplog.text.count("scene.ply: is not what") == said
+
+
 def test_a_setting_repeats_only_what_depends_on_it(room, trained):
     work = trained.with_name("scene.work")
     before = kept_results(work)
