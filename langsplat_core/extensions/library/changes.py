@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from langsplat_core.arrays import Array, linear_light, unit
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, report_loss
 from langsplat_core.extensions.geometry.registration import some_cameras
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.describe import Describer, likely_name
@@ -102,13 +102,16 @@ def changes(
     """Return the changes from the first scene to the second, by `KINDS`, the largest first.
 
     placed: (4, 4) similarity from the second scene's frame to the first one's; None: both have one world.
-    describers: of both, for names. Raises InputError if neither scene has cameras, if one has no language
-    field, and for a matrix that is no similarity.
+    describers: of both, for names. Reports scenes in which most of the other's pixels are gone. Raises
+    InputError if neither scene has cameras, if one has no language field, and for a matrix that is no
+    similarity.
     """
     if placed is None:
         placed = moving(second.scene.origin - first.scene.origin).matrix
     into = similarity(placed).matrix
     before, after = _evidence(first.scene, second.scene, into, rasterizer, progress)
+    if all(sums[:, 0].sum() > sums[:, 1].sum() for sums in (before, after)):
+        report_loss("most of each scene lies elsewhere in the other; align them by --register or --transform")
     home = (first, before, np.eye(4)), (second, after, into)
     gone, appeared = (_pieces(*each) for each in home)
     lost = [piece for piece in gone if piece.is_absent]

@@ -34,7 +34,7 @@ from langsplat_core.query.grammar import named
 from langsplat_core.query.rule import judge, scaling_of, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Calibration, Gaussians, PlattScaling, Scene
-from langsplat_core.scene.transform import place_scene
+from langsplat_core.scene.transform import place_scene, rotating, transform_scene
 from langsplat_core.semantics.encoders import keep_calibration, load_text_encoder
 from langsplat_core.semantics.relevancy import bundled_vocabulary
 from tests.support.fakes import CENTRES, NAMES, PER_BLOB, FakeEncoder, axis, named_scene
@@ -316,6 +316,14 @@ def test_another_frame_and_scale_change_nothing(scene):
     assert compared(scene, second, into) == ()
     (change,) = compared(scene, without(second, MUG), into)
     np.testing.assert_allclose(change.centre, CENTRES[0], atol=0.1)
+
+
+def test_scenes_with_other_axes_are_reported(scene, caplog):
+    tilted = rotating(np.array([1.0, 0, 0]), 30.0).about(np.array([0, 0, 1.6]))
+    compared(scene, transform_scene(scene, tilted), tilted.inverse().matrix)
+    assert caplog.messages == []
+    compared(scene, transform_scene(scene, tilted))
+    assert "align them" in "".join(caplog.messages)
 
 
 def test_scenes_that_cannot_be_compared_are_refused(scene):
