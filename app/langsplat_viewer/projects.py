@@ -24,7 +24,7 @@ from msgspec import Meta
 
 from langsplat_core.config import check_settings
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted
-from langsplat_core.io.files import atomic_path, locked
+from langsplat_core.io.files import locked, write_whole
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.scene import FARTHEST, Intrinsics, is_rotation
 from langsplat_core.scene.transform import similarity
@@ -105,8 +105,7 @@ def _read(path: Path, what: str, decode: Callable[[Any], T]) -> T:
 
 
 def _write(path: Path, content: object) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+    write_whole(path, json.dumps(content, indent=1, ensure_ascii=False))
 
 
 # Poses, in paths flat beside what else an entry has:
@@ -215,6 +214,10 @@ class Project(msgspec.Struct, omit_defaults=True):
     left_out: tuple[str, ...] = ()  # of a project of an earlier version, a line each
 
 
+def _folder_of(path: Path) -> Path:  # of a symbolic link its target's, which may also be opened itself
+    return Path(os.path.realpath(path) if os.path.islink(path) else os.path.abspath(path)).parent
+
+
 def digest_of(path: Path) -> str:
     """Return a digest of a file's content; "" where there is no file."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
@@ -229,14 +232,13 @@ def write_project(
     under the name that `apart` gives, asked while no other window writes; else nothing is kept, None.
     """
     project = msgspec.structs.replace(project, session=checked(project.session))
-    folder, scene = Path(os.path.abspath(path)).parent, Path(project.scene)
+    folder, scene = _folder_of(path), Path(project.scene)
     named = scene.relative_to(folder).as_posix() if scene.is_relative_to(folder) else str(scene)
     kept = None
     with locked(folder):
         if digest_of(path) not in ("", known):
             kept = apart()
-            with atomic_path(kept) as temporary:
-                temporary.write_bytes(path.read_bytes())
+            write_whole(kept, path.read_bytes())
         _write(path, {"format": FORMAT, "version": VERSION, **plain(project), "scene": named})
         return digest_of(path), kept
 
@@ -260,7 +262,7 @@ def read_project(path: Path) -> Project:
         groups = things.get("groups") or things.get("locked")
         found = {NO_GROUPS: groups, NOT_COMPARED: top["session"].get("canonical")}
         project.left_out = tuple(reason for reason, there in found.items() if there)
-        project.scene = os.path.abspath(path.parent / project.scene)
+        project.scene = os.path.abspath(_folder_of(path) / project.scene)
         return project
 
     return _read(path, "project", decode)
@@ -385,5 +387,4 @@ def save_preferences(folder: Path, preferences: Preferences, before: Preferences
                     )
                     changed["recent"] = tuple(recent)[:MOST_RECENT]
                 preferences = replace(there, **changed)
-        with atomic_path(folder / FILE_NAME) as temporary:
-            temporary.write_bytes(msgspec.json.format(msgspec.json.encode(preferences), indent=1))
+        write_whole(folder / FILE_NAME, msgspec.json.format(msgspec.json.encode(preferences), indent=1))

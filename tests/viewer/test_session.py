@@ -29,6 +29,7 @@ from langsplat_viewer.projects import (
     read_flight,
     read_project,
     save_preferences,
+    write_project,
 )
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.session import Note, Preferences, Query, Ruler, Things
@@ -502,6 +503,18 @@ def test_project_with_impossible_values_is_refused(saved):
         saved.write_text(json.dumps(content))
         with pytest.raises(LangSplatError):
             read_project(saved)
+
+
+def test_a_linked_project_names_its_scene_from_its_own_folder(opened, tmp_path):
+    own, link = tmp_path / "own" / "a.langsplat", tmp_path / "links" / "a.langsplat"
+    own.parent.mkdir()
+    link.parent.mkdir()
+    link.symlink_to(own)
+    project = read_project(saving.save_project(opened, own))
+    for scene in (own.with_suffix(".ply"), link.with_suffix(".ply")):
+        project.scene = str(scene)
+        write_project(link, project, lambda: tmp_path / "before.langsplat")
+        assert (read_project(link).scene, read_project(own).scene) == (str(scene), str(scene))
 
 
 def test_notes_are_pinned_edited_and_removed(opened):
