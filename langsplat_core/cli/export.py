@@ -232,8 +232,8 @@ class Transform:
         scene = load_scene(self.scene)
         to = self._similarity(scene)
         save_scene(self.out, replace(place_scene(scene, to), path=self.out))
-        rows = "; ".join(" ".join(f"{number:.9g}" for number in row) for row in to.matrix)
-        print(f"{self.out}: {len(scene.gaussians)} Gaussians, {len(scene.cameras)} cameras; matrix {rows}")
+        rows = "  ".join(" ".join(f"{number:.15g}" for number in row) for row in to.matrix)
+        print(f"{self.out}: {len(scene.gaussians)} Gaussians, {len(scene.cameras)} cameras; --matrix {rows}")
 
     def _similarity(self, scene: Scene) -> Similarity:
         to = IDENTITY if self.matrix is None else similarity(np.array(self.matrix))

@@ -116,9 +116,9 @@ def assert_companions(made: Scene, scene: Scene, rows) -> None:
     np.testing.assert_array_equal(made.extras["age"], scene.extras["age"][rows])
 
 
-def test_transform_moves_everything(scene, source, tmp_path):
+def test_transform_moves_everything(scene, source, tmp_path, capsys):
     """A quarter turn about z, twice the size, and a move, in that order, whatever the order of options; then
-    a matrix, row by row, and an axis."""
+    the printed matrix, one row by row, and an axis."""
     out = tmp_path / "out.ply"
     assert run("transform", source, out, "--move", 1, 2, 3, "--scale", 2, "--rotate", "z", 90) == 0
     made = load_scene(out)
@@ -127,6 +127,9 @@ def test_transform_moves_everything(scene, source, tmp_path):
     np.testing.assert_allclose(made.gaussians.means, moved, atol=1e-5)
     assert made.metres_per_unit == pytest.approx(0.25)
     assert_companions(made, scene, np.arange(N))
+    printed = capsys.readouterr().out.split(" cameras; ")[1].split()
+    assert run("transform", source, tmp_path / "again.ply", *printed) == 0
+    np.testing.assert_array_equal(load_scene(tmp_path / "again.ply").gaussians.means, made.gaussians.means)
     matrix = [0, -2, 0, 5, 2, 0, 0, 6, 0, 0, 2, 7, 0, 0, 0, 1]
     assert run("transform", source, tmp_path / "there.ply", "--matrix", *matrix) == 0
     want = scene.gaussians.means @ np.array([[0, 2, 0], [-2, 0, 0], [0, 0, 2]]) + (5, 6, 7)

@@ -124,11 +124,10 @@ class Register:
         matrix = between_worlds(similarity(found.transform), scene.origin, fixed.origin).matrix
         if self.out is not None:
             write_json(self.out, {"matrix": matrix.tolist()})
-        digits = 15 if scene.origin.any() or fixed.origin.any() else 9
-        rows = "; ".join(" ".join(f"{number:.{digits}g}" for number in row) for row in matrix)
+        rows = "  ".join(" ".join(f"{number:.15g}" for number in row) for row in matrix)
         print(
             f"{100 * found.agreement:.0f} % of the surfaces agree, {found.rmse:.3g} units apart; scale "
-            f"{found.scale:.4g}; matrix {rows}"
+            f"{found.scale:.4g}; --matrix {rows}"
         )
 
 
