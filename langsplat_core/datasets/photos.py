@@ -19,7 +19,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.colour import as_srgb, coded_as
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics, pinhole_for, resample, source_positions
-from langsplat_core.errors import InputError, Tell, shortened
+from langsplat_core.errors import InputError, Tell, report_loss, shortened
 from langsplat_core.io import hostile
 from langsplat_core.scene import Camera
 
@@ -86,11 +86,11 @@ def say_unread(folder: Path, photos: Sequence[Path]) -> None:
     """Say which photographs and videos among `photos`, and in folders of `folder`, are not read."""
     known, stems = set(photos), {photo.with_suffix("") for photo in photos}
     more = [path.relative_to(folder).as_posix() for path in find_photos(folder, DEEP) if path not in known]
-    beside = [
-        path for at in {photo.parent for photo in photos} for path in at.iterdir() if hostile.is_video(path)
-    ]
-    live = [path for path in beside if path.with_suffix("") in stems]
-    videos = sorted(path.name for path in beside if path not in live)
+    beside = [path for at in {photo.parent for photo in photos} for path in at.iterdir()]
+    live = [path for path in beside if hostile.is_video(path) and path.with_suffix("") in stems]
+    videos = sorted(path.name for path in beside if hostile.is_video(path) and path not in live)
+    if lost := sorted(path.name for path in beside if path.name[0] != "." and not os.path.exists(path)):
+        report_loss("%d links beside the photographs lead nowhere: %s", len(lost), shortened(lost))
     if live:
         log.info("%d videos of Live Photos are not read, their stills are", len(live))
     if videos:

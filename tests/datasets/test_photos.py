@@ -124,9 +124,11 @@ def test_unread_files_beside_photographs_are_named(tmp_path: Path, caplog) -> No
     for name in ("IMG_1.HEIC", "IMG_1.MOV", "IMG_2.heic", "IMG_2.mov", "walk.mp4", "edited/IMG_1.jpg"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
+    (tmp_path / "IMG_3.jpg").symlink_to("not fetched.jpg")
     caplog.set_level(logging.INFO, "langsplat")
     say_unread(*photo_folder(tmp_path))
     assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
+        "1 links beside the photographs lead nowhere",
         "2 videos of Live Photos are not read, their stills are",
         "1 videos are not read, train each by itself",
         "1 photographs in other folders are not read",
