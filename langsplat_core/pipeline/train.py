@@ -249,7 +249,8 @@ def _photographs(run: _Run) -> Capture:
             f"{FEWEST_VIEWS}; take more, or go on with --dataset.allow-few-cameras"
         )
     report, out = run.work / reports.REPORT, run.out  # the report is written after its scene
-    other = reports.stated_figures(report).get("dataset") != os.path.realpath(run.dataset)
+    stated = reports.stated_figures(report).get("dataset")  # is gone where it was moved
+    other = stated is None or (stated != os.path.realpath(run.dataset) and os.path.exists(str(stated)))
     if run.processes.is_main and out.exists() and (other or report.stat().st_mtime < out.stat().st_mtime):
         said = "%s: is not what %s last made of these photographs, and is replaced; else: another --out"
         log.warning(said, shown(out), shown(run.work))

@@ -137,9 +137,12 @@ def test_the_same_command_repeats_no_stage(room, trained):
 
 def test_replacing_a_scene_of_another_training_is_said(room, tmp_path, caplog):
     out, settings = tmp_path / "scene.ply", tiny_settings(room)
-    shutil.copytree(room, tmp_path / "other")
-    rooms, works = (*[room] * 4, tmp_path / "other"), ("one", "one", "two", "one", "one")
-    for dataset, work, said in zip(rooms, works, (0, 0, 1, 1, 1), strict=True):
+    other, moved = tmp_path / "other", tmp_path / "moved"
+    shutil.copytree(room, other)
+    table = [(room, "one", 0), (room, "one", 0), (room, "two", 1), (room, "one", 1), (other, "one", 1)]
+    for dataset, work, said in (*table, (moved, "one", 0)):
+        if dataset == moved:
+            other.rename(moved)
         caplog.clear()
         train_scene(dataset, out, settings, tmp_path / work, until="gaussians")
         assert caplog.text.count("scene.ply: is not what") == said
