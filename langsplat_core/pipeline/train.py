@@ -252,7 +252,7 @@ def _photographs(run: _Run) -> Capture:
     stated = reports.stated_figures(report).get("dataset")  # is gone where it was moved
     other = stated is None or (stated != os.path.realpath(run.dataset) and os.path.exists(str(stated)))
     if run.processes.is_main and out.exists() and (other or report.stat().st_mtime < out.stat().st_mtime):
-        said = "%s: is not what %s last made of these photographs, and is replaced; else: another --out"
+        said = "%s was not made by the last training in %s and will be replaced; else use another --out"
         log.warning(said, shown(out), shown(run.work))
     return capture
 
