@@ -286,8 +286,7 @@ class Window:
         except InputError as error:
             viewer.say_error(str(error))
         if (span := options.orthographic) is not None:
-            # Of the image in the window, whose sides are others than the photograph's.
-            viewpoint.move(viewer, lambda view: spanning(view, span * view.span / view.span_in(*state.size)))
+            viewpoint.move(viewer, lambda view: spanning(view, span))
         wanted = options.picture
         settings.set_picture(
             viewer, replace(state.session.picture, heat=wanted.heat, heat_scale=wanted.heat_scale)

@@ -397,7 +397,7 @@ def from_the_command_line(s: Session) -> None:
     np.testing.assert_allclose(s.state.view.eye, expected.position, atol=1e-9)
     np.testing.assert_allclose(s.state.view.rotation, expected.rotation, atol=1e-9)
     assert s.state.view.orthographic
-    assert abs(s.state.view.span_in(*s.state.size) - 4.0) < 1e-9
+    assert abs(s.state.view.span - 4.0) < 1e-9
 
 
 def broken_renderer(s: Session) -> None:
