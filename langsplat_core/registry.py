@@ -105,7 +105,8 @@ def parts(kind: Kind) -> Mapping[str, Any]:
 def _imported(kind: Kind, name: str, where: str) -> Any:
     what = f"extension's {kind} {name}"
     found, wanted = _loaded(what, EntryPoint(name, where, GROUP)), CLASSES.get(kind, "function")
-    fits = type(found).__name__ == wanted if kind in CLASSES else callable(found)
+    classes = [one.__name__ for one in type(found).__mro__]  # by name: their modules are imported later
+    fits = wanted in classes if kind in CLASSES else callable(found)
     if kind == "commands":
         fits, wanted = is_dataclass(found) and hasattr(found, "run"), "dataclass with `run`"
     if found is not None and not fits:

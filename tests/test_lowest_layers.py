@@ -356,8 +356,10 @@ def test_broken_part_is_refused_when_it_is_asked_for(monkeypatch: pytest.MonkeyP
 def test_names_taken_and_misfits_are_said(monkeypatch: pytest.MonkeyPatch, caplog) -> None:
     """Two extensions of one name, two parts of one, no Exporter; a group may do without a sentence."""
     part = registry.Extension(commands={"hail": "json:load", "greet one": "json:load"})
-    other = registry.Extension(commands={"hail": "json:dump"}, exporters={"odd": "json:load"})
-    monkeypatch.setitem(sys.modules, "two", SimpleNamespace(A=part, B=other))
+    exporters = {"odd": "json:load", "own": "two:C"}
+    other = registry.Extension(commands={"hail": "json:dump"}, exporters=exporters)
+    own = type("Own", (type("Exporter", (), {}),), {})()
+    monkeypatch.setitem(sys.modules, "two", SimpleNamespace(A=part, B=other, C=own))
     points = [EntryPoint(name, f"two:{what}", registry.GROUP) for name, what in ("aA", "aB", "bB")]
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
     monkeypatch.setattr(registry, "extensions", registry.extensions.__wrapped__)
@@ -369,6 +371,7 @@ def test_names_taken_and_misfits_are_said(monkeypatch: pytest.MonkeyPatch, caplo
             "extension a has it among its commands, too; LANGSPLAT_WITHOUT=a hides that",
         ),
     ]
+    assert registry.part("exporters", "own") is own
     for kind, name in (("commands", "hail"), ("exporters", "odd")):
         with pytest.raises(InputError, match="cannot be used: its extension is broken"):
             registry.part(kind, name)

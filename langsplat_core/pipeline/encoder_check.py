@@ -86,7 +86,7 @@ class EncoderReport:
 
 
 class _Names(Struct):
-    """assets/demo/names.json."""
+    """Names of the bundled scene's regions, as assets/demo/names.json has them."""
 
     names: dict[int, list[str]]  # whole, or part with a word of its own -> its names
     called: list[str]  # all words for anything there

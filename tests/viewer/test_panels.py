@@ -217,7 +217,7 @@ def plain_clip(camera, start, end):
     )
 
 
-def test_segments_are_clipped_before_the_eye_as_plain_arithmetic_does():
+def test_segments_are_clipped_ahead_of_the_eye():
     rng = np.random.default_rng(4)
     camera = look_at(np.array([0.3, -0.2, -2.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
     segments = rng.normal(scale=2.5, size=(4000, 2, 3))

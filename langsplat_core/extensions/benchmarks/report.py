@@ -268,7 +268,7 @@ log = logging.getLogger("langsplat")
 
 @dataclass(frozen=True)
 class Evaluated:
-    """What is evaluated: exactly one of `scene` and `maps` is set."""
+    """The scenes or maps that `eval` scores; exactly one of `scene` and `maps` is set."""
 
     scene: Path | None = None  # a scene file, or a folder of <benchmark's scene>.ply
     maps: Path | None = None  # <view>/<phrase>..., or <benchmark's scene>/<view>/<phrase>...
