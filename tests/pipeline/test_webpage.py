@@ -782,7 +782,7 @@ def test_notebooks_show_a_page_that_was_asked(browser, demo, engine, tmp_path, p
     tab.goto((tmp_path / "cell.html").as_uri())
     frame = tab.frames[1]
     said = run_phrase(engine, asked).answer.said
-    frame.wait_for_function("said => document.body.innerText.includes(said)", arg=said)
+    assert said in frame.evaluate("async () => (await langsplat) && document.body.innerText")
     assert frame.evaluate("async () => (await langsplat).page.display") == "relevancy"
     frame.fill("#phrase", other)
     frame.press("#phrase", "Enter")
