@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from importlib.resources import files
 from types import MappingProxyType
-from typing import Literal, Protocol, get_args
-from weakref import WeakKeyDictionary
+from typing import Literal, Protocol, TypeVar, get_args
 
 import numpy as np
 
@@ -44,12 +43,9 @@ MAX_QUERIES = len(QUERY_COLOURS)  # shown at a time: one colour each, one channe
 
 
 def mapped(t: Array, name: ColourMap) -> Array:
-    """Return (..., 3) colours in [0, 1] of a colour map at (...,) values in [0, 1]."""
-    position = np.clip(t, 0, 1) * (NODES - 1)
-    low = np.minimum(position.astype(int), NODES - 2)
-    fraction = (position - low)[..., None]
-    table = COLOUR_MAPS[name] / 255.0
-    return table[low] * (1 - fraction) + table[low + 1] * fraction
+    """Return (..., 3) colours in [0, 1] of a colour map at (...,) values, its ends beyond [0, 1]."""
+    nodes = np.linspace(0, 1, NODES)
+    return np.stack([np.interp(t, nodes, channel / 255) for channel in COLOUR_MAPS[name].T], -1)
 
 
 def oklab(colours: Array) -> Array:
@@ -100,6 +96,7 @@ class Answer(Protocol):
 
 
 Answers = Sequence[Answer | None]  # by colour slot; None: the slot has no answer
+A = TypeVar("A", bound=Answer)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +110,10 @@ class Subject:
     heat: HeatOf = "smooth"
 
 
-def painted(answers: Answers) -> list[int]:
-    """Return the slots that are drawn: those of answers other than "not here"."""
-    return [slot for slot, answer in enumerate(answers) if answer is not None and STRENGTH[answer.verdict]]
+def painted(answers: Sequence[A | None]) -> dict[int, A]:
+    """Return the answers that are drawn, those other than "not here", by their slots."""
+    given = {slot: answer for slot, answer in enumerate(answers) if answer is not None}
+    return {slot: answer for slot, answer in given.items() if STRENGTH[answer.verdict]}
 
 
 def heats(subject: Subject) -> Array | None:
@@ -127,10 +125,13 @@ def heats(subject: Subject) -> Array | None:
     """
 
     def heat(one: Answer) -> Array:
-        own = one.relevancy[one.level if subject.level is None else subject.level]
+        values = one.relevancy[one.level if subject.level is None else subject.level]
         if subject.heat == "everywhere" or subject.level is not None:
-            return -own
-        values = {"smooth": lambda: one.smooth, "own": lambda: own, "node": lambda: one.even}[subject.heat]()
+            return -values
+        if subject.heat == "smooth":
+            values = one.smooth
+        elif subject.heat == "node":
+            values = one.even
         low, high = one.heat_range
         hot = HEAT_BASE + (1 - HEAT_BASE) * np.clip((values - low) / (high - low), 0, 1)
         return np.where(one.members, hot, 0)
@@ -144,12 +145,12 @@ def members(subject: Subject) -> Array | None:
 
 
 def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | None:
-    if not painted(subject.answers):
+    drawn = painted(subject.answers)
+    if not drawn:
         return None
     values = np.zeros((subject.count, len(subject.answers)), np.float32)
-    for slot, answer in enumerate(subject.answers):
-        if answer is not None and STRENGTH[answer.verdict]:
-            values[:, slot] = values_of(answer)
+    for slot, answer in drawn.items():
+        values[:, slot] = values_of(answer)
     return values
 
 
@@ -159,10 +160,11 @@ def heat_ranges(
     """Return the values of `heats` at heat 0 and 1 of each slot, by `scale`, in relevancies, or its own."""
 
     def ends(answer: Answer) -> tuple[float, float]:
-        (low, high), own = answer.heat_range, scale or answer.heat_range
+        low, high = answer.heat_range
+        coldest, hottest = scale or answer.heat_range
         if everywhere:
-            return -own[0], -own[1]
-        first, last = (HEAT_BASE + (1 - HEAT_BASE) * (end - low) / (high - low) for end in own)
+            return -coldest, -hottest
+        first, last = (HEAT_BASE + (1 - HEAT_BASE) * (end - low) / (high - low) for end in (coldest, hottest))
         return first, last
 
     return _ranges(answers, ends)
@@ -175,38 +177,18 @@ def member_ranges(answers: Answers, *_: object) -> Ranges:
 
 def _ranges(answers: Answers, ends: Callable[[Answer], tuple[float, float]]) -> Ranges:
     """Return the range of each slot; weak matches reach half of it."""
-    ranges = []
-    for answer in answers:
-        strength = 0.0 if answer is None else STRENGTH[answer.verdict]
-        low, high = ends(answer) if answer is not None and strength else NO_HEAT
-        ranges.append((low, low + (high - low) / (strength or 1.0)))
+    ranges = [NO_HEAT] * len(answers)
+    for slot, answer in painted(answers).items():
+        low, high = ends(answer)
+        ranges[slot] = low, low + (high - low) / STRENGTH[answer.verdict]
     return tuple(ranges)
-
-
-_LATENT: WeakKeyDictionary[LanguageField, Array] = WeakKeyDictionary()
 
 
 def latents(subject: Subject) -> Array | None:
     """Return (N, 3) colours of the latents at a level; None without a language field or level."""
     if subject.language is None or subject.level is None:
         return None
-    return np.asarray(latent_colours(subject.language)[subject.level])
-
-
-def latent_colours(field: LanguageField) -> Array:
-    """Return (3, N, 3) float32 colours in [0, 1] of latents at each level; grey where nothing was seen.
-
-    The colours are cached for each field.
-
-    Codewords have their own. Latents of 3 numbers are colours themselves, others have their first three
-    principal axes over all levels together (one basis for the scene, so that colours agree between views
-    and levels); each axis is stretched between its 2 % and 98 % quantiles.
-    """
-    if field not in _LATENT:
-        seen, flat = field.known, field.latents.reshape(-1, field.latents.shape[2])
-        colours = field.codec.colours(flat, seen.reshape(-1).astype(np.float64)).reshape(*seen.shape, 3)
-        _LATENT[field] = np.where(seen[..., None], colours, np.float32(0.5)).astype(np.float32)
-    return _LATENT[field]
+    return np.asarray(subject.language.colours[subject.level])
 
 
 GOLDEN = 0.6180339887  # step of hue, in turns, between consecutive nodes: it keeps their colours apart
@@ -268,11 +250,6 @@ _GLSL = {
     Drawing.HEAT: "vec4(on_edge(extra, place, HEAT_EDGE) ? vec3(1.0) : heat_map(base, mean, place), c.a)",
     Drawing.SEGMENTS: "vec4(segments(base, mean, place), c.a)",
 }
-
-
-def gated_mean(total: Array, alpha: Array, gate: float) -> Array:
-    """Return (H, W, Q) means, weighted sums / alpha, where alpha exceeds `gate`, else 0."""
-    return np.asarray(total / np.where(alpha > gate, alpha, np.float32(np.inf))[..., None])
 
 
 def full_ranges(ranges: Ranges) -> Array:

@@ -92,8 +92,7 @@ def covered(scene: Scene, cameras: Sequence[Camera]) -> Array:
     """Return (N,) float32: each Gaussian's largest summed weight in any camera's image of 320 px, pixels."""
     most = np.zeros(len(scene.gaussians), np.float32)
     for camera in (each.within(320) for each in cameras):
-        painted = view_of(scene, camera).gather(np.ones((camera.height, camera.width, 1), np.float32))
-        np.maximum(most, painted[:, 0], out=most)
+        np.maximum(most, view_of(scene, camera).contributions(), out=most)
     return most
 
 

@@ -14,7 +14,6 @@ import scipy
 
 from langsplat_core.arrays import Array, pieces, unit
 from langsplat_core.compiled import kernel, shared_workers
-from langsplat_core.display.displays import gated_mean
 from langsplat_core.errors import InputError
 from langsplat_core.raster.protocol import View
 from langsplat_core.scene import CodebookCodec, LanguageField
@@ -136,7 +135,7 @@ def sphere_cells(latents: Array, most: int = CELLS) -> tuple[Array, Array]:
 def splatted_relevancy(view: View, relevancy: Array, alpha_gate: float) -> Array:
     """Return (H, W, Q) relevancy in [0, 1] of pixels from (N, Q) of Gaussians; 0 below the alpha gate."""
     total, alpha = view.splat(np.asarray(relevancy, np.float32))
-    return gated_mean(total, alpha, alpha_gate)
+    return np.asarray(total / np.where(alpha > alpha_gate, alpha, np.float32(np.inf))[..., None])
 
 
 def decoded_relevancy(

@@ -310,6 +310,16 @@ class LanguageField:
         flat = self.codec.known(self.latents.reshape(-1, self.latents.shape[2]))
         return np.asarray((self.confidence > 0) & flat.reshape(self.confidence.shape))
 
+    @cached_property
+    def colours(self) -> Array:
+        """(3, N, 3) float32 colours in [0, 1] of the latents at each level, grey where nothing was seen.
+
+        One basis for all levels, see `codec.principal_colours`: colours agree between views and levels.
+        """
+        seen, flat = self.known, self.latents.reshape(-1, self.latents.shape[2])
+        colours = self.codec.colours(flat, seen.reshape(-1).astype(np.float64)).reshape(*seen.shape, 3)
+        return np.where(seen[..., None], colours, np.float32(0.5)).astype(np.float32)
+
     def take(self, rows: Array) -> "LanguageField":
         """Return the field of the Gaussians at `rows` (indices or a boolean mask)."""
         return replace(

@@ -26,7 +26,6 @@ from langsplat_core.display.displays import (
     Subject,
     heat_ranges,
     heats,
-    latent_colours,
     mapped,
     member_ranges,
     members,
@@ -64,7 +63,7 @@ def test_absent_answers_paint_nothing(channel, ranges):
     assert not values[:, 0].any()
     assert values[:, 1].any()
     assert ranges((ABSENT, FOUND, None))[0] == NO_HEAT
-    assert painted((ABSENT, FOUND, None)) == [1]
+    assert painted((ABSENT, FOUND, None)) == {1: FOUND}
 
 
 def test_a_weak_match_is_never_hotter_than_half():
@@ -278,7 +277,7 @@ def test_latent_colours_for_any_dimension(d):
     confidence = np.ones((3, 50), np.float32)
     confidence[:, 10] = 0
     field = LanguageField(latents, confidence, codec, np.eye(12, dtype=np.float32)[:4], "none")
-    colours = latent_colours(field)
+    colours = field.colours
     assert colours.shape == (3, 50, 3)
     assert colours.min() >= 0
     assert colours.max() <= 1

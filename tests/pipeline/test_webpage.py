@@ -21,7 +21,7 @@ from langsplat_core.cli.app import parse
 from langsplat_core.cli.export import Export
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
-from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats, latent_colours
+from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.webpage import covered, make_page, views, write_page
@@ -132,7 +132,7 @@ def test_page_draws_heat_and_latents_as_opengl_does(tab, demo, engine, gl, measu
     values, ranges = heats(Subject(len(demo.gaussians), answers=[answer])), heat_ranges([answer])
     compare(measured, "demo, heat", ours, drawn(gl, demo, camera, values, display="relevancy", ranges=ranges))
     ours = tab.image(camera, origin, "latent")
-    theirs = drawn(gl, demo, camera, latent_colours(demo.language)[2], display="latent")
+    theirs = drawn(gl, demo, camera, demo.language.colours[2], display="latent")
     compare(measured, "demo, latent", ours, theirs)
 
 

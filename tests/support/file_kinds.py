@@ -38,7 +38,6 @@ from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import exif_facts, optics, read_photo
 from langsplat_core.datasets.video import kept_frames
-from langsplat_core.display.displays import latent_colours
 from langsplat_core.errors import InputError, LangSplatError, printable_line
 from langsplat_core.extensions.benchmarks.raster_speed import peak_memory, restart_peak
 from langsplat_core.extensions.geometry.usd import write_usd
@@ -500,7 +499,7 @@ def searched(path: Path) -> float:
     describer = Describer(engine, ["cup"])
     scene_inventory(describer)
     outline_lines(outline_of(describer), Unit(None, scene.origin))
-    values = np.concatenate([answer.relevancy.T, *latent_colours(field)], axis=1)
+    values = np.concatenate([answer.relevancy.T, *field.colours], axis=1)
     drawn = render(scene, scene.framing_camera((32, 24)), values)
     assert np.isfinite(values).all()
     assert np.isfinite(drawn.values).all()

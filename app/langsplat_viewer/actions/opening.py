@@ -10,7 +10,7 @@ import numpy as np
 
 from langsplat_core.compiled import is_compiled
 from langsplat_core.datasets.photos import count_photographs
-from langsplat_core.display.displays import DISPLAYS, latent_colours
+from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io.files import is_utf8, shown
 from langsplat_core.io.scenes import format_of, scene_files
@@ -134,7 +134,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
         state.preferences = state.preferences.with_recent(path.absolute())
         _say_opened(viewer, path, opened)
     if field is not None:
-        viewer.run("preparing latent colours", lambda progress: latent_colours(field))  # none is needed yet
+        viewer.run("preparing latent colours", lambda progress: field.colours)  # none is needed yet
         _prepare_search(viewer)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.display.displays import Subject, latent_colours, nodes
+from langsplat_core.display.displays import Subject, nodes
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
@@ -113,7 +113,7 @@ def colour_of(viewer: Viewer, node: int) -> tuple[float, float, float] | None:
     field = state.scene.language
     if key not in view.colours and field is not None:
         subject = Subject(len(state.scene.gaussians), field, level=state.session.latent_level)
-        values = latent_colours(field)[state.session.latent_level] if display == "latent" else nodes(subject)
+        values = field.colours[state.session.latent_level] if display == "latent" else nodes(subject)
         inside = view.tree.members(node)
         mean = np.zeros(3) if values is None else np.median(values[inside], axis=0)
         view.colours[key] = (float(mean[0]), float(mean[1]), float(mean[2]))

@@ -386,17 +386,16 @@ def beside_search(part: ui.Area, free: ui.Area, rows: int) -> ui.Area:
 def _bars(viewer: Viewer, drawing: Drawing, of: str) -> list[Callable[[float], None]]:
     """Return functions that draw a bar of a width: one for depth, or one for each query shown as heat."""
     state, picture, shown = viewer.state, viewer.state.session.picture, viewer.state.shown_results()
-    depths, slots = state.stats.depths, painted(shown) if drawing is Drawing.HEAT else []
+    depths, answers = state.stats.depths, painted(shown) if drawing is Drawing.HEAT else {}
     if drawing is Drawing.DEPTH and depths is not None and state.scene is not None:
         scale, unit = (1.0, "units") if (metres := state.scene.metres_per_unit) is None else (metres, "m")
         colours = bar_colours(1.0, picture.colour_map)[::-1]  # the nearest is the hottest
         return [partial(_bar, f"depth, {unit}{of}", colours, (scale * depths[0], scale * depths[1]), None)]
     bars: list[Callable[[float], None]] = []
-    for slot, result in ((slot, shown[slot]) for slot in slots):
-        if result is not None:
-            colours = bar_colours(STRENGTH[result.verdict], picture.colour_map if len(slots) == 1 else slot)
-            ends = picture.heat_scale or result.heat_range
-            bars.append(partial(_bar, f"{result.phrase}{of}", colours, ends, result.cut))
+    for slot, result in answers.items():
+        colours = bar_colours(STRENGTH[result.verdict], picture.colour_map if len(answers) == 1 else slot)
+        ends = picture.heat_scale or result.heat_range
+        bars.append(partial(_bar, f"{result.phrase}{of}", colours, ends, result.cut))
     return bars
 
 
