@@ -152,7 +152,6 @@ class Canvas:
         return layers, 1e3 * (self._clock() - began)
 
     def _changes(self, request: RenderRequest) -> bool:
-        """Return whether the image on screen is of another request, at any level of detail."""
         return self._wanted is None or self._wanted[0] != request
 
     def _merged(self, request: RenderRequest) -> Merged | None:

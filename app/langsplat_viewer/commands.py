@@ -95,11 +95,11 @@ def _display(button: Button, number: int) -> Command:
     )
 
 
-def _overlay(name: Overlay, title: str) -> Command:
+def _overlay(name: Overlay, title: str, *keys: str) -> Command:
     return Command(
         f"show or hide the {title}",
         lambda v: settings.toggle_overlay(v, name),
-        ("B",) if name == "things" else (),
+        keys,
         is_on=lambda v: name in v.state.session.overlays,
     )
 
@@ -119,13 +119,6 @@ def _side(side: Side, key: str) -> Command:
     return Command(f"look from {where}", lambda v: viewpoint.look_from(v, side), (key,))
 
 
-OVERLAY_TITLES: dict[Overlay, str] = {
-    "things": "boxes of what was found",
-    "cameras": "training cameras",
-    "cube": "axes",
-    "grid": "ground grid",
-}
-SIDES: tuple[tuple[int, Side, Side], ...] = ((1, "front", "back"), (3, "right", "left"), (7, "top", "bottom"))
 PANEL_TITLES = (
     *("Search", "Display", "Camera", "Outline", "Selection", "Transform", "Record", "Bookmarks"),
     *("Notes", "Scene", "Train", "Timeline", "Messages"),
@@ -230,7 +223,10 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             "three levels side by side", settings.toggle_levels, is_on=_is("session.split.mode", "levels")
         ),
         Command("compare with another scene ...", opening.ask_for_beside),
-        *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
+        _overlay("things", "boxes of what was found", "B"),
+        _overlay("cameras", "training cameras"),
+        _overlay("cube", "axes"),
+        _overlay("grid", "ground grid"),
         Command(
             "measure a distance",
             settings.toggle_measuring,
@@ -253,7 +249,12 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command(
             "align the up axis with the view", lambda v: viewpoint.move(v, adopt_up), (), "Align up axis"
         ),
-        *chain(*((_side(one, f"Keypad{n}"), _side(other, f"Ctrl+Keypad{n}")) for n, one, other in SIDES)),
+        _side("front", "Keypad1"),
+        _side("back", "Ctrl+Keypad1"),
+        _side("right", "Keypad3"),
+        _side("left", "Ctrl+Keypad3"),
+        _side("top", "Keypad7"),
+        _side("bottom", "Ctrl+Keypad7"),
         Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
         Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True),
         Command("add a keyframe here", viewpoint.add_keyframe, ("K",), "Add keyframe"),

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal, get_args
 
@@ -40,11 +40,6 @@ class Marks:
     @property
     def kept(self) -> Array:
         return ~self.deleted
-
-    def same(self, other: "Marks") -> bool:
-        """Return whether both mark the same Gaussians."""
-        pairs = ((getattr(self, part.name), getattr(other, part.name)) for part in fields(Marks))
-        return all(a is b or np.array_equal(a, b) for a, b in pairs)
 
 
 def unmarked(count: int) -> Marks:

@@ -52,14 +52,7 @@ class ViewerCommand(ViewerOptions):
         self.wanted_size, self.picture  # noqa: B018  what cannot be read is said before anything slow is done
         path = scene_path(self.scene)
         chosen_camera(self.camera)
-        if self.headless and self.beside is not None:
-            raise InputError("--beside is for the window; draw the two scenes one after the other")
-        if self.headless and path.name.endswith(PROJECTS):
-            raise InputError(
-                f"{path}: a project is opened in a window; name its scene, or leave out --headless"
-            )
         if self.headless:
-            check_options(self)
             with TerminalProgress() if sys.stderr.isatty() else nullcontext(silent) as progress:
                 lines = draw(self, path, services(self.encoder), progress)
             print("\n".join(lines))
@@ -75,8 +68,15 @@ class ViewerCommand(ViewerOptions):
 # Images and films without a window.
 
 
-def check_options(options: ViewerOptions) -> Path:
-    """Return where the image or film goes. InputError where that cannot work, before anything slow."""
+def check_options(options: ViewerOptions, path: Path) -> Path:
+    """Return where the image or film of the scene `path` goes.
+
+    InputError where that cannot work, before anything slow.
+    """
+    if options.beside is not None:
+        raise InputError("--beside is for the window; draw the two scenes one after the other")
+    if path.name.endswith(PROJECTS):
+        raise InputError(f"{path}: a project is opened in a window; name its scene, or leave out --headless")
     if options.path is not None and options.turntable is not None:
         raise InputError("--path and --turntable are two films; choose one")
     if options.path is not None and options.orthographic is not None:
@@ -99,7 +99,7 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
     The first is of the file, then follow one of each query, and what the answers stand on. Raises InputError
     and what the services do.
     """
-    out = check_options(options)
+    out = check_options(options, path)
     flight = None if options.path is None else read_flight(options.path)  # before anything slow is done
     if out != options.out:
         log.warning("PyAV is not installed: pictures are written into the folder %s instead", out)
@@ -161,7 +161,6 @@ def _first_camera(scene: Scene, options: ViewerOptions) -> Camera:
 def _answers(
     engine: QueryEngine, options: ViewerOptions, camera: Camera, progress: Progress
 ) -> tuple[QueryResult, ...]:
-    """Return the answers to the queries, in their order."""
     phrases = [phrase for text in options.query for phrase in split_phrases(text) or [text]]
     for phrase in phrases:  # before anything slow is done
         check_phrase(engine, phrase, camera, progress)

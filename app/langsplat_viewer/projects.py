@@ -308,7 +308,6 @@ def _rigid(move: Move) -> Move:
 
 
 def _from_version_1(top: dict[str, Any]) -> dict[str, Any]:
-    """Return a project of version 1 in the layout of version 2."""
     asked = top["queries"]["queries"]
     free = iter([*range(SLOTS), *[None] * len(asked)])
     queries = [

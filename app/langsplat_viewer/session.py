@@ -74,12 +74,12 @@ class Marked:
     deleted: Bits | None = None
 
     def of(self, marks: Marks, now: Marks) -> "Marked":
-        """Return the bits of `marks`.
+        """Return the bits of `marks`; those of this object, which are the bits of `now`, where both agree."""
 
-        Those of this object, which are the bits of `now`, are used as far as both share their masks.
-        """
-        kept = ((name, getattr(marks, name), getattr(now, name)) for name in MASKS)
-        return Marked(**{name: getattr(self, name) if new is old else pack(new) for name, new, old in kept})
+        def bits(own: Bits | None, new: Array, old: Array) -> Bits | None:
+            return own if new is old or np.array_equal(new, old) else pack(new)
+
+        return Marked(*(bits(*(getattr(part, name) for part in (self, marks, now))) for name in MASKS))
 
     def masks(self, before: "Marked", marks: Marks) -> Marks:
         """Unpack these bits into masks, (count,) bool each.
@@ -175,7 +175,6 @@ class Bookmark:
     distance: Annotated[float, Meta(gt=0, le=FARTHEST)]  # to what it turns around, world units
 
     def moved(self, offset: Array) -> "Bookmark":
-        """Return the view moved by `offset` (3,)."""
         return replace(self, pose=self.pose.moved(offset))
 
 

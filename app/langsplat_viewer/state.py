@@ -22,7 +22,7 @@ from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, unmarked
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes, widget
-from langsplat_viewer.session import OF_PROJECT, Move, Note, Point, Preferences, Query, Session
+from langsplat_viewer.session import OF_PROJECT, Marked, Move, Note, Point, Preferences, Query, Session
 
 # Camera path and film: the panel "Record".
 
@@ -228,7 +228,6 @@ class SceneState:
 
     # what follows from the session
     opened: Scene | None = None  # the scene as its file has it, once something was transformed
-    marks: Marks = field(default_factory=lambda: unmarked(0))
     answers: dict[str, QueryAnswer] = field(default_factory=dict)  # by phrase
 
     view: OrbitCamera | None = None
@@ -245,9 +244,9 @@ class SceneState:
     suggestions: Suggestions = field(default_factory=Suggestions)
     offered: tuple[str, tuple[str, tuple[str, ...]]] = ("", ("", ()))  # what was typed, and its offers
     suggestions_of: Scene | None = None  # the scene for which they were looked for
-    frusta: tuple[Scene, Array] | None = None  # (C, 8, 2, 3) edges of the cameras of which scene
     pivot: tuple[Scene, Array, Array] | None = None  # of what is selected in which scene, a point (3,)
     out_of_sight: tuple[OutlineView, Marks, Array] | None = None  # nodes with nothing shown, of which
+    _masks: tuple[Marked, Marks] | None = None  # what the session last marked, and its masks
     _edited: EditedScene | None = None  # of the last request
 
     def visit(self) -> "SceneState":
@@ -255,6 +254,13 @@ class SceneState:
         files = ("saved", "project", "project_digest", "count", "origin")
         names = ("session", *files, "path", "view", "opening_camera", "camera_index")
         return SceneState(**{name: getattr(self, name) for name in names})
+
+    @property
+    def marks(self) -> Marks:
+        """What the session marks, as masks: the same objects for the same marks."""
+        before, masks = self._masks or (Marked(), unmarked(self.count))
+        self._masks = self.session.marks, self.session.marks.masks(before, masks)
+        return self._masks[1]
 
     @property
     def has_field(self) -> bool:
@@ -335,7 +341,6 @@ class ViewerState(SceneState):
             print(message.text, file=sys.stderr)
 
     def answer(self, query: Query) -> QueryAnswer:
-        """Return the answer to a query of the list."""
         return self.answers.get(query.phrase, QueryAnswer(pending=True))
 
     def result(self, query: Query) -> QueryResult | None:

@@ -324,5 +324,4 @@ class Viewer:
         self.recorder.poll()
 
     def say_error(self, reason: str) -> None:
-        """Add one line to the messages area, as an error."""
         self.state.say(reason, is_error=True)

@@ -18,6 +18,7 @@ from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.marks import Marks, unmarked
 from langsplat_viewer.rendering.renderer import Backend, open_renderer
 from langsplat_viewer.rendering.request import Clip, RenderRequest, Splats
+from langsplat_viewer.session import Marked
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene
@@ -212,9 +213,8 @@ def marks_of(viewer: Viewer) -> Marks:
 
 def put_marks(viewer: Viewer, **masks: np.ndarray) -> None:
     """Mark nothing but the (N,) `selected`, `hidden` and `deleted` that are given."""
-    assert viewer.state.scene is not None
-    marks = replace(unmarked(len(viewer.state.scene.gaussians)), **masks)
-    editing.put_marks(viewer, marks)
+    nothing = unmarked(viewer.state.count)
+    viewer.put(marks=Marked().of(replace(nothing, **masks), nothing))
 
 
 def names(rows: np.ndarray) -> str:

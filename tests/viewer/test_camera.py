@@ -189,14 +189,6 @@ def test_training_cameras_wrap_round(opened):
     assert opened.state.camera_index == 0
 
 
-def test_frusta_are_computed_once_for_a_scene(opened):
-    made = viewpoint.camera_frusta(opened)
-    assert made.shape == (3, 8, 2, 3)
-    assert viewpoint.camera_frusta(opened) is made
-    open_scene(opened, "bare.ply")
-    assert len(viewpoint.camera_frusta(opened)) == 0
-
-
 def test_double_click_turns_around_the_surface(opened):
     go(viewpoint.focus_pixel, opened, 0.75, 0.5)
     assert_allclose(opened.state.view.target, (0.25, 0.0, 0.0))
@@ -322,7 +314,7 @@ def test_weights_are_opacity_times_size_and_faults_have_none():
     assert_allclose(sample.weights[5], 2 * plain.weights[7], rtol=1e-5)  # two rows fewer before it
     nothing = controls.Sample(np.zeros((0, 3)), np.zeros(0))
     assert controls.framing_eye(nothing, ROTATION, WIDE) is None
-    assert controls.reach(nothing, np.zeros(3)) == 0
+    assert controls.depth_share(nothing, np.zeros(3), ROTATION[2], 0.5) == 0
 
 
 # Views with names, and the six sides.

@@ -240,12 +240,13 @@ def test_segments_are_clipped_ahead_of_the_eye():
 
 def test_frusta_nearest_segments_and_edges_of_boxes():
     camera = cameras()[1]
-    edges = overlays.frusta([camera], 0.4)[0]
+    edges = overlays.frusta((camera,), 0.4)[0]
     np.testing.assert_allclose(edges[:4, 0], np.tile(camera.position, (4, 1)), atol=1e-12)
     pixels, depths = camera.project(edges[:4, 1])
     np.testing.assert_allclose(depths, 0.4)
     np.testing.assert_allclose(pixels, [(0, 0), (160, 0), (160, 120), (0, 120)], atol=1e-9)
-    assert overlays.frusta([], 1.0).shape == (0, 8, 2, 3)
+    assert overlays.frusta((camera,), 0.4) is overlays.frusta((camera,), 0.4)
+    assert overlays.frusta((), 1.0).shape == (0, 8, 2, 3)
     segments = np.array([[[0.0, 0], [10, 0]], [[0, 5], [10, 5]], [[3, 3], [3, 3]]])
     assert overlays.nearest_segment(segments, (20.0, 0.0)) == (0, 10.0)
     assert overlays.nearest_segment(segments, (6.0, 4.5)) == (1, 0.5)

@@ -215,7 +215,7 @@ def test_threshold_is_one_step_and_outlives_the_level(asked):
     automatic = result(asked)
     queries.set_cut(asked, "mug", 0.6)
     for value in (0.61, 0.62):  # the slider moves on
-        queries.set_cut(asked, "mug", value, is_new=False)
+        queries.set_cut(asked, "mug", value)
     act(queries.set_level, asked, "part")
     assert (result(asked).level, result(asked).own_cut) == (1, 0.62)
     act(editing.undo, asked)

@@ -11,7 +11,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer.actions import editing, queries, saving, settings, viewpoint
 from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
+from langsplat_viewer.commands import BUTTONS, COMMANDS
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.projects import load_preferences, save_preferences
 from langsplat_viewer.rendering.renderer import ArrayRenderer, Inputs, renderer_for
@@ -263,9 +263,8 @@ def test_splats_are_drawn_smaller_and_of_one_colour():
 
 
 def test_overlays_and_colour_map_have_commands_and_are_remembered(opened, tmp_path):
-    for name in reversed(OVERLAYS):
-        (command,) = matching(OVERLAY_TITLES[name])
-        if name not in opened.state.session.overlays:
+    for command in reversed(COMMANDS):
+        if command.does.startswith("show or hide") and not command.is_on(opened):
             command.act(opened)
     assert opened.state.session.overlays == OVERLAYS
     settings.set_picture(opened, replace(opened.state.session.picture, colour_map="cividis"))

@@ -21,7 +21,7 @@ from langsplat_viewer import options
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.marks import Marks, unmarked
+from langsplat_viewer.marks import Marks
 from langsplat_viewer.projects import (
     NO_GROUPS,
     NOT_COMPARED,
@@ -226,7 +226,7 @@ def changed(marks: Marks, rng: np.random.Generator, step: int) -> Marks:
 def test_history_of_a_million_gaussians_takes_little_memory(viewer):
     """At random, so that nothing could be shared."""
     count, rng = 1_000_000, np.random.default_rng(0)
-    viewer.state.marks = unmarked(count)
+    viewer.state.count = count
     tracemalloc.start()
     try:
         for step in range(MOST_STEPS):

@@ -8,7 +8,6 @@ that undoing them all gives exactly what was there.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from operator import methodcaller
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -34,19 +33,11 @@ from langsplat_viewer.viewer import Viewer
 
 def mark(viewer: Viewer, marks: Marks) -> None:
     """Set the marks, as a step that can be undone, unless they mark the same."""
-    if not marks.same(viewer.state.marks):
-        viewer.remember()
-        gone = int(marks.deleted.sum() - viewer.state.marks.deleted.sum())
-        put_marks(viewer, marks)
-        if gone > 0:
-            viewer.state.say(f"deleted {gone:,} Gaussians", undoes=viewer.history.past[-1])
-
-
-def put_marks(viewer: Viewer, marks: Marks) -> None:
-    """Set the marks without a step of its own to undo."""
-    state = viewer.state
-    viewer.put(marks=state.session.marks.of(marks, state.marks))
-    state.marks = marks
+    before, session = viewer.state.marks, viewer.state.session
+    viewer.change(marks=session.marks.of(marks, before))
+    gone = int(marks.deleted.sum() - before.deleted.sum())
+    if gone > 0:
+        viewer.state.say(f"deleted {gone:,} Gaussians", undoes=session)
 
 
 def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
@@ -57,7 +48,9 @@ def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
     mark(viewer, marks.combined(state.marks, found, mode or state.tools.mode))
 
 
-has_scene = methodcaller("has_scene", "select in it")  # whether a scene is open; reports where none is
+def has_scene(viewer: Viewer) -> bool:
+    """Return whether a scene is open to select in; report where none is."""
+    return viewer.has_scene("select in it")
 
 
 def has_selection(viewer: Viewer) -> bool:
@@ -439,7 +432,6 @@ def adopt(viewer: Viewer, session: Session) -> None:
         place(viewer, session.moves)
     set_tools(viewer, stroke=None)
     state.record.chosen = None
-    state.marks = session.marks.masks(before.marks, state.marks)
     state.session = session
     forget_unlisted(viewer)
     teach_given(viewer)

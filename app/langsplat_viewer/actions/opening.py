@@ -26,7 +26,6 @@ from langsplat_viewer.actions.settings import ask_for, compare, open_panel
 from langsplat_viewer.camera.controls import Extent, extent_of
 from langsplat_viewer.disk import Stamps, stamps
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.marks import unmarked
 from langsplat_viewer.output import free_name
 from langsplat_viewer.projects import PATHS, PROJECTS, Project, digest_of, read_project
 from langsplat_viewer.rendering.request import Split, why_undrawable
@@ -119,7 +118,6 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
             extent=opened.extent,
             warnings=opened.warnings,
             nothing=why_undrawable(scene.gaussians),
-            marks=unmarked(len(scene.gaussians)),
             camera_index=0 if scene.cameras else None,
             record=Recording(size=state.record.size, fps=state.record.fps),
         )
@@ -139,7 +137,6 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
 
 
 def _without_field(session: Session) -> Session:
-    """Return the session of a scene that cannot be searched."""
     display = "rgb" if DISPLAYS[session.picture.display].needs_field else session.picture.display
     return replace(session, queries=(), picture=replace(session.picture, display=display))
 

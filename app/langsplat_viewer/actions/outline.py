@@ -61,7 +61,11 @@ def _find(viewer: Viewer) -> None:
 
 def things_first(rows: Iterable[Outline]) -> tuple[Outline, ...]:
     """Return rows with those that are likely to be walls and floors last, else in their order."""
-    return tuple(sorted(rows, key=lambda row: bool(row.word and BACKGROUND & {*row.word.phrase.split()})))
+
+    def is_background(row: Outline) -> bool:
+        return row.word is not None and not BACKGROUND.isdisjoint(row.word.phrase.split())
+
+    return tuple(sorted(rows, key=is_background))
 
 
 def name_of(viewer: Viewer, row: Outline) -> str:

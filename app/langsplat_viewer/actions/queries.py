@@ -43,8 +43,11 @@ def ask(viewer: Viewer, text: str) -> None:
 
 def ask_together(viewer: Viewer, phrases: Sequence[str]) -> None:
     """Search the scene for phrases, and give a colour to each that may be there."""
-    state, listed = viewer.state, list[str]()
-    for phrase in phrases if phrases and viewer.searchable() is not None else ():
+    if not phrases or viewer.searchable() is None:
+        return
+    state = viewer.state
+    listed: list[str] = []
+    for phrase in phrases:
         viewer.remember()
         queries, key = state.session.queries, phrase_key(phrase)
         query = next((query for query in queries if phrase_key(query.phrase) == key), Query(phrase))
@@ -216,18 +219,12 @@ def set_level(viewer: Viewer, level: LevelChoice) -> None:
         ask_listed(viewer)
 
 
-def set_cut(viewer: Viewer, phrase: str, cut: float | None, *, is_new: bool = True) -> None:
-    """Set the threshold of an answer, None for its own one.
-
-    is_new: a step of its own to undo, and not a slider that moves on.
-    """
-    state, cut = viewer.state, None if cut is None else min(max(cut, 0.0), 1.0)
-    query = state.session.query(phrase)
-    if query is None or state.answer(query).result is None or cut == query.cut:
-        return
-    if is_new:
-        viewer.remember()
-    state.session = state.session.with_query(phrase, cut=cut)
+def set_cut(viewer: Viewer, phrase: str, cut: float | None) -> None:
+    """Set the threshold of an answer, None for its own one."""
+    session, cut = viewer.state.session, None if cut is None else min(max(cut, 0.0), 1.0)
+    query = session.query(phrase)
+    if query is not None and viewer.state.answer(query).result is not None:
+        viewer.change(f"threshold of {phrase}", queries=session.with_query(phrase, cut=cut).queries)
 
 
 # Evidence of an answer.

@@ -369,7 +369,10 @@ def _page(viewer: Viewer) -> Callable[[Path, Scene, Progress], str]:
 
 def save(viewer: Viewer) -> None:
     """Save the project to its file; where it has none yet, a dialog asks for one."""
-    (save_as if viewer.state.project is None else save_project)(viewer)
+    if viewer.state.project is None:
+        save_as(viewer)
+    else:
+        save_project(viewer)
 
 
 def save_as(viewer: Viewer) -> None:

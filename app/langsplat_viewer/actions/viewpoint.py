@@ -17,7 +17,6 @@ from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera import controls, flight
 from langsplat_viewer.camera.controls import Extent, OrbitCamera, Sample, Side
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.camera.overlays import FRUSTUM_DEPTH, frusta
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight
 from langsplat_viewer.rendering.request import Split, image_formation
 from langsplat_viewer.session import LONGEST_NAME, MOST_BOOKMARKS, Bookmark, Query
@@ -147,16 +146,6 @@ def go_to_camera(viewer: Viewer, index: int) -> None:
         return
     viewer.state.camera_index = index % len(scene.cameras)
     glide_to(viewer, controls.from_camera(scene.cameras[viewer.state.camera_index], extent))
-
-
-def camera_frusta(viewer: Viewer) -> Array:
-    """Return (C, 8, 2, 3) edges of the pyramids of the training cameras; none without a scene."""
-    scene, extent, kept = viewer.state.scene, viewer.state.extent, viewer.state.frusta
-    if scene is None or extent is None:
-        return np.zeros((0, 8, 2, 3))
-    if kept is None or kept[0] is not scene:  # asked in every frame
-        kept = viewer.state.frusta = scene, frusta(scene.cameras, FRUSTUM_DEPTH * extent.radius)
-    return kept[1]
 
 
 def step_camera(viewer: Viewer, by: int) -> None:

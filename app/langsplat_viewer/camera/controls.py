@@ -45,11 +45,6 @@ def sample_of(gaussians: Gaussians) -> Sample:
     return Sample(gaussians.means[rows][seen].astype(np.float64), weights[seen])
 
 
-def reach(sample: Sample, centre: Array) -> float:
-    """Return the distance from `centre` (3,) within which `SHARE` of the weight lies; 0 without any."""
-    return weighted_quantile(np.linalg.norm(sample.points - centre, axis=1), sample.weights, SHARE)
-
-
 def framing_eye(sample: Sample, rotation: Array, inner: Intrinsics, share: float = SHARE) -> Array | None:
     """Return the (3,) place from which a camera sees `share` of the weight, filling the image to `MARGIN`.
 
@@ -321,8 +316,9 @@ def extent_of(scene: Scene) -> Extent:
     """Return the extent of a scene's Gaussians."""
     centre, radius = scene.bounds()
     sample = sample_of(scene.gaussians)
-    farthest = FARTHEST * max(reach(sample, centre), radius)
-    return Extent(centre, radius, scene.up(), sample, farthest)
+    distances = np.linalg.norm(sample.points - centre, axis=1)
+    reach = max(weighted_quantile(distances, sample.weights, SHARE), radius)
+    return Extent(centre, radius, scene.up(), sample, FARTHEST * reach)
 
 
 def joined(extent: Extent, other: Sample) -> Extent:

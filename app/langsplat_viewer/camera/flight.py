@@ -61,7 +61,6 @@ class Keyframe:
     pose: Pose
 
     def moved(self, offset: Array) -> "Keyframe":
-        """Return the keyframe moved by `offset` (3,)."""
         return replace(self, pose=self.pose.moved(offset))
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -89,7 +90,8 @@ def clip_segments(camera: Camera, segments: Array, least_depth: float) -> tuple[
     return ends[..., :2] / depth * (camera.fx, camera.fy) + (camera.cx, camera.cy), rows
 
 
-def frusta(cameras: Sequence[Camera], depth: float) -> Array:
+@lru_cache(maxsize=1)  # asked in every frame
+def frusta(cameras: tuple[Camera, ...], depth: float) -> Array:
     """Return the (C, 8, 2, 3) edges of the pyramids from each camera's eye to its image at `depth`.
 
     World units. The four from the eye come first.

@@ -65,8 +65,8 @@ class Keyboard:
 
 NAMED = {  # keys whose name in imgui is another
     "Esc": "escape",
-    **{f"Page{way}": f"page_{way.lower()}" for way in ("Up", "Down")},
-    **{name: f"{name.lower()}_arrow" for name in ("Left", "Right", "Up", "Down")},
+    "PageUp": "page_up",
+    "PageDown": "page_down",
 }
 MODIFIERS = {name: imgui.Key[f"mod_{name.lower()}"] for name in ("Ctrl", "Shift", "Alt")}
 WHILE_TYPING = ("F1", "Esc")  # beside those with Ctrl

@@ -92,7 +92,6 @@ def _sides(row: Outline) -> str:
 
 
 def _eye(viewer: Viewer, node: int, left: float, side: float) -> None:
-    """Draw the button that hides a node or shows it again."""
     hidden = bool(outline.hidden_nodes(viewer)[node])
     imgui.same_line(left)
     text, icon = theme.colour("soft"), icons.ICON_FA_EYE_SLASH if hidden else icons.ICON_FA_EYE

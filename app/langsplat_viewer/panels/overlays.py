@@ -188,7 +188,8 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
         if grid is not None:
             _lines(pen.segments(grid[0])[0], GRID, 1.0)
         if "cameras" in shown:
-            _cameras(viewer, viewpoint.camera_frusta(viewer), pen)
+            depth = overlays.FRUSTUM_DEPTH * state.extent.radius
+            _cameras(viewer, overlays.frusta(state.scene.cameras, depth), pen)
         if "things" in shown:  # after the lines, so that its words are readable
             _things(viewer, pen)
         _ruler(state.session.ruler, pen, metres)
@@ -330,7 +331,6 @@ def _ruler(ruler: Ruler, pen: Pen, metres: float | None) -> None:
 
 
 def _notes(notes: Sequence[Note], pen: Pen) -> None:
-    """Write the notes at the places that they are pinned to."""
     places = [(note, pen.place(note.at)) for note in notes]
     named = [Named(note.text, place, NOTE) for note, place in places if place is not None]
     for name in named:

@@ -109,7 +109,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
         "What is less relevant than this is no part of the answer; one set by hand stays, whatever the level"
     )
     if changed:
-        queries.set_cut(viewer, query.phrase, value, is_new=not own)
+        queries.set_cut(viewer, query.phrase, value)
     if own:
         imgui.same_line()
         if imgui.button("Auto##cut"):  # another is the level

@@ -158,7 +158,6 @@ class Pane:
 
     @property
     def row(self) -> DisplayRow:
-        """The display's row of the table."""
         return DISPLAYS[self.picture.display]
 
     @property
