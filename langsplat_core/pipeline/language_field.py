@@ -7,7 +7,7 @@ memory depends on a block of Gaussians and not on all of them times all photogra
 
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -76,26 +76,16 @@ def check_masks(features: Iterable[ImageFeatures]) -> None:
         raise InputError("no photograph has masks; try --masks.source graph, or larger photographs")
 
 
-def language_field(
-    gaussians: Gaussians,
-    views: Views,
-    encoder: Encoder,
-    config: TrainConfig,
-    work: Path,
-    progress: Progress,
-    processes: ProcessGroup | None = None,
-) -> tuple[LanguageField, codec_fit.CodecReport]:
+def language_field(stages: "Stages") -> tuple[LanguageField, codec_fit.CodecReport]:
     """Return the field of the views' masks, and its codec's loss; InputError without any mask."""
-    check_lift(config)
-    check_masks(features for _, features in views)
-    stages = _Stages(gaussians, views, encoder, config, work, progress, processes or ProcessGroup())
+    check_masks(features for _, features in stages.views)
     codec, report = stages.codec()
     latents, confidence = stages.latents(codec)
     confidence = confidence.clip(max=MOST_CONFIDENCE).astype(np.float16).astype(np.float32)
-    field = field_of((latents, confidence), codec, encoder, config.phrases)
+    field = field_of((latents, confidence), codec, stages.encoder, stages.config.phrases)
     tree = stages.tree(field)
     if isinstance(codec, CodebookCodec):
-        colours = codec_fit.contrasting_colours(field, tree, build_surface(gaussians))
+        colours = codec_fit.contrasting_colours(field, tree, build_surface(stages.gaussians))
         codec = codec if colours is None else replace(codec, palette=codec_fit.rounded(colours))
     return replace(field, tree=tree, codec=codec), report
 
@@ -119,8 +109,8 @@ def field_of(
 
 
 @dataclass(frozen=True)
-class _Stages:
-    """Results on the way to a field, each made at most once, or read where it was kept."""
+class Stages:
+    """Results on the way to a field, each made at most once, or read where it was kept in `work`."""
 
     gaussians: Gaussians
     views: Views
@@ -128,7 +118,7 @@ class _Stages:
     config: TrainConfig
     work: Path
     progress: Progress
-    processes: ProcessGroup
+    processes: ProcessGroup = field(default_factory=ProcessGroup)
 
     @property
     def by_weights(self) -> bool:
@@ -164,7 +154,7 @@ class _Stages:
         vectors, inputs = self.inputs
         # Named as in older work folders.
         folder = self.work / stage_key("memberships", 2, *inputs)  # codespell:ignore memberships
-        mask_weights = self.weights_in(folder)
+        mask_weights = self.weights_in(folder, list(map(len, vectors)))
 
         def make() -> Arrays:
             self.progress("grouping masks", 0.0)
@@ -172,16 +162,16 @@ class _Stages:
             return {"of_mask": groups.of_mask, "vectors": groups.vectors}
 
         made = self.processes.once(lambda: kept(folder / "groups.npz", make))
-        return mask_weights, MaskGroups(made["of_mask"], list(map(len, vectors)), made["vectors"])
+        return mask_weights, MaskGroups(made["of_mask"], made["vectors"])
 
-    def weights_in(self, folder: Path) -> MaskWeights:
+    def weights_in(self, folder: Path, mask_counts: Sequence[int]) -> MaskWeights:
         """Return the mask weights of all views, a file in `folder` each, which is read where it is needed."""
         files = [folder / f"{index:05d}.npy" for index in range(len(self.views))]
         drawn = self.rasterizer(), self.gaussians
         for index in self.each(len(files), "lifting masks onto the Gaussians"):
             if not files[index].exists():
                 write_array(files[index], lift.view_pairs(*drawn, *self.views[index], self.formation))
-        return MaskWeights([open_array(path) for path in files], len(self.gaussians))
+        return MaskWeights([open_array(path) for path in files], mask_counts, len(self.gaussians))
 
     def each(self, count: int, stage: str) -> Iterator[int]:
         """Yield this process's share of `count` items, report each, and wait for all processes."""
@@ -280,10 +270,10 @@ class _Stages:
             parts = build_surface(self.gaussians), field.codec, field.latents, field.known
             if not self.by_weights:
                 return vars(build_tree(*parts))
-            counts, mask_weights = [len(vectors) for vectors in self.inputs[0]], self.mask_weights[0]
-            things = [lift.find_instances(mask_weights, counts, level) for level in range(len(LEVELS))]
+            mask_weights, _ = self.mask_weights
+            things = [lift.find_instances(mask_weights, level) for level in range(len(LEVELS))]
             tree = build_tree(*parts, np.stack(things))
-            return vars(replace(tree, votes=lift.count_votes(tree, mask_weights, counts)))
+            return vars(replace(tree, votes=lift.count_votes(tree, mask_weights)))
 
         return Tree(**self.kept(self.path("nodes", 4, self.lift, self.config.codec.own), make))
 
@@ -309,30 +299,22 @@ VERSION = 3
 
 
 def agreed_features(
-    gaussians: Gaussians,
-    views: Views,
-    photographs: Sequence[tuple[Array, Array | None]],
-    encoder: Encoder,
-    config: TrainConfig,
-    work: Path,
-    progress: Progress,
-    processes: ProcessGroup | None = None,
+    stages: Stages, photographs: Sequence[tuple[Array, Array | None]]
 ) -> OnDemand[ImageFeatures]:
-    """Describe masks by the consensus of all views' masks, whose vectors are not read.
+    """Describe masks by the consensus of the masks of all `stages.views`, whose vectors are not read.
 
     photographs: (H, W, 3) uint8 of each view, and its (H, W) bool mask of pixels that count (None: all do).
-    What is finished is kept in `work`.
     """
-    stages = _Stages(gaussians, views, encoder, config, work, progress, processes or ProcessGroup())
+    gaussians, views, encoder, work = stages.gaussians, stages.views, stages.encoder, stages.work
     rasterizer, formed = stages.rasterizer(), stages.formation
     facts = ((camera.position, len(seen.vectors), digest_of(seen)) for camera, seen in views)
     eyes, counts, digests = zip(*facts, strict=True)
     inputs = digest_of(gaussians), digests, formed
-    mask_weights = stages.weights_in(work / stage_key("rough-memberships", VERSION, *inputs))
+    mask_weights = stages.weights_in(work / stage_key("rough-memberships", VERSION, *inputs), counts)
 
     def make() -> Arrays:
         surface = build_surface(gaussians)
-        return vars(find_tree(gaussians, surface, mask_weights, counts, np.stack(eyes), progress))
+        return vars(find_tree(gaussians, surface, mask_weights, np.stack(eyes), stages.progress))
 
     key = stage_key("tree", VERSION, *inputs)
     tree = MergeTree(**stages.processes.once(lambda: kept(work / f"{key}.npz", make)))
@@ -362,7 +344,7 @@ def agreed_features(
 
 
 def _described(
-    stages: _Stages,
+    stages: Stages,
     tree: MergeTree,
     nodes: Array,
     eyes: Array,

@@ -208,16 +208,16 @@ def _language(
     encoder: Encoder,
 ) -> tuple[LanguageField, dict[str, Any]]:
     """Return the language field of the Gaussians, and the report's figures of it."""
-    config, shared = run.config, (run.work, run.progress, run.processes)
     cameras = tuple(capture.cameras[i] for i in train)
+    views, shared = language_field.views_of(cameras, features), (run.work, run.progress, run.processes)
+    stages = language_field.Stages(gaussians, views, encoder, run.config, *shared)
     if not source.agrees:
         with run.timed("masks that agree"):
             photographs = [(capture.images[i], capture.mask(i)) for i in train]
-            views = language_field.views_of(cameras, features)
-            features = language_field.agreed_features(gaussians, views, photographs, encoder, config, *shared)
+            features = language_field.agreed_features(stages, photographs)
+            stages = replace(stages, views=language_field.views_of(cameras, features))
     with run.timed("language field"):
-        views = language_field.views_of(cameras, features)
-        language, codec = language_field.language_field(gaussians, views, encoder, config, *shared)
+        language, codec = language_field.language_field(stages)
         if not capture.drawn:
             language = replace(language, calibration=None)  # which holds in drawn rooms alone
     return language, {

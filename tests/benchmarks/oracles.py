@@ -148,7 +148,7 @@ def true_labels(
         columns.append(numbers)
     members = find_mask_weights(rasterizer, gaussians, described)
     known, group = np.unique(np.concatenate(columns), return_inverse=True)
-    groups = MaskGroups(group, list(map(len, columns)), np.zeros((len(known), 1), np.float32))
+    groups = MaskGroups(group, np.zeros((len(known), 1), np.float32))
     result = np.full((len(LEVELS), len(gaussians)), -1, np.int64)
     for number, (first, last) in enumerate(members.blocks):
         weights = members.block(number, groups)

@@ -44,7 +44,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.report import write_report
 from langsplat_core.io.hostile import write_npy
 from langsplat_core.io.sidecar import means_checksum
-from langsplat_core.pipeline.language_field import Views, agreed_features, language_field
+from langsplat_core.pipeline.language_field import Stages, Views, agreed_features, language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import trained_gaussians
 from langsplat_core.progress import Progress, TerminalProgress
@@ -261,7 +261,8 @@ class Room:
         store = FeatureStore(self.folder / f"features-{outlines}-none")
         rough = zip(cameras, describe_capture(photographs, names, source, None, store, shared), strict=True)
         images, work = [(image, None) for image in photographs], self.folder / f"agreed-{self.weights}"
-        return agreed_features(self.gaussians, list(rough), images, encoder, self.settings, work, shared)
+        stages = Stages(self.gaussians, list(rough), encoder, self.settings, work, shared)
+        return agreed_features(stages, images)
 
     def field(self, variant: Variant, fresh: bool = False) -> tuple[LanguageField, CodecReport, float]:
         """The language field, what its codec loses, and seconds; `fresh` takes nothing that was kept."""
@@ -270,7 +271,7 @@ class Room:
         with TemporaryDirectory(dir=self.folder) as empty, self._timed(f"language field ({variant.name})"):
             work = Path(empty) if fresh else self.folder
             encoder = cast(Encoder, self.encoder)
-            made = language_field(self.gaussians, views, encoder, settings, work, self.progress)
+            made = language_field(Stages(self.gaussians, views, encoder, settings, work, self.progress))
         return *made, round(time.perf_counter() - start, 1)
 
     def engine(self, variant: Variant, cameras: Sequence[Camera] = ()) -> QueryEngine:

@@ -354,7 +354,7 @@ def find_mask_weights(
 ) -> MaskWeights:
     """The mask weights of all views, in memory."""
     pairs = [view_pairs(rasterizer, gaussians, *view, settings) for view in views]
-    return MaskWeights(pairs, len(gaussians))
+    return MaskWeights(pairs, [len(features.vectors) for _, features in views], len(gaussians))
 
 
 def repeated(scene: Scene, count: int) -> Scene:

@@ -14,6 +14,7 @@ block, so that memory does not grow with the number of photographs. It also give
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -36,7 +37,6 @@ class MaskGroups:
     """
 
     of_mask: Array  # group of every mask, one view after the other
-    counts: Sequence[int]  # number of masks of each view
     vectors: Array  # (G, D) float32 unit vectors
 
 
@@ -53,7 +53,7 @@ def group_masks(vectors: Sequence[Array], groups: int = 2_048) -> MaskGroups:
         sample = joined[np.sort(generator.permutation(len(joined))[:16_384])]
         centres = spherical_kmeans(sample, groups, rounds=6, generator=generator)
         of_mask = nearest_centres(joined, centres)[0]
-    return MaskGroups(of_mask.astype(np.int32), [len(view) for view in vectors], centres)
+    return MaskGroups(of_mask.astype(np.int32), centres)
 
 
 PAIR = np.dtype([("row", "<u4"), ("mask", "<u2"), ("level", "<u2"), ("weight", "<f4")])
@@ -64,6 +64,7 @@ class MaskWeights:
     """Mask weights of `count` Gaussians in all views, W^T onehot(mask), sparse."""
 
     pairs: Sequence[Array]  # of each view, of type PAIR, by rising row: Gaussian, mask, its level, pixels
+    mask_counts: Sequence[int]  # of each view
     count: int
     block_size: int = 16_384  # Gaussians per block
 
@@ -72,6 +73,11 @@ class MaskWeights:
         """Return the first Gaussian, and the one after the last, of every block."""
         firsts = range(0, self.count, self.block_size)
         return [(first, min(first + self.block_size, self.count)) for first in firsts]
+
+    @property
+    def first_masks(self) -> Array:
+        """The (V + 1,) number of each view's first mask, counted through all views, and that of all masks."""
+        return np.cumsum([0, *self.mask_counts])
 
     @cached_property
     def _edges(self) -> list[Array]:
@@ -83,7 +89,7 @@ class MaskWeights:
         """Return the (n, 3 G) weights, in pixels, of a block's Gaussians in the groups, level after level."""
         first, last = self.blocks[number]
         rows, columns, weights = [], [], []
-        of_mask = np.split(groups.of_mask, np.cumsum(groups.counts)[:-1])
+        of_mask = np.split(groups.of_mask, self.first_masks[1:-1])
         for pairs, edges, group in zip(self.pairs, self._edges, of_mask, strict=True):
             part = pairs[edges[number] : edges[number + 1]]
             rows.append(part["row"].astype(np.int32) - first)
@@ -93,14 +99,14 @@ class MaskWeights:
         entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
         return scipy.sparse.coo_matrix(entries, shape).tocsr()  # sums duplicates
 
-    def sums(self, sets: Array, size: int, counts: Sequence[int]) -> "tuple[scipy.sparse.csr_matrix, Array]":
+    def sums(self, sets: Array, size: int) -> "tuple[scipy.sparse.csr_matrix, Array]":
         """Return the (size, masks of all views) float32 pixels that each set of Gaussians paints.
 
         Also returns the int32 number 3 view + level of each mask. sets: (N,) set of each Gaussian, -1 for
-        none; counts: number of masks of each view.
+        none.
         """
         views, labelling = [scipy.sparse.csr_matrix((size, 0))], [np.zeros(0, np.int32)]
-        for view, (pairs, count) in enumerate(zip(self.pairs, counts, strict=True)):
+        for view, (pairs, count) in enumerate(zip(self.pairs, self.mask_counts, strict=True)):
             within = pairs[sets[pairs["row"]] >= 0]
             place = sets[within["row"]], within["mask"]
             painted = scipy.sparse.coo_matrix((within["weight"].astype(np.float64), place), (size, count))
@@ -147,23 +153,21 @@ def view_pairs(
 SAME = 0.6  # IoU of the claims of two masks above which they are linked
 
 
-def find_instances(
-    mask_weights: MaskWeights, counts: Sequence[int], level: int = len(LEVELS) - 1, sample: int = 50_000
-) -> Array:
+def find_instances(mask_weights: MaskWeights, level: int = len(LEVELS) - 1, sample: int = 50_000) -> Array:
     """Return the (N,) int32 number of each Gaussian's instance at a level; NO_NODE if it is in no mask.
 
-    Instances are numbered from the largest, by number of Gaussians. counts: number of masks of each view;
-    sample: number of Gaussians by which masks are compared, whose cost grows with the views squared.
+    Instances are numbered from the largest, by number of Gaussians. sample: number of Gaussians by which
+    masks are compared, whose cost grows with the views squared.
     """
-    view_of = np.repeat(np.arange(len(counts)), counts)
-    claims = _claims(mask_weights, np.cumsum([0, *counts]), level, sample)
+    view_of = np.repeat(np.arange(len(mask_weights.pairs)), mask_weights.mask_counts)
+    claims = _claims(mask_weights, level, sample)
     _, found = scipy.sparse.csgraph.connected_components(_overlapping(claims, view_of), directed=False)
     claiming = np.flatnonzero(np.diff(claims.tocsc().indptr) > 0)
     names, numbers = np.unique(found[claiming], return_inverse=True)
     size = len(names)
     of_mask = np.full(len(view_of), size, np.int32)  # masks of other levels, and those that claim nothing
     of_mask[claiming] = numbers
-    groups = MaskGroups(of_mask, counts, np.zeros((size + 1, 1), np.float32))
+    groups = MaskGroups(of_mask, np.zeros((size + 1, 1), np.float32))
     instances = np.full(mask_weights.count, size, np.int64)
     for number, (first, last) in enumerate(mask_weights.blocks):
         weights = mask_weights.block(number, groups)[:, level * (size + 1) : (level + 1) * (size + 1)].tocsr()
@@ -178,13 +182,14 @@ def find_instances(
     return np.asarray(rank[instances])
 
 
-def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> "scipy.sparse.csr_matrix":
+def _claims(mask_weights: MaskWeights, level: int, most: int) -> "scipy.sparse.csr_matrix":
     """Return (n, M) ones where a mask has over half of a sampled Gaussian's weight in its view and level."""
     chosen = np.full(mask_weights.count, -1)
     sample = np.random.default_rng(0).permutation(mask_weights.count)[:most]
     chosen[np.sort(sample)] = np.arange(len(sample))
     rows, columns = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for first, pairs in zip(firsts, mask_weights.pairs, strict=False):
+    *firsts, masks = mask_weights.first_masks.tolist()
+    for first, pairs in zip(firsts, mask_weights.pairs, strict=True):
         here = pairs[(pairs["level"] == level) & (chosen[pairs["row"]] >= 0)]
         row = chosen[here["row"]]
         total = np.bincount(row, here["weight"], len(sample))
@@ -193,7 +198,7 @@ def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> 
         columns.append(first + here["mask"][strong].astype(np.int64))
     places = np.concatenate(rows), np.concatenate(columns)
     ones = np.ones(len(places[0]), np.float32)
-    return scipy.sparse.csr_matrix((ones, places), (len(sample), int(firsts[-1])))
+    return scipy.sparse.csr_matrix((ones, places), (len(sample), masks))
 
 
 def _overlapping(claims: "scipy.sparse.csr_matrix", view_of: Array) -> "scipy.sparse.csr_matrix":
@@ -218,23 +223,22 @@ VOTE = 0.5  # IoU of a node and a mask above which the mask is a vote for the no
 SHOWN = 25.0  # least pixels of a node in a photograph that shows it
 
 
-def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) -> Array:
+def count_votes(tree: Tree, mask_weights: MaskWeights) -> Array:
     """Return the (K, 2) uint16 numbers of photographs with a mask of exactly each node, and without one.
 
     Masks are compared with the visible part of a node; a photograph that hardly shows it does not vote.
-    counts: number of masks of each view.
     """
-    sums, labelling = mask_weights.sums(tree.leaves, tree.count, counts)
+    sums, labelling = mask_weights.sums(tree.leaves, tree.count)
     sums = sums.tocsc()
     votes = np.zeros((tree.count, 2), np.uint16)
-    for pairs, first, count in zip(mask_weights.pairs, np.cumsum([0, *counts]), counts, strict=False):
-        shared = sums[:, first : first + count].toarray()  # (K, M) pixels, then with those of descendants
+    for pairs, (first, last) in zip(mask_weights.pairs, pairwise(mask_weights.first_masks), strict=True):
+        shared = sums[:, first:last].toarray()  # (K, M) pixels, then with those of descendants
         for node, parent in enumerate(tree.parents):
             if parent != NO_NODE:
                 shared[parent] += shared[node]
-        level_of = labelling[first : first + count] % len(LEVELS)
+        level_of = labelling[first:last] % len(LEVELS)
         visible = np.stack([shared[:, level_of == level].sum(1) for level in range(len(LEVELS))], 1)
-        every = np.bincount(pairs["mask"], pairs["weight"], count)
+        every = np.bincount(pairs["mask"], pairs["weight"], last - first)
         union = visible[:, level_of] + every - shared
         agree = (shared > VOTE * union).any(1)
         shown = visible.max(1) >= SHOWN

@@ -118,11 +118,10 @@ def find_tree(
     gaussians: Gaussians,
     surface: Surface,
     mask_weights: MaskWeights,
-    counts: Sequence[int],
     eyes: Array,
     progress: Progress = silent,
 ) -> MergeTree:
-    """Return the merge tree of a scene; counts: masks of each view; eyes: (V, 3) positions of cameras."""
+    """Return the merge tree of a scene; eyes: (V, 3) positions of cameras."""
     everywhere = np.full(len(gaussians), -1, np.int32)
     if len(surface.rows) == 0:
         return MergeTree(everywhere, np.zeros((0, 2), np.int32), np.zeros(0))
@@ -140,7 +139,7 @@ def find_tree(
     values = *(surface.positions - origin).T, np.ones(len(of)), *colours.T
     moments = np.stack([np.bincount(of, areas * one * other) for one in values for other in values[:4]], 1)
     patches = Patches(
-        *mask_weights.sums(everywhere, count, counts),
+        *mask_weights.sums(everywhere, count),
         moments.reshape(-1, 7, 4),
         eyes - origin,
         *find_borders(of, surface.ends, disagreement, concavity),

@@ -179,8 +179,7 @@ def test_tree_finds_instances_despite_wrong_masks(wrong):
     mask_weights = find_mask_weights(CpuRasterizer(), scene.gaussians, views)
     surface = build_surface(scene.gaussians)
     eyes = np.stack([camera.position for camera, _ in views])
-    counts = [len(features.vectors) for _, features in views]
-    tree = find_tree(scene.gaussians, surface, mask_weights, counts, eyes)
+    tree = find_tree(scene.gaussians, surface, mask_weights, eyes)
     nodes = tree.cut(0.5)[tree.patches[surface.rows]]
     for one in np.unique(blob):
         own = blob[surface.rows] == one
@@ -268,8 +267,8 @@ def test_empty_scenes_have_empty_trees():
     eyes = np.zeros((1, 3))
     for count in (0, 1, 3):
         gaussians = random_gaussians(count)
-        nothing = MaskWeights([np.zeros(0, PAIR)], count)
-        tree = find_tree(gaussians, build_surface(gaussians), nothing, [7], eyes)
+        nothing = MaskWeights([np.zeros(0, PAIR)], [7], count)
+        tree = find_tree(gaussians, build_surface(gaussians), nothing, eyes)
         assert tree.patches.shape == (count,)
         assert (tree.cut(0.5) >= 0).all()
     view = CpuRasterizer().view(gaussians, random_camera(0, 8, 6))
