@@ -120,6 +120,7 @@ Rate = Annotated[float, Range(0.0, 10.0, above=True)]  # a learning rate
 NotNegative = Annotated[float, Range(0.0, 1e9)]
 Decibels = Annotated[float, Range(0.0, 200.0)]
 Positive = Annotated[float, Range(0.0, 1e9, above=True)]
+Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ class RadianceConfig:
 
     steps: Count = 30_000  # of training
     reference_steps: Count = 30_000  # of the schedules that follow
-    backend: Literal["auto", "cpu", "cuda"] = "auto"  # what rasterizes
+    backend: Device = "auto"  # what rasterizes
     sh_degree: Annotated[int, Range(0, 3)] = 3  # highest degree of the spherical harmonics, 0 to 3
     sh_degree_every: Count = 1_000  # steps after which the degree grows by one
     max_gaussians: Count = 1_000_000  # never more than so many
@@ -245,7 +246,7 @@ class ClipConfig:
 
     model: str = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"  # hub id, folder, or "demo" for the bundled one
     batch: Count = 32  # images per forward pass
-    device: Literal["auto", "cpu", "cuda"] = "auto"  # where it runs
+    device: Device = "auto"  # where it runs
 
 
 CodecKind = Literal["codebook", "autoencoder", "linear"]
@@ -290,7 +291,7 @@ class LiftConfig:
     # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
     mode: Literal["median", "mean", "one-pass", "gradient"] = "median"
     # what lifts; auto: cpu, which is faster but for gradient
-    backend: Literal["auto", "cpu", "cuda"] = "auto"
+    backend: Device = "auto"
     steps: Count = 30_000  # of mode gradient, as are the following
     lr: Rate = 2.5e-3  # learning rate
     start: Literal["one-pass", "zeros-as-published"] = "one-pass"  # what mode gradient starts from
@@ -323,6 +324,7 @@ PAPER = TrainConfig(
 )
 TrainProfile = Literal["default", "paper"]
 TrainPreset = Literal["quick", "good", "full"]
+Until = Literal["gaussians", "language field"]  # the last stage of a training
 # Settings of the presets, see docs/photographs.md; by the decay few photographs gain a third of a decibel.
 QUICK_SIDE, GOOD_SIDE = 320, 480  # px, the photographs' longer side
 QUICK: dict[str, Any] = {"steps": 500, "max_gaussians": 30_000, "sh_degree": 1, "opacity_decay": 0.01}
@@ -345,7 +347,8 @@ def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
 Display = Literal["rgb", "latent", "tree", "relevancy", "segmentation", "depth", "alpha"]
 ColourMap = Literal["inferno", "viridis", "turbo", "amber", "cividis", "magma", "grey"]
 HeatOf = Literal["smooth", "own", "node", "everywhere"]
-LevelChoice = Literal["auto", "subpart", "part", "whole"]
+Level = Literal["subpart", "part", "whole"]
+LevelChoice = Literal["auto", Level]
 
 
 @dataclass(frozen=True)

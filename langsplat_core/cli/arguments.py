@@ -12,8 +12,6 @@ from langsplat_core import config
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_file, check_output_folder
 
-Level = Literal["subpart", "part", "whole"]
-
 
 class Runnable(Protocol):
     """Parsed arguments of a command, with the work that they ask for."""

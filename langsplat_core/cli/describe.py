@@ -13,10 +13,10 @@ from typing import Annotated, Any
 import tyro
 
 from langsplat_core.arrays import Array, length_text
-from langsplat_core.cli.arguments import EncoderOption, JsonOption, Level, Needs, TrainedScene
+from langsplat_core.cli.arguments import EncoderOption, JsonOption, Needs, TrainedScene
 from langsplat_core.cli.query import Unit, basis_fields, camera_of, in_world
 from langsplat_core.cli.run import aligned, print_json
-from langsplat_core.config import CountOrZero, PictureConfig
+from langsplat_core.config import CountOrZero, Level, PictureConfig
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io import sidecar as files
 from langsplat_core.io.files import check_output_file, locked
@@ -49,7 +49,6 @@ class Describe:
     json: JsonOption = False
 
     def run(self) -> None:
-        """Describe, and print the words."""
         if self.labels is not None:
             if self.outline or self.json:
                 raise InputError("--labels writes files of the whole scene; leave out what else is asked for")
@@ -181,7 +180,6 @@ class Teach:
     """Forget the word, with all its examples."""
 
     def run(self) -> None:
-        """Learn the word, or forget it, and write the file."""
         target = self.into or companion_path(self.scene, files.SUFFIX)
         if self.remove == bool(self.at):
             raise InputError("give either --at X,Y, a pixel to teach, or --remove")

@@ -10,8 +10,8 @@ import numpy as np
 import tyro
 
 from langsplat_core import registry
-from langsplat_core.cli.arguments import AnyScene, EncoderOption, Level, WrittenScene
-from langsplat_core.config import CodecConfig, Positive, Range
+from langsplat_core.cli.arguments import AnyScene, EncoderOption, WrittenScene
+from langsplat_core.config import CodecConfig, Level, Positive, Range
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_file, check_output_folder
 from langsplat_core.io.ply import write_metres
@@ -117,16 +117,13 @@ class Convert:
 
     @property
     def sources(self) -> tuple[Path, ...]:
-        """The files that are read."""
         return (self.source, *self.rest[:-1])
 
     @property
     def out(self) -> Path:
-        """The file or folder that is written."""
         return self.rest[-1]
 
     def run(self) -> None:
-        """Read, and write a scene or what an exporter makes of it."""
         if not self.rest:
             raise InputError(f"{self.source}: name what to read, and then what to write")
         if self.to != "scene":

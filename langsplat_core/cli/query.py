@@ -49,7 +49,6 @@ class Unit:
 
     @property
     def name(self) -> str:
-        """Name of the unit, for people."""
         return "units" if self.metres is None else "m"
 
     @property
@@ -186,7 +185,6 @@ class QueryScene:
     json: arguments.JsonOption = False
 
     def run(self) -> None:
-        """Ask, and print the answers."""
         scene = searchable(self.scene)
         if not self.texts:
             raise InputError("no phrase given; for example: langsplat query scene.ply 'blue gift'")
@@ -440,7 +438,6 @@ class Select:
     json: arguments.JsonOption = False
 
     def run(self) -> None:
-        """Select, write the file, and print what is in it."""
         if not self.texts:
             raise InputError("no phrase given; say: langsplat select scene.ply 'blue gift' --out gift.ply")
         check_writable(self.out, self.scene)

@@ -13,7 +13,15 @@ import tyro
 
 from langsplat_core.cli.arguments import OutFolder, check_codec, named
 from langsplat_core.cli.run import one_line
-from langsplat_core.config import PAPER, TrainConfig, TrainPreset, TrainProfile, check_settings, with_preset
+from langsplat_core.config import (
+    PAPER,
+    TrainConfig,
+    TrainPreset,
+    TrainProfile,
+    Until,
+    check_settings,
+    with_preset,
+)
 from langsplat_core.errors import InputError, printable_line, shortened
 from langsplat_core.io.hostile import read_text
 from langsplat_core.progress import TerminalProgress, silent
@@ -48,12 +56,11 @@ class Train:
     """A file of options, `preset = "good"` or `radiance.steps = 7000`; options beside it count more."""
     gaussians: Path | None = None
     """Take the Gaussians of this scene, trained elsewhere from the same cameras, and describe them."""
-    until: Literal["gaussians", "language field"] = "language field"
+    until: Until = "language field"
     """"gaussians" writes a scene without a language field; the same command without this adds that."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:
-        """Train, and print the figures of the scene, or a table of several."""
         if self.on or len(self.dataset) != 1:
             self._train_several()
             return

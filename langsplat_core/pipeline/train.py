@@ -15,12 +15,12 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
 
-from langsplat_core.config import QUICK_SIDE, RadianceConfig, TrainConfig, check_settings
+from langsplat_core.config import QUICK_SIDE, RadianceConfig, TrainConfig, Until, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
 from langsplat_core.datasets.photos import count_photographs
@@ -47,8 +47,6 @@ from langsplat_core.training.radiance.differentiable import evaluate_views
 
 FEWEST_VIEWS = 3
 VERSION = 9  # of the results of training
-
-Until = Literal["gaussians", "language field"]  # the last stage of a training
 
 log = logging.getLogger("langsplat")
 

@@ -10,12 +10,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, permutations
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import LevelChoice
 from langsplat_core.errors import LangSplatError
 from langsplat_core.io.files import atomic_path, check_output_file
 from langsplat_core.io.scenes import check_writable, save_scene
@@ -149,7 +148,7 @@ def _verified(describer: Describer, claim: _Claim, placed: bool) -> InventoryEnt
     """Return an entry under the claim's first word that a query finds at half its area; None without one."""
     engine, areas, level = describer.engine, describer.areas, claim.level
     for phrase in claim.phrases:
-        result = engine.run(phrase, get_args(LevelChoice)[1 + level])  # after "auto"
+        result = engine.run(phrase, LEVELS[level])
         agreed = claim.rows[result.relevancy[level, claim.rows] > FLOOR]
         if not result.found or 2 * areas[agreed].sum() < areas[claim.rows].sum():
             continue

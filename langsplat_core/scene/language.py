@@ -13,6 +13,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array, sigmoid
+from langsplat_core.config import Level
 from langsplat_core.scene.codec import Codec
 
 _SEPARATE = re.compile(r"(?i)[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except|other\s+than)\b)")
@@ -69,7 +70,8 @@ def _bare(word: str) -> str:
 # The tree of a scene: wholes, their parts and the subparts of these. Relevancy varies between the Gaussians
 # of an instance: an answer of whole nodes has its borders and no speckles, and its peak is a patch's mean.
 
-LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
+# Index 0, 1, 2 wherever a level axis appears.
+LEVELS: tuple[Level, Level, Level] = ("subpart", "part", "whole")
 NO_NODE = -1
 
 

@@ -6,14 +6,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from langsplat_core.arrays import Array, ViewScore, near_power, psnr
-from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.config import INRIA, Device, RasterSettings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import BackendError
 from langsplat_core.progress import Progress, silent
@@ -133,10 +133,7 @@ def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor],
     return np.where(alpha > 0.5, length * depth / np.maximum(alpha, 1e-6), np.nan)
 
 
-Backend = Literal["auto", "cpu", "cuda"]
-
-
-def renderer_for(backend: Backend, settings: RasterSettings = INRIA) -> DifferentiableRenderer:
+def renderer_for(backend: Device, settings: RasterSettings = INRIA) -> DifferentiableRenderer:
     """Return the renderer of a backend; `auto` is CUDA if gsplat draws there, else the CPU.
 
     Raises BackendError if `cuda` is chosen and cannot work.
@@ -156,7 +153,7 @@ def evaluate_views(
     gaussians: Gaussians,
     capture: Capture,
     indices: Sequence[int],
-    backend: Backend = "auto",
+    backend: Device = "auto",
     small: Capture | None = None,
     near: float | None = None,
     progress: Progress = silent,
