@@ -68,7 +68,7 @@ class Canvas:
         self._resolution = AdaptiveResolution(budget)
         self._kept: dict[tuple[int, int, int], moderngl.Texture] = {}  # by pane, width, height
         self.phase: Literal["moving", "settling", "still"] = "still"
-        self._pose: tuple[object, object] = (None, None)  # the view, and what a gizmo does
+        self._pose: tuple[object, object] | None = None  # the view, and what a gizmo does
         self._moved = -1e9  # when that last changed, seconds
         self._wanted: tuple[RenderRequest, Detail] | None = None  # what was drawn last, or failed to be
         self._drawn: RenderRequest | None = None  # the same at its level of detail
@@ -86,9 +86,11 @@ class Canvas:
             self._background.drop()
             self.phase = "still"
             return False
-        pose, before = (state.view, state.moving), self._pose
-        if pose[0] is not before[0] or pose[1] is not before[1]:
-            self._pose, self._moved = pose, now if before[0] is not None else self._moved
+        pose = state.view, state.moving
+        if pose != self._pose:
+            if self._pose is not None:  # the first view is no move
+                self._moved = now
+            self._pose = pose
         moving = now - self._moved < REST_SECONDS
         request = state.request().without_line()
         self._resolution.count = max(len(state.scene.gaussians), 1)
@@ -227,10 +229,8 @@ class Canvas:
         if not self.textures:
             return None
         texture = self.textures[0]
-        image = Image.frombytes("RGBA", texture.size, texture.read()).transpose(
-            Image.Transpose.FLIP_TOP_BOTTOM
-        )
-        return ImageOps.fit(image.convert("RGB"), THUMBNAIL)
+        image = Image.frombytes("RGBA", texture.size, texture.read()).convert("RGB")
+        return ImageOps.fit(ImageOps.flip(image), THUMBNAIL)
 
     @property
     def waits(self) -> bool:

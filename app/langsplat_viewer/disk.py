@@ -45,7 +45,8 @@ def stamps(files: tuple[Path, ...]) -> Stamps:
     for file in files:
         stamp = None
         with suppress(OSError):
-            stamp = (stat := file.stat()).st_mtime_ns, stat.st_size
+            stat = file.stat()
+            stamp = stat.st_mtime_ns, stat.st_size
         found.append((file, stamp))
     return tuple(found)
 

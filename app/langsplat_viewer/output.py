@@ -5,9 +5,8 @@ A file is written whole or not at all. A folder is filled image by image.
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from fractions import Fraction
 from importlib.util import find_spec
 from itertools import count
@@ -123,7 +122,8 @@ def write_film(out: Path, count: int, fps: float, draw: Draw) -> None:
     Raises InputError where PyAV fails, OSError where nothing can be written, and what
     `draw` does; a file is then as it was before.
     """
-    (_write_folder if is_folder(out) else _write_video)(out, count, fps, draw)
+    write = _write_folder if is_folder(out) else _write_video
+    write(out, count, fps, draw)
 
 
 def _write_folder(out: Path, count: int, fps: float, draw: Draw) -> None:
@@ -165,16 +165,6 @@ def _write_video(out: Path, count: int, fps: float, draw: Draw) -> None:
 # A film of the scene.
 
 
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """A request seen by a camera that moves."""
-
-    request: RenderRequest
-    cameras: tuple[Camera, ...]  # one for each image, of its size
-    fps: float
-    backend: Backend = "auto"
-
-
 def cameras_of(flight: Flight, extent: Extent, fps: float, size: tuple[int, int]) -> tuple[Camera, ...]:
     """Return one camera of `size` pixels for each image of a film. InputError for more than `MOST_FRAMES`."""
     if flight.seconds * fps > MOST_FRAMES:
@@ -182,30 +172,37 @@ def cameras_of(flight: Flight, extent: Extent, fps: float, size: tuple[int, int]
     return tuple(camera_of(pose, extent, size) for pose in flight.poses(frame_times(flight, fps)))
 
 
-def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:
-    """Draw and write a film; return the lines to print.
+def make_film(
+    request: RenderRequest,
+    cameras: Sequence[Camera],
+    fps: float,
+    out: Path,
+    backend: Backend = "auto",
+    progress: Progress = silent,
+) -> list[str]:
+    """Draw and write a film of what `cameras` see, one for each image; return the lines to print.
 
     Raises InputError, among others where no image shows anything of the scene, and BackendError; `progress`
     may raise to stop it.
     """
-    (width, height), cameras, empty = shot.request.size, shot.cameras, 0
-    with in_one_line(out, f"{width}x{height}"), open_renderer(shot.backend) as renderer:
+    (width, height), empty = request.size, 0
+    with in_one_line(out, f"{width}x{height}"), open_renderer(backend) as renderer:
 
         def draw(number: int) -> Array:
             nonlocal empty
             progress("drawing", number / len(cameras), f"{number + 1} of {len(cameras)} pictures")
-            image = renderer.read(shot.request.seen_by(cameras[number]))
+            image = renderer.read(request.seen_by(cameras[number]))
             empty += renderer.shows_nothing()
             if empty == len(cameras):
-                scene = shot.request.scene.scene
+                scene = request.scene.scene
                 raise InputError(
                     f"{scene.path}: no picture of the film shows anything of the scene: "
                     f"{why_nothing(scene.gaussians, cameras[number])}; mend the path"
                 )
             return image
 
-        write_film(out, len(cameras), shot.fps, draw)
+        write_film(out, len(cameras), fps, draw)
     name, count = f"{out}/" if is_folder(out) else str(out), len(cameras)
     pictures = "picture" if count == 1 else "pictures"
     nothing = [f"{empty} of {count} pictures show nothing of the scene"] if empty else []
-    return [f"{name}: {width}x{height}, {count} {pictures}, {shot.fps:g} a second", *nothing]
+    return [f"{name}: {width}x{height}, {count} {pictures}, {fps:g} a second", *nothing]

@@ -127,9 +127,11 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
         extent = extent_of(scene)
         if flight is None:
             assert options.turntable is not None
-            flight = turntable(from_camera(camera, extent), options.turntable).moved(scene.origin)
-        cameras = output.cameras_of(flight.moved(-scene.origin), extent, options.fps, request.size)
-        lines = output.make_film(output.Shot(request, cameras, options.fps, options.backend), out, progress)
+            flight = turntable(from_camera(camera, extent), options.turntable)
+        else:
+            flight = flight.moved(-scene.origin)
+        cameras = output.cameras_of(flight, extent, options.fps, request.size)
+        lines = output.make_film(request, cameras, options.fps, out, options.backend, progress)
     else:
         progress("drawing", 0.8)
         size = f"{camera.width}x{camera.height}"

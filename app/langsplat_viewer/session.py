@@ -31,6 +31,14 @@ MOST_BOOKMARKS, MOST_NOTES = 50, 1000
 
 Coordinate = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]  # world units
 Point = tuple[Coordinate, Coordinate, Coordinate]
+
+
+def point_of(position: Array) -> Point:
+    """Return a (3,) position as plain numbers."""
+    x, y, z = position.tolist()
+    return x, y, z
+
+
 Phrase = Annotated[str, Meta(pattern=r"\S", max_length=1000)]
 Name = Annotated[str, Meta(pattern=r"\S", max_length=LONGEST_NOTE)]
 Node = Annotated[int, Meta(ge=0, lt=2**31)]  # of the scene's tree
@@ -211,18 +219,13 @@ class Session:
         """Return the session of the same scene about an origin that lies `offset` (3,) lower."""
         if not offset.any():
             return self
-
-        def point(at: Point) -> Point:
-            x, y, z = np.add(at, offset).tolist()
-            return x, y, z
-
         return replace(
             self,
             moves=tuple(replace(move, to=between_worlds(move.to, offset, offset)) for move in self.moves),
-            notes=tuple(replace(note, at=point(note.at)) for note in self.notes),
+            notes=tuple(replace(note, at=point_of(np.add(note.at, offset))) for note in self.notes),
             keyframes=tuple(key.moved(offset) for key in self.keyframes),
             bookmarks=tuple(bookmark.moved(offset) for bookmark in self.bookmarks),
-            ruler=replace(self.ruler, points=tuple(map(point, self.ruler.points))),
+            ruler=replace(self.ruler, points=tuple(point_of(np.add(at, offset)) for at in self.ruler.points)),
         )
 
     def query(self, phrase: str) -> Query | None:

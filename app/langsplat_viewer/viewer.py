@@ -21,7 +21,7 @@ from langsplat_core.semantics.weights import local_path
 from langsplat_viewer.disk import Stamps, Watch
 from langsplat_viewer.jobs import Job, Worker, one_line
 from langsplat_viewer.rendering.request import RenderRequest
-from langsplat_viewer.session import Point, Session
+from langsplat_viewer.session import Point, Session, point_of
 from langsplat_viewer.state import SceneState, TrainingForm, ViewerState
 
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
@@ -48,12 +48,14 @@ class ProcessProgress:
                 self.said = [*self.said[1 - KEPT :], text]
             return
         if report.stage != self.stage:
-            self.stages |= dict.fromkeys(filter(None, [self.stage]), 1.0)  # it may end before its last report
+            if self.stage:
+                self.stages[self.stage] = 1.0  # it may end before its last report
             self.stage, self.left = report.stage, TimeLeft()
         self.stages[report.stage] = report.fraction
         self.left.hear(report.fraction)
         for name, value in report.metrics.items():
-            if [value] != (curve := self.curves.get(name, []))[-1:]:
+            curve = self.curves.get(name, [])
+            if curve[-1:] != [value]:
                 self.curves = {**self.curves, name: [*curve, value]}
 
 
@@ -293,8 +295,7 @@ class Viewer:
         if point is None:
             self.state.say(f"nothing under the cursor to {to}")
             return None
-        x, y, z = (float(part) for part in point)
-        return x, y, z
+        return point_of(point)
 
     @property
     def encoder_id(self) -> str:

@@ -32,7 +32,7 @@ from langsplat_viewer.camera.flight import (
     tangents,
     turntable,
 )
-from langsplat_viewer.output import Shot, cameras_of, make_film, write_film
+from langsplat_viewer.output import cameras_of, make_film, write_film
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight, write_flight
 from langsplat_viewer.rendering.request import RenderRequest, plain_request
 from langsplat_viewer.viewer import Viewer
@@ -412,9 +412,8 @@ def request() -> RenderRequest:
     return plain_request(scene, scene.cameras[0].resized(*SIZE), PictureConfig())
 
 
-def shot(away: float = 0.0, **changed) -> Shot:
-    given = {"fps": 4.0, "backend": "cpu", **changed}
-    return Shot(request(), cameras_of(flight(away), extent_of(blob_scene()), given["fps"], SIZE), **given)
+def seen(away: float = 0.0) -> tuple:
+    return cameras_of(flight(away), extent_of(blob_scene()), 4.0, SIZE)
 
 
 @pytest.fixture
@@ -472,16 +471,16 @@ def test_without_pyav_a_video_becomes_a_folder(program, folder, caplog, monkeypa
 
 
 def test_a_video_has_the_images_at_their_rate(program, folder):
-    assert make_film(shot(), Path("a.mp4")) == ["a.mp4: 32x24, 5 pictures, 4 a second"]
+    assert make_film(request(), seen(), 4.0, Path("a.mp4"), "cpu") == ["a.mp4: 32x24, 5 pictures, 4 a second"]
     with av.open("a.mp4") as container:
         (stream,) = container.streams
         assert (stream.codec_context.name, stream.average_rate) == ("h264", 4)
         images = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(stream)]
     assert len(images) == 5
-    expected = render_image(request().seen_by(shot().cameras[4]), "cpu")
+    expected = render_image(request().seen_by(seen()[4]), "cpu")
     assert np.abs(images[4] - expected).mean() < 6  # colours of 2 x 2 pixels are one
     with pytest.raises(WorkCancelledError):  # a stopped video leaves nothing
-        make_film(shot(), folder / "b.mp4", Progress(stop))
+        make_film(request(), seen(), 4.0, folder / "b.mp4", "cpu", Progress(stop))
     assert [path.name for path in folder.iterdir() if path.suffix == ".mp4"] == ["a.mp4"]
 
 
@@ -506,11 +505,11 @@ def test_unwritable_films_leave_the_earlier_one(folder):
 
 def test_film_of_nothing_is_refused(folder):
     with pytest.raises(InputError, match="no picture of the film shows anything"):
-        make_film(shot(away=1.0), folder / "a.mp4")
+        make_film(request(), seen(away=1.0), 4.0, folder / "a.mp4", "cpu")
     assert not (folder / "a.mp4").exists()
     keys = (*flight().keyframes, Keyframe(2.0, flight(1.0).keyframes[2].pose))
-    cameras = cameras_of(Flight(keys), extent_of(blob_scene()), 2.0, SIZE)
-    lines = make_film(Shot(request(), cameras, 2.0, "cpu"), folder / "a.mp4")
+    seen_by = cameras_of(Flight(keys), extent_of(blob_scene()), 2.0, SIZE)
+    lines = make_film(request(), seen_by, 2.0, folder / "a.mp4", "cpu")
     assert lines[1].endswith("of 5 pictures show nothing of the scene")
 
 

@@ -123,8 +123,8 @@ def test_long_lines_are_cut_where_they_fit():
 # The theme.
 
 
-def blended(over: str, below: tuple[float, ...]) -> tuple[float, ...]:
-    *colour, alpha = theme.rgba(over)
+def blended(over: tuple[float, ...], below: tuple[float, ...]) -> tuple[float, ...]:
+    *colour, alpha = over
     return tuple(alpha * top + (1 - alpha) * low for top, low in zip(colour, below, strict=True))
 
 
@@ -136,13 +136,15 @@ def luminance(colour: tuple[float, ...]) -> float:
 
 @pytest.mark.parametrize("name", theme.THEMES)
 def test_every_text_stands_out_from_what_it_lies_on(name):
-    chosen = theme.THEMES[name]
-    plain = [blended(getattr(chosen, ground), (0.0,) * 3) for ground in ("ground", "raised", "glass")]
-    grounds = [*plain, blended(chosen.glass, (1.0,) * 3)]  # glass, over black and white scenes
-    over = [blended(getattr(chosen, part), low) for low in grounds for part in ("field", "button", "hover")]
-    lit = [blended(getattr(chosen, part), low) for low in grounds for part in ("pressed", "grab")]
+    def rgba(part: str) -> tuple[float, ...]:
+        return theme.rgba(part, name)
+
+    plain = [blended(rgba(ground), (0.0,) * 3) for ground in ("ground", "raised", "glass")]
+    grounds = [*plain, blended(rgba("glass"), (1.0,) * 3)]  # glass, over black and white scenes
+    over = [blended(rgba(part), low) for low in grounds for part in ("field", "button", "hover")]
+    lit = [blended(rgba(part), low) for low in grounds for part in ("pressed", "grab")]
     for text in ("ink", "soft", "accent", "good", "weak", "bad"):
-        colour = luminance(theme.rgba(getattr(chosen, text))[:3])
+        colour = luminance(rgba(text)[:3])
         for place in (*grounds, *over, *(lit if text == "ink" else ())):
             low, high = sorted((luminance(place), colour))
             assert (high + 0.05) / (low + 0.05) >= 4.5, (text, place)

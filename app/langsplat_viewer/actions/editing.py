@@ -26,7 +26,7 @@ from langsplat_viewer.actions.viewpoint import focus_pixel
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.marks import Drawn, Marks, Mode, Stroke, Tool
 from langsplat_viewer.rendering.request import UNCLIPPED
-from langsplat_viewer.session import Move, Point, Query, Session, change_between, pack
+from langsplat_viewer.session import Move, Point, Query, Session, change_between, pack, point_of
 from langsplat_viewer.state import EditForm, Gizmo
 from langsplat_viewer.viewer import Viewer
 
@@ -363,8 +363,7 @@ def fill_box(viewer: Viewer) -> None:
     chosen = (marks.selected if marks.selected.any() else marks.shown) & state.scene.gaussians.valid()
     if chosen.any():
         means = state.scene.gaussians.means[chosen].astype(np.float64)
-        low, high = (tuple(corner.tolist()) for corner in (means.min(0), means.max(0)))
-        set_box(viewer, low, high)
+        set_box(viewer, point_of(means.min(0)), point_of(means.max(0)))
 
 
 def in_crop_box(viewer: Viewer) -> Array:

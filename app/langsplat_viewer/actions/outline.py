@@ -17,6 +17,7 @@ from langsplat_core.scene.language import tidy
 from langsplat_viewer.actions.editing import Target, mark, of_thing, select_alike, take
 from langsplat_viewer.actions.queries import teach
 from langsplat_viewer.actions.viewpoint import focus_on
+from langsplat_viewer.session import point_of
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
@@ -120,7 +121,7 @@ def colour_of(viewer: Viewer, node: int) -> tuple[float, float, float] | None:
         values = field.colours[state.session.latent_level] if display == "latent" else nodes(subject)
         inside = view.tree.members(node)
         mean = np.zeros(3) if values is None else np.median(values[inside], axis=0)
-        view.colours[key] = (float(mean[0]), float(mean[1]), float(mean[2]))
+        view.colours[key] = point_of(mean)
     return view.colours.get(key)
 
 

@@ -33,7 +33,7 @@ from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.projects import PATHS, PROJECTS, Project, write_flight, write_project
 from langsplat_viewer.rendering.renderer import open_renderer
-from langsplat_viewer.session import Bookmark, Session
+from langsplat_viewer.session import Bookmark, Session, point_of
 from langsplat_viewer.state import ExportForm, FileChoice, Leaving, SceneState, flight_of
 from langsplat_viewer.viewer import CommandProcess, Viewer, program
 
@@ -128,21 +128,20 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
     if state.extent is None or path_seconds(viewer) <= 0:
         viewer.say_error("a film needs a path: add two keyframes, or press Turntable")
         return
-    typed, request = record.film_file.strip(), state.request(record.size)
+    typed, fps, request = record.film_file.strip(), record.fps, state.request(record.size)
     try:
         new = folder.absolute() / typed
         if not typed:
             new = _new_file(viewer.state, folder, output.VIDEO if output.has_video() else "", "-film")
         out = output.check_film(new, record.size)
-        seen_by = output.cameras_of(flight_of(path), state.extent, record.fps, record.size)
-        shot = output.Shot(request, seen_by, record.fps, "cpu")
+        seen_by = output.cameras_of(flight_of(path), state.extent, fps, record.size)
     except (InputError, OSError) as error:
         viewer.say_error(f"no film: {error}")
         return
 
     def work(progress: Progress) -> tuple[Path, str]:
         say_compiling(progress)
-        return out, "; ".join(output.make_film(shot, out, progress))
+        return out, "; ".join(output.make_film(request, seen_by, fps, out, "cpu", progress))
 
     _record(viewer, f"film {out.name}", work)
 
@@ -395,7 +394,7 @@ def save_project(viewer: Viewer, to: Path = Path(), of: SceneState | None = None
     project = Project(
         scene=os.path.abspath(state.path),
         gaussians=state.count,
-        origin=(float(state.origin[0]), float(state.origin[1]), float(state.origin[2])),
+        origin=point_of(state.origin),
         view=Bookmark("view", pose_of(state.view), state.view.distance),
         session=state.session,
         intrinsics=state.view.intrinsics,

@@ -98,7 +98,8 @@ def _eye(viewer: Viewer, node: int, left: float, side: float) -> None:
     with theme.styled(text=ImVec4(text.x, text.y, text.z, 0.45) if hidden else "ink"):
         clicked = ui.small(f"{icon}###eye", side)
     if clicked:
-        (outline.show if hidden else outline.hide)(viewer, node)
+        act = outline.show if hidden else outline.hide
+        act(viewer, node)
     ui.tip("Show it again" if hidden else "Hide it")
 
 

@@ -18,7 +18,7 @@ from langsplat_viewer.actions import editing, settings
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import say
-from langsplat_viewer.session import Point
+from langsplat_viewer.session import Point, point_of
 from langsplat_viewer.state import Gizmo
 from langsplat_viewer.viewer import Viewer
 
@@ -297,8 +297,7 @@ def _box_handles(viewer: Viewer, seen: tuple[Any, Any]) -> None:
 def box_of(matrix: Array) -> tuple[Point, Point]:
     """Return the lowest and highest corner of the unit cube under a (4, 4) matrix without rotation."""
     half = np.abs(np.diag(matrix)[:3]) / 2
-    low, high = (tuple(map(float, matrix[:3, 3] + sign * half)) for sign in (-1, 1))
-    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+    return point_of(matrix[:3, 3] - half), point_of(matrix[:3, 3] + half)
 
 
 def dragged(start: Array, now: Array) -> Similarity:

@@ -2,45 +2,31 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_viewer.session import Preferences
 
-
-@dataclass(frozen=True)
-class Theme:
-    """Colours as style sheets write them; what is see-through lies on ground, glass or what is raised."""
-
-    ink: str  # text
-    soft: str  # secondary text
-    ground: str  # panels
-    glass: str  # what floats over the scene
-    raised: str  # menus, lists, questions
-    field: str  # boxes and the track of choices
-    line: str
-    button: str
-    hover: str
-    pressed: str  # what is pressed or chosen
-    grab: str  # of sliders; numbers are read over it
-    accent: str
-    good: str
-    weak: str
-    bad: str
-
-
-DARK = Theme(
-    *("#eef1f6", "#b6becd", "#12161e", "#12161ee6", "#1b202b", "#0000005c", "#ffffff1c", "#ffffff14"),
-    *("#ffffff20", "#ffffff30", "#6b542f", "#ffb454", "#7bd88f", "#ffd166", "#ffa796"),
-)
-LIGHT = Theme(
-    *("#1b2130", "#4b5567", "#f3f5f9", "#f8f9fcf0", "#ffffff", "#ffffff", "#1b213026", "#1b213010"),
-    *("#1b21301f", "#1b21302b", "#f3cf94", "#7a4100", "#145c33", "#6d4800", "#9f2417"),
-)
-THEMES = {"dark": DARK, "light": LIGHT}
+THEMES = ("dark", "light")
+COLOURS = {  # in each theme, as style sheets write them; what is see-through lies on ground, glass or raised
+    "ink": ("#eef1f6", "#1b2130"),  # text
+    "soft": ("#b6becd", "#4b5567"),  # secondary text
+    "ground": ("#12161e", "#f3f5f9"),  # panels
+    "glass": ("#12161ee6", "#f8f9fcf0"),  # what floats over the scene
+    "raised": ("#1b202b", "#ffffff"),  # menus, lists, questions
+    "field": ("#0000005c", "#ffffff"),  # boxes and the track of choices
+    "line": ("#ffffff1c", "#1b213026"),
+    "button": ("#ffffff14", "#1b213010"),
+    "hover": ("#ffffff20", "#1b21301f"),
+    "pressed": ("#ffffff30", "#1b21302b"),  # what is pressed or chosen
+    "grab": ("#6b542f", "#f3cf94"),  # of sliders; numbers are read over it
+    "accent": ("#ffb454", "#7a4100"),
+    "good": ("#7bd88f", "#145c33"),
+    "weak": ("#ffd166", "#6d4800"),
+    "bad": ("#ffa796", "#9f2417"),
+}
 CLEAR = ImVec4(0, 0, 0, 0)
-VEIL = "#00000080"  # over what a question covers
+VEIL = ImVec4(0, 0, 0, 0.5)  # over what a question covers
 
 # imgui's names of what has a colour of the theme; what is not named is clear.
 PAINTED = {
@@ -87,27 +73,27 @@ FONT_SIZE = 15.0
 FONT = "fonts/Roboto/Roboto-Regular.ttf"  # of imgui-bundle
 
 
-def rgba(colour: str) -> tuple[float, float, float, float]:
-    """Return the parts of a colour, each from 0 to 1."""
-    red, green, blue, alpha = bytes.fromhex((colour[1:] + "ff")[:8])
+def rgba(name: str, theme: str) -> tuple[float, float, float, float]:
+    """Return the parts of a colour in a theme, each from 0 to 1."""
+    red, green, blue, alpha = bytes.fromhex((COLOURS[name][THEMES.index(theme)][1:] + "ff")[:8])
     return red / 255, green / 255, blue / 255, alpha / 255
 
 
 def apply(preferences: Preferences) -> None:
     """Have imgui draw everything in the theme and size that is preferred; once for every change."""
-    style, chosen, scale = imgui.get_style(), THEMES[preferences.theme], preferences.ui_scale
+    style, chosen, scale = imgui.get_style(), preferences.theme, preferences.ui_scale
     names = {part: name for name, parts in PAINTED.items() for part in parts.split()}
     for slot in imgui.Col_:
         if slot != imgui.Col_.count:
-            colour = ImVec4(*rgba(getattr(chosen, names[slot.name]))) if slot.name in names else CLEAR
+            colour = ImVec4(*rgba(names[slot.name], chosen)) if slot.name in names else CLEAR
             style.set_color_(slot, colour)
     for slot in (imgui.Col_.modal_window_dim_bg, imgui.Col_.nav_windowing_dim_bg):
-        style.set_color_(slot, ImVec4(*rgba(VEIL)))
+        style.set_color_(slot, VEIL)
     for name, (x, y) in SPACES.items():
         setattr(style, name, ImVec2(x * scale, y * scale))
     for name, size in SIZES.items():
         setattr(style, name, size * scale)
-    hello_imgui.get_runner_params().imgui_window_params.background_color = ImVec4(*rgba(chosen.ground))
+    hello_imgui.get_runner_params().imgui_window_params.background_color = ImVec4(*rgba("ground", chosen))
     style.window_border_size = style.popup_border_size = style.tab_border_size = 0
     style.child_border_size = style.frame_border_size = 1
     style.window_menu_button_position = imgui.Dir.none
@@ -117,8 +103,7 @@ def apply(preferences: Preferences) -> None:
 def colour(name: str) -> ImVec4:
     """Return a colour of the theme that imgui draws in, by its name there."""
     ground = imgui.get_style().color_(imgui.Col_.window_bg)
-    shown = DARK if ground.x + ground.y + ground.z < 1.5 else LIGHT
-    return ImVec4(*rgba(getattr(shown, name)))
+    return ImVec4(*rgba(name, "dark" if ground.x + ground.y + ground.z < 1.5 else "light"))
 
 
 @contextmanager
