@@ -62,7 +62,8 @@ def check_arguments(command: object) -> None:
                 raise InputError(f"{option} {plain}: is not UTF-8; use a terminal that is set to UTF-8")
         for part in config.annotations(hint):
             if isinstance(part, OutputPath) and value is not None:
-                (check_output_file if part.kind == "file" else check_output_folder)(value)
+                check = check_output_file if part.kind == "file" else check_output_folder
+                check(value)
             unused = isinstance(part, Needs) and not getattr(command, part.field)
             if unused and value != getattr(type(command), option[2:].replace("-", "_")):
                 other = part.said or f"--{part.field.replace('_', '-')}"

@@ -131,8 +131,8 @@ class Convert:
             return
         rematched = () if self.rematch is None else (self.rematch,)
         row = check_writable(self.out, *self.sources, *rematched)  # before minutes are spent on reading
-        files = (self.source.suffix.lower() == ".spz") + (row.suffix == ".spz")
-        if len(self.axes) > files or (self.spz_version != 3 and row.suffix != ".spz"):
+        of_spz = (self.source.suffix.lower(), row.suffix).count(".spz")
+        if len(self.axes) > of_spz or (self.spz_version != 3 and row.suffix != ".spz"):
             raise InputError("--axes, a word for each, and --spz-version are of an .spz; leave them out")
         scene = self._read()
         write, axes = None, (self.axes or ("rub",))[-1]

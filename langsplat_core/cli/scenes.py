@@ -51,24 +51,24 @@ class Inspect:
         _print_rows([*lines, *(("not read", reason) for reason in scene.unread)])
 
 
-def _lines(a: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Rows of the report: a name, and a value for people."""
-    reasons = "".join(f"; {count} {reason}" for reason, count in a["invalid"].items())
-    digits, metres = 10 if any(a["origin"]) else 3, a["metres_per_unit"]
-    low, high = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in a["bounds"])
+    reasons = "".join(f"; {count} {reason}" for reason, count in summary["invalid"].items())
+    digits, metres = 10 if any(summary["origin"]) else 3, summary["metres_per_unit"]
+    low, high = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in summary["bounds"])
     lines = [
-        ("in memory", f"{a['memory_bytes'] / 1e6:.2f} MB"),
-        ("Gaussians", f"{a['gaussians']:,}"),
-        ("invalid rows", f"{a['invalid_rows']}{reasons}"),
+        ("in memory", f"{summary['memory_bytes'] / 1e6:.2f} MB"),
+        ("Gaussians", f"{summary['gaussians']:,}"),
+        ("invalid rows", f"{summary['invalid_rows']}{reasons}"),
         ("bounds (1-99 %)", f"{low}  to  {high}"),
-        ("origin", " ".join(f"{value:.10g}" for value in a["origin"])),
-        ("SH degree", f"{a['sh_degree']}"),
-        ("antialiased", "yes (Mip-Splatting)" if a["antialiased"] else "no"),
+        ("origin", " ".join(f"{value:.10g}" for value in summary["origin"])),
+        ("SH degree", f"{summary['sh_degree']}"),
+        ("antialiased", "yes (Mip-Splatting)" if summary["antialiased"] else "no"),
         ("scale", f"{metres:g} m per unit" if metres else "unknown: `langsplat scale`"),
-        ("extra properties", ", ".join(a["extras"]) or "none"),
-        ("cameras", f"{a['cameras']}" if a["cameras"] else "none"),
+        ("extra properties", ", ".join(summary["extras"]) or "none"),
+        ("cameras", f"{summary['cameras']}" if summary["cameras"] else "none"),
     ]
-    if (field := a["language"]) is None:
+    if (field := summary["language"]) is None:
         return [*lines, ("language field", "none")]
     observed = ", ".join(f"{name} {100 * share:.1f} %" for name, share in field["observed"].items())
     megabytes = field["bytes"] / 1e6

@@ -175,18 +175,18 @@ def _faults(path: Path) -> Iterator[None]:
         raise malformed(path, str(error)) from None
 
 
-def _read(path: Path, kind: _Format) -> tuple[dict[str, Array], dict[str, Any]]:
-    """Return the tensors of a file of this kind, floats as float32, and its metadata."""
+def _read(path: Path, layout: _Format) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Return the tensors of a file of this layout, floats as float32, and its metadata."""
     open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
-    name, versions, what = kind
+    stated, versions, what = layout
     tensors = {}
     with safe_open(path, framework="numpy") as file:
         about: dict[str, Any] = file.metadata() or {}
-        if about.get("format") != name:
+        if about.get("format") != stated:
             raise ValueError(f"a safetensors file, but not of {what}")
         if about.get("version") not in versions:
-            found = f"version {quoted(about.get('version'))} of {what}"
-            raise malformed(path, f"{found}; this program reads {' and '.join(versions)}", "update it")
+            other = f"version {quoted(about.get('version'))} of {what}"
+            raise malformed(path, f"{other}; this program reads {' and '.join(versions)}", "update it")
         about |= {
             key: decode_json(about[key].encode(), kind, path) for key, kind in _PARSED.items() if key in about
         }
@@ -275,12 +275,13 @@ def _unsigned(numbers: Array, kind: DTypeLike) -> Array:
     return np.where(numbers == NO_NODE, np.iinfo(kind).max, numbers).astype(kind)
 
 
-def _save(path: Path | str, kind: _Format, tensors: dict[str, Array], about: dict[str, str]) -> None:
+def _save(path: Path | str, layout: _Format, tensors: dict[str, Array], about: dict[str, str]) -> None:
     """Write a safetensors file, atomically; equal content gives equal bytes.
 
     The library writes the metadata in random order, so they are sorted here.
     """
-    about = {"format": kind[0], "version": kind[1][-1], **about}
+    name, versions, _ = layout
+    about = {"format": name, "version": versions[-1], **about}
     with atomic_path(path) as temporary:
         tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
         save_file(tensors, temporary, about)

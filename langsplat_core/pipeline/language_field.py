@@ -139,7 +139,6 @@ class Stages:
         return [own for own, _ in read], (digest_of(self.gaussians), digests, self.config.radiance.near)
 
     def path(self, name: str, version: int, *settings: Any) -> Path:
-        """Return the file of a stage."""
         return self.work / f"{stage_key(name, version, *self.inputs[1], *settings)}.npz"
 
     def kept(self, path: Path, make: Callable[[], Arrays]) -> Arrays:

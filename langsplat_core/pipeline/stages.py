@@ -31,12 +31,10 @@ except ImportError:  # Windows; there two trainings in one folder are the user's
 
 log = logging.getLogger("langsplat")
 LOCK = "in-use.lock"  # in the work folder, where it stays: only the system's lock on it counts
+DIGEST = "digest"  # name beside the arrays of a stage
 PATIENCE = timedelta(days=7)  # radiance training is one process's work, and the others wait for it
 T = TypeVar("T")
 Arrays = Mapping[str, Array]
-
-
-DIGEST = "digest"  # name beside the arrays of a stage
 
 
 def stage_key(name: str, version: int, *inputs: Any) -> str:
@@ -56,12 +54,12 @@ def kept(path: Path, make: Callable[[], Arrays]) -> Arrays:
         log.debug("%s: kept from an earlier run", path.name)
         found = dict(read_arrays(path))
         stated = str(found.pop(DIGEST, ""))  # none in work folders of earlier versions
-        if stated and stated != _digest(found.items()):
-            raise _changed(path)
+        if stated and stated != _digest(found.values()):
+            raise changed(path)
         return found
     made = make()
     # The digest first, so that it is not lost together with an array at the end.
-    arrays: Arrays = {DIGEST: np.array(_digest(made.items())), **made}
+    arrays: Arrays = {DIGEST: np.array(_digest(made.values())), **made}
     with atomic_path(path) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
     return made
@@ -69,7 +67,7 @@ def kept(path: Path, make: Callable[[], Arrays]) -> Arrays:
 
 def write_array(path: Path, array: Array) -> None:
     """Write an array of numbers that `open_array` maps, with its digest behind it, whole or not at all."""
-    write_npy(path, array, bytes.fromhex(_digest([("", array)])))
+    write_npy(path, array, bytes.fromhex(_digest([array])))
 
 
 def open_array(path: Path) -> Array:
@@ -82,8 +80,8 @@ def open_array(path: Path) -> Array:
         with path.open("rb") as file:
             file.seek(array.offset + array.nbytes)
             stated = file.read().hex()  # nothing in work folders of earlier versions
-    if stated and stated != _digest([("", array)]):
-        raise _changed(path)
+    if stated and stated != _digest([array]):
+        raise changed(path)
     return np.asanyarray(array)
 
 
@@ -107,18 +105,19 @@ def _damage_as_error(path: Path) -> Iterator[None]:
         raise FormatError(f"{path}: damaged ({printable_line(error, 80)}); delete it and run again") from None
 
 
-def _changed(path: Path) -> FormatError:
+def changed(path: Path) -> FormatError:
+    """Return the error of a stage's file that is not as it was written."""
     return FormatError(f"{path}: changed since it was written; delete it and run again")
 
 
 def digest_of(data: Gaussians | ImageFeatures) -> str:
     """Return a digest of every number of Gaussians, or of the masks and vectors of a photograph."""
-    return _digest((entry.name, getattr(data, entry.name)) for entry in fields(data))
+    return _digest(getattr(data, entry.name) for entry in fields(data))
 
 
-def _digest(arrays: Iterable[tuple[str, Array]]) -> str:
+def _digest(arrays: Iterable[Array]) -> str:
     digest = hashlib.blake2b(digest_size=16)
-    for _, array in arrays:
+    for array in arrays:
         digest.update(repr((array.shape, array.dtype.str)).encode())
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()

@@ -24,7 +24,7 @@ from langsplat_core.config import QUICK_SIDE, RadianceConfig, TrainConfig, Until
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
 from langsplat_core.datasets.photos import count_photographs
-from langsplat_core.errors import STRICTNESS, FormatError, InputError, LangSplatError, optional_imports
+from langsplat_core.errors import STRICTNESS, InputError, LangSplatError, optional_imports
 from langsplat_core.interrupts import raised
 from langsplat_core.io import apart
 from langsplat_core.io.cameras import SUFFIX as CAMERAS
@@ -34,7 +34,7 @@ from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.pipeline import language_field
 from langsplat_core.pipeline import report as reports
-from langsplat_core.pipeline.stages import LOCK, ProcessGroup, digest_of, sole_use, stage_key
+from langsplat_core.pipeline.stages import LOCK, ProcessGroup, changed, digest_of, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Gaussians, LanguageField, Scene
 from langsplat_core.scene.transform import place_scene
@@ -172,7 +172,7 @@ def _train(
             small = capture.read_at(held_out, QUICK_SIDE) if held_out else None
             near = config.radiance.near or scene.near  # as whoever opens the scene has it
             told: dict[str, Any] = {"near": near, "progress": run.progress}
-            scores = evaluate_views(gaussians, capture, held_out, small=small, **told) if held_out else []
+            scores = evaluate_views(gaussians, capture, held_out, small=small, **told)
             trained = evaluate_views(gaussians, capture, reports.shown_views(train), **told)
         rule = f"one in {config.dataset.test_every}, "
         rule += "by name" if config.dataset.hold_out == "every" else "amid others"
@@ -292,7 +292,7 @@ def trained_gaussians(
         log.debug("%s: kept from an earlier run", done.name)
         found = read_ply(done)
         if stated.exists() and stated.read_bytes() != digest_of(found).encode():  # none in earlier versions
-            raise FormatError(f"{done}: changed since it was written; delete it and run again")
+            raise changed(done)
         return found
     checkpoint = done.with_suffix(".checkpoint.safetensors")
     stated.unlink(missing_ok=True)

@@ -150,7 +150,7 @@ class _Evaluator:
                 members = excluded.members
                 if isinstance(unwanted, Atom):
                     # "red mug" may also find a green mug, if nothing fits better; "not red mug" keeps it.
-                    members = members & within_reach(self.engine, excluded, HALF)[0]
+                    members = members & within_reach(self.engine, excluded, HALF)
                 return restricted(wanted, ~members, wanted) if excluded.found else wanted
             case Inside(part, whole):
                 return self._inside(part, whole, level)
@@ -183,7 +183,7 @@ class _Evaluator:
         if isinstance(whole, Atom) and not engine.is_taught(whole.text):
             names += filter(engine.is_known, [f"{whole.text} {part.text}"])
             if ADJECTIVES.isdisjoint(whole.text.lower().split()):  # an adjective picks one of several
-                on = within_reach(engine, thing, RULE.around)[0]
+                on = within_reach(engine, thing, RULE.around)
         calibration = engine.calibration if thing.probability is not None else None
         found = engine.run_inside(names, on, level, calibration)
         return restricted(found, found.members, thing)
@@ -248,11 +248,11 @@ def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryRe
     )
 
 
-def within_reach(engine: QueryEngine, answer: QueryResult, *shares: float) -> list[Array]:
-    """Return for each share the (N,) bool members that the answer has with this share of `RULE`'s reach."""
+def within_reach(engine: QueryEngine, answer: QueryResult, share: float) -> Array:
+    """Return the (N,) bool members that the answer has with this share of `RULE`'s reach."""
     fits = engine.scale.fit(answer.even)
     best = float(fits[answer.members].max(initial=-np.inf))
-    return [np.asarray(fits >= RULE.least_fit(best, share)) for share in shares]
+    return np.asarray(fits >= RULE.least_fit(best, share))
 
 
 @dataclass(frozen=True)
@@ -266,7 +266,7 @@ class InstanceCount:
 
 def count_instances(engine: QueryEngine, answer: QueryResult) -> InstanceCount:
     """Return the number of instances in an answer, as `separate` divides it, and its range."""
-    least, most = within_reach(engine, answer, RULE.strict, RULE.wide)
+    least, most = (within_reach(engine, answer, share) for share in (RULE.strict, RULE.wide))
     low, own, high = (
         len(separate(engine.surface, inside[engine.surface.rows], engine.tree))
         for inside in (least & answer.members, answer.members, most | answer.members)

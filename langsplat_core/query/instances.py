@@ -112,7 +112,6 @@ class Instance:
 
     @property
     def count(self) -> int:
-        """Number of its Gaussians."""
         return len(self.members)
 
     @cached_property

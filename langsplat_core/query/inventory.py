@@ -17,7 +17,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_core.io.files import atomic_path, check_output_file
-from langsplat_core.io.scenes import check_writable, save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import LIKELY, OR, Describer, Word, likely_name
@@ -284,7 +284,6 @@ def export_labels(describer: Describer, path: Path) -> Path:
     for outline in scene_outline(describer):
         place(outline, NO_NODE)
     beside = path.with_suffix(".labels.json")
-    check_writable(path)
     check_output_file(beside)
     kept = {name: values for name, values in scene.extras.items() if name not in labels}
     with atomic_path(beside) as temporary:
@@ -331,8 +330,10 @@ def composed_examples(engine: QueryEngine, suggestions: Suggestions) -> tuple[st
     here = suggestions.phrases[: TRIES * EXAMPLES]
     parts = (phrase for phrase in here if " " in phrase and is_part(phrase.split()[-1]))
     pairs = (f"{thing} near the {other}" for thing, other in permutations(suggestions.examples, 2))
-    firsts = (islice((p for p in kind if _is_found(engine, p)), 1) for kind in (parts, islice(pairs, 12)))
-    return tuple(phrase for first in firsts for phrase in first)
+    found: list[str] = []
+    for kind in (parts, islice(pairs, 12)):
+        found += islice((phrase for phrase in kind if _is_found(engine, phrase)), 1)
+    return tuple(found)
 
 
 def _is_found(engine: QueryEngine, phrase: str) -> bool:

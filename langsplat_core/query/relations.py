@@ -165,4 +165,6 @@ def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Array | N
     if kind in ("nearest", "farthest"):
         return float(np.linalg.norm(_centre(thing, seen_by)))
     aside = _seen(thing, seen_by)[0]
-    return (np.inf if kind == "leftmost" else -np.inf) if np.isnan(aside) else aside
+    if np.isnan(aside):  # behind the camera: the last of either ranking
+        return np.inf if kind == "leftmost" else -np.inf
+    return aside

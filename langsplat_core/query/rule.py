@@ -256,7 +256,6 @@ class Judged:
 
     @property
     def verdict(self) -> Outcome:
-        """The verdict in words."""
         return self.judgement.outcome
 
     @property
@@ -277,12 +276,17 @@ class Judged:
 
 def combined(verdicts: Sequence[Verdict], all_needed: bool) -> Verdict:
     """Return the verdict on several things: the weakest if all are needed, else the strongest."""
-    score = min if all_needed else max
-    reached = {verdict.reached for verdict in verdicts}
+    score, holds = (min, all) if all_needed else (max, any)
+    kinds = {verdict.reached for verdict in verdicts}
+    reached: Reached = "several"
+    if len(kinds) == 1:
+        reached = kinds.pop()
+    elif kinds <= {*IN_SPREADS}:
+        reached = "chance"
     probabilities = [verdict.probability for verdict in verdicts if verdict.probability is not None]
     return Verdict(
-        found=(all if all_needed else any)(verdict.found for verdict in verdicts),
-        reached=reached.pop() if len(reached) == 1 else "chance" if reached <= {*IN_SPREADS} else "several",
+        found=holds(verdict.found for verdict in verdicts),
+        reached=reached,
         margin=score(verdict.margin for verdict in verdicts),
         probability=score(probabilities) if len(probabilities) == len(verdicts) else None,
     )
@@ -290,8 +294,10 @@ def combined(verdicts: Sequence[Verdict], all_needed: bool) -> Verdict:
 
 def scaling_of(calibration: Calibration | None, sought: Sought, phrase: str) -> PlattScaling | None:
     """Return the logistic function of a calibration for a phrase; None without a calibration."""
-    if calibration is None or sought == "inside":
-        return None if calibration is None else calibration.inside
+    if calibration is None:
+        return None
+    if sought == "inside":
+        return calibration.inside
     coloured = not COLOURS.isdisjoint(phrase_key(phrase).split()[:-1])
     if sought == "thing":
         return calibration.coloured_thing if coloured else calibration.thing

@@ -79,8 +79,7 @@ class PlainClipText:
 
     batch = 512  # small matrix products spend their time on synchronising threads
 
-    def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: "PairTokenizer") -> None:
-        self.id = id
+    def __init__(self, config: TextConfig, tensors: Tensors, tokenizer: "PairTokenizer") -> None:
         self.temperature, self.dim = TEMPERATURE, config.projection_dim
         self.config, self.tensors, self.tokenizer = config, tensors, tokenizer
 
@@ -106,7 +105,7 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
         config = msgspec.convert({**stated["text_config"], **settings}, TextConfig)
         tokenizer = read_tokenizer(weights.folder / TOKENIZER)
         tensors = _tensors(weights.folder, config, PREFIX, PROJECTION, others=5)
-        tower = PlainClipText(weights.id, config, tensors, tokenizer)
+        tower = PlainClipText(config, tensors, tokenizer)
         rows = len(tensors[TOKENS]), len(tensors[POSITIONS])
         # Checked here so that no later phrase fails.
         fits = set(tokenizer.numbers.values()) <= set(range(rows[0])) and tokenizer.end == config.eos_token_id

@@ -180,7 +180,6 @@ class Sam3Text(TorchText):
 
     @models.asking_errors("the segmenter")
     def segment(self, image: Array, phrases: Sequence[str]) -> Array:
-        """See `TextSegmenter`."""
         import torch
 
         pixels, _ = normalised(image, self._side, padded=False, statistics=SAM3_PIXELS)
