@@ -544,6 +544,7 @@ def test_options_beside_a_file_win(tmp_path: Path) -> None:
         ("44 = 'quick'", "44"),
         ("steps = ", "Invalid value"),
         ("\x01", "cannot be used as --config"),
+        (f"{'9' * 400} = 1", "is a number"),
         (None, "no such file"),
     ],
 )
@@ -554,6 +555,7 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(text, said, tmp_path, 
     line = refusal(capsys, *WORDS, "--config", file)
     assert line.startswith(f"langsplat: {file}: ")
     assert said in line
+    assert len(line) <= len(str(file)) + 240
 
 
 @pytest.mark.parametrize("said", [None, "ACTIVE"])

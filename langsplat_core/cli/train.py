@@ -156,7 +156,7 @@ def with_file(args: Sequence[str]) -> list[str]:
     except SystemExit:
         raise InputError(f"{name}: {printable_line(one_line(complaint.getvalue()), 200)}") from None
     except (ValueError, InputError) as error:  # a TOMLDecodeError is a ValueError
-        raise InputError(f"{name}: cannot be used as --config: {printable_line(error, 200)}") from None
+        raise InputError(f"{name}: cannot be used as --config: {printable_line(error, 190)}") from None
     return [args[0], *words, "--config", name, *args[1:]]  # an option, so that no list takes the dataset
 
 

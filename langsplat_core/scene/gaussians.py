@@ -46,7 +46,7 @@ class Gaussians:
         if given.dtype == np.float64 and len(self):
             some = slice(None, None, len(self) // 4096 + 1)
             step = np.spacing(np.median(np.abs(self.means[some]).max(1)))
-            if step > np.exp(np.median(self.log_scales[some].max(1))):
+            if np.log(step) > np.median(self.log_scales[some].max(1)):
                 report_loss("positions so far from zero are rounded to %g units: give Scene an origin", step)
 
     def __repr__(self) -> str:

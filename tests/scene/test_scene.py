@@ -46,6 +46,12 @@ def test_a_camera_frames_any_scene(offset: float) -> None:
     np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-6)
 
 
+@pytest.mark.filterwarnings("error")
+def test_scales_of_any_size_are_taken_from_doubles() -> None:
+    taken = random_gaussians(9)
+    assert len(replace(taken, means=taken.means.astype(np.float64), log_scales=np.full((9, 3), 1e4))) == 9
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.5, 1.3, 2.2])
 def test_a_thin_scene_is_seen_from_its_broad_side(angle: float) -> None:
     """Up is -y without cameras; a sheet that stands upright, turned about it."""
