@@ -309,7 +309,7 @@ HELD: tuple[tuple[str, str], ...] = (
 
 
 def with_key(text: str, act: Callable[[Viewer], object]) -> str:
-    """`text`, and in brackets the key of the command that does it."""
+    """Return `text` and, in brackets, the key of the command that does it, if it has one."""
     keys = next((command.keys for command in COMMANDS if command.act is act), ())
     return f"{text} ({keys[0]})" if keys else text
 

@@ -368,9 +368,12 @@ def draw_unsaved(viewer: Viewer) -> None:
 def _ask(viewer: Viewer, to: str) -> None:
     state = viewer.state
     if state.is_unsaved:
-        count, moved = int(state.marks.deleted.sum()), bool(state.session.moves)
-        edits = " and ".join([f"{count:,} deleted"] * (count > 0) + ["some transformed"] * moved)
-        imgui.text_wrapped(f"Gaussians: {edits or 'as once opened'}. The scene is not saved so.")
+        count = int(state.marks.deleted.sum())
+        edits = [f"{count:,} deleted"] if count else []
+        if state.session.moves:
+            edits.append("some transformed")
+        said = " and ".join(edits) or "as once opened"
+        imgui.text_wrapped(f"Gaussians: {said}. The scene is not saved so.")
     for other in viewer.unsaved():
         of = other.path.name if other.path else "the scene"
         imgui.text_wrapped(f"Notes, names, bookmarks or keyframes of {of} are in no project.")

@@ -90,7 +90,7 @@ def _name(viewer: Viewer) -> None:
         imgui.set_keyboard_focus_here()
     if (name := ui.kept_box(viewer, "##name", "a name for what is selected", "Name it")) is not None:
         editing.name_selection(viewer, name)
-    ui.tip("Searching for the name finds this, and what is like it")
+    ui.tip("Searching for the name finds just this; Like it, below that answer, finds what is like it")
 
 
 # Strokes: the left button while a tool selects.
