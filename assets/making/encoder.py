@@ -39,10 +39,10 @@ from assets.making.world import (
 from langsplat_core.arrays import Array
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress
-from langsplat_core.scene import CANONICAL_PHRASES
+from langsplat_core.scene import CANONICAL_PHRASES, LanguageField
 from langsplat_core.semantics.encoders import Encoder as ImageTextEncoder
 from langsplat_core.semantics.encoders import load_encoder
-from langsplat_core.semantics.relevancy import FLOOR, relevancy
+from langsplat_core.semantics.relevancy import FLOOR, relevancy_of
 
 FUNCTION_WORDS = ("a", "an", "the", "of", "and", "with", "photo", "my", "on", "in", "some", "one")
 PREFIXES = ("", "", "", "", "a", "the", "the", "a photo of a", "a photo of the", "my", "one", "some")
@@ -435,7 +435,8 @@ def report(encoder: ImageTextEncoder, crops: CropSet) -> list[KindReport]:
     for kind in BOOK_KINDS:
         columns = np.flatnonzero(kinds == kind)
         if (fits[:, columns] == 1).any():
-            scores = relevancy(images, texts[columns], canonical)
+            zero, rate = (images @ canonical.T).max(1, keepdims=True), LanguageField.temperature
+            scores = relevancy_of(images @ texts[columns].T, zero, rate)
             rows.append(_kind_report(kind, scores, fits[:, columns]))
     return rows
 

@@ -13,7 +13,7 @@ from langsplat_core import registry
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, WrittenScene
 from langsplat_core.config import CodecConfig, Level, Positive, Range
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import check_output_file, check_output_folder
+from langsplat_core.io.files import check_output_file, check_output_folder, write_whole
 from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import (
     ORIGIN_SUFFIX,
@@ -28,7 +28,7 @@ from langsplat_core.io.scenes import (
 )
 from langsplat_core.io.sidecar import rematch_language
 from langsplat_core.io.spz import read_spz_scene, write_spz
-from langsplat_core.pipeline.webpage import make_page, write_page
+from langsplat_core.pipeline.webpage import make_page
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.selection import in_box
@@ -73,8 +73,8 @@ class Export:
             first = [camera for camera in scene.cameras if self.view and camera.name == self.view][:1]
             if self.view and not first:
                 raise InputError(f"--view {self.view}: {self.scene} has no camera of this name")
-            page = make_page(scene, engine, self.title or self.out.stem, progress, first)
-            report = write_page(self.out, page)
+            text, report = make_page(scene, engine, self.title or self.out.stem, progress, first)
+            write_whole(self.out, text)
         what = "any words of the scene's encoder" if report.free_text else f"{report.phrases:,} phrases"
         asked = f"nothing can be searched: {report.why_not}" if report.why_not else f"{what} can be searched"
         print(f"{self.out}: {report.gaussians:,} Gaussians, {report.bytes / 1e6:.2f} MB; {asked}")

@@ -167,7 +167,8 @@ def _read(path: Path, read: Reader | None = None) -> Scene:
     if row is None:
         kinds = ", ".join(row.suffix for row in formats())
         raise InputError(f"{path}: not a scene of a known kind; supported: {kinds}, {META_NAME}")
-    scene = _about_origin(path, (read or row.read)(path))
+    read = read or row.read
+    scene = _about_origin(path, read(path))
     log.debug("%s: %d Gaussians", path, len(scene.gaussians))
     warn_of_undrawable(path, scene.gaussians)
     return scene

@@ -328,7 +328,7 @@ def agreed_features(
     whole = isinstance(encoder, RegionEncoder)  # one look at a photograph describes all its regions
     used = np.isin(np.arange(len(tree.highest)), [] if whole else finer)
     nodes = np.flatnonzero(tree.between(*NAMED) | used)
-    vectors = _described(stages, tree, nodes, np.stack(eyes), drawn, photographs, work / described)
+    vectors = _node_vectors(stages, tree, nodes, np.stack(eyes), drawn, photographs, work / described)
     names = name_scores(tree, surface_areas(gaussians), vectors, encoder)
     cuts = [*finer, tree.cut(CUTS[2]) if names is None else tree.cut(*NAMED, names)]
     store = FeatureStore(work / "features")
@@ -342,7 +342,7 @@ def agreed_features(
     return store.of([camera.name for camera, _ in views])
 
 
-def _described(
+def _node_vectors(
     stages: Stages,
     tree: MergeTree,
     nodes: Array,

@@ -45,7 +45,7 @@ from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.training.radiance import trainer
 from langsplat_core.training.radiance.differentiable import evaluate_views
 
-FEWEST_VIEWS = 3
+FEWEST_CAMERAS = 3
 VERSION = 9  # of the results of training
 
 log = logging.getLogger("langsplat")
@@ -142,7 +142,7 @@ def _train(
     if encoder is not None:
         mask_source = named_source or masks_of(capture)  # type: ignore[misc]  # one of them is there
         with run.timed("masks and vectors"):
-            features = _described(run, capture, train, mask_source, encoder)
+            features = _features(run, capture, train, mask_source, encoder)
             language_field.check_masks(features)  # before the Gaussians, which may cost hours
 
     with run.timed("radiance"):
@@ -240,11 +240,11 @@ def _mean(scores: Iterable[float | None]) -> float | None:
 def _photographs(run: _Run) -> Capture:
     """Return the photographs that have cameras, enough for a scene."""
     capture = load_capture(run.dataset, run.config.dataset, run.work, run.progress)
-    if len(capture) < FEWEST_VIEWS and not run.config.dataset.allow_few_cameras:
+    if len(capture) < FEWEST_CAMERAS and not run.config.dataset.allow_few_cameras:
         why = f" ({'; '.join(STRICTNESS.said)})" if STRICTNESS.said else ""
         raise InputError(
             f"{shown(run.dataset)}: only {len(capture)} photographs have cameras{why}, and a scene needs "
-            f"{FEWEST_VIEWS}; take more, or go on with --dataset.allow-few-cameras"
+            f"{FEWEST_CAMERAS}; take more, or go on with --dataset.allow-few-cameras"
         )
     report, out = run.work / reports.REPORT, run.out  # the report is written after its scene
     stated = reports.stated_figures(report).get("dataset")  # is gone where it was moved
@@ -255,7 +255,7 @@ def _photographs(run: _Run) -> Capture:
     return capture
 
 
-def _described(
+def _features(
     run: _Run, capture: Capture, train: list[int], source: MaskSource, encoder: Encoder
 ) -> OnDemand[ImageFeatures]:
     """Find the masks of the photographs at `train`, and their vectors where masks agree between photographs.

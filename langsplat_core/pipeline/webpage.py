@@ -1,4 +1,4 @@
-"""A scene as one HTML file that a browser draws and searches without a network: `write_page`, `make_page`.
+"""A scene as one HTML file that a browser draws and searches without a network: `make_page`.
 
 The file holds a compressed safetensors file (Gaussians of 8 and 16 bits, codes, codebook, words, regions)
 and the modules of `langsplat_core/web`. A phrase is answered there by the rule of `query.rule`:
@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.resources import files
 from io import BytesIO
-from pathlib import Path
 from typing import Any, get_args
 from urllib.parse import urlencode
 
@@ -38,7 +37,6 @@ from langsplat_core.display.displays import (
     shader_defines,
 )
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.io.files import write_whole
 from langsplat_core.io.quantised import to_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query import grammar, relations, taught
@@ -72,20 +70,13 @@ FLATTEST, OPAQUE = -46.0, 20.0  # log scales are clipped to [-46, 46], logits to
 
 @dataclass(frozen=True)
 class PageReport:
-    """The content of a page that was written."""
+    """The content of a page."""
 
     gaussians: int
     phrases: int  # number that completion offers
     free_text: bool  # the encoder is in the page, so that any of its words may be combined
     bytes: int
     why_not: str = ""  # reason why nothing can be searched, "" where it can
-
-
-def write_page(path: Path, page: tuple[str, PageReport]) -> PageReport:
-    """Write what `make_page` returned as a file."""
-    text, report = page
-    write_whole(path, text)
-    return report
 
 
 def covered(scene: Scene, cameras: Sequence[Camera]) -> Array:

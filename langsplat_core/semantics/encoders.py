@@ -221,7 +221,8 @@ class Encoder(PhraseEncoder):
         """Return unit vectors of (B, H, W, 3) uint8 images, by `forward`, by default the tower's `encode`."""
         mean, std = self._images.statistics
         pixels = (images.astype(np.float32) / 255 - mean) / std
-        return unit((forward or self._images.encode)(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))))
+        forward = forward or self._images.encode
+        return unit(forward(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))))
 
 
 @models.asking_errors("the encoder")
@@ -457,7 +458,8 @@ def load_encoder(model: str, device: str = "auto", batch: int = 32, option: str 
     """Load both halves of `model`, as in `load_text_encoder`; batch: images per forward pass."""
     weights = models.open_weights(model, model_path(model, option), device)
     family = models.family_of(weights, FAMILIES, "encoders")
-    return (family.encoder or Encoder)(weights, family.text(weights), family.images(weights), batch)
+    kind = family.encoder or Encoder
+    return kind(weights, family.text(weights), family.images(weights), batch)
 
 
 def model_path(model: str, option: str) -> Path:

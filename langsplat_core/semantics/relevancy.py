@@ -43,13 +43,6 @@ def relevancy_of(cosines: Array, zero: Array, rate: Array | float) -> Array:
     return sigmoid(rate * (cosines - zero))
 
 
-def relevancy(
-    vectors: Array, phrases: Array, canonical: Array, temperature: float = LanguageField.temperature
-) -> Array:
-    """Return the published (M, Q) relevancy in (0, 1) of (M, D), (Q, D) and canonical (C, D) unit vectors."""
-    return relevancy_of(vectors @ phrases.T, (vectors @ canonical.T).max(1, keepdims=True), temperature)
-
-
 def latent_relevancy(
     codec: Codec,
     latents: Array,

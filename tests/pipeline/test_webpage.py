@@ -23,8 +23,9 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats
 from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.io.files import write_whole
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.pipeline.webpage import covered, make_page, views, write_page
+from langsplat_core.pipeline.webpage import covered, make_page, views
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
@@ -71,7 +72,7 @@ def engine(demo: Scene) -> QueryEngine:
 @pytest.fixture(scope="module")
 def page(demo: Scene, engine: QueryEngine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "room.html"
-    write_page(path, make_page(demo, engine, "Demo"))
+    write_whole(path, make_page(demo, engine, "Demo")[0])
     return path
 
 
@@ -80,7 +81,7 @@ def thin(demo: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of every eighth Gaussian, for what is not about the image: here the processor draws it."""
     scene = demo.take(np.arange(0, len(demo.gaussians), 8))
     path = tmp_path_factory.mktemp("page") / "thin.html"
-    write_page(path, make_page(scene, QueryEngine(scene, load_text_encoder), "Thin"))
+    write_whole(path, make_page(scene, QueryEngine(scene, load_text_encoder), "Thin")[0])
     return path
 
 
@@ -91,7 +92,7 @@ def tab(browser: Any, page: Path) -> Iterator[Tab]:
 
 
 def exported(tmp_path: Path, scene: Scene, engine: QueryEngine | None = None) -> Path:
-    write_page(tmp_path / "a.html", make_page(scene, engine, "A"))
+    write_whole(tmp_path / "a.html", make_page(scene, engine, "A")[0])
     return tmp_path / "a.html"
 
 
@@ -314,7 +315,8 @@ def test_page_without_small_encoder_knows_encoded_phrases(browser: Any, demo: Sc
     scene = demo.take(np.arange(0, len(demo.gaussians), 8))
     encoder = Fluent(scene.language.canonical)
     engine = QueryEngine(scene, lambda name: encoder)
-    report = write_page(tmp_path / "a.html", make_page(scene, engine, "A"))
+    text, report = make_page(scene, engine, "A")
+    write_whole(tmp_path / "a.html", text)
     assert (report.free_text, report.why_not, report.phrases > 2000) == (False, "", True)
     with open_tab(browser, tmp_path / "a.html") as tab:
         assert tab.run("async () => (await langsplat).page.language.keys.size") == report.phrases
@@ -329,7 +331,8 @@ def test_markup_in_names_is_shown_as_text(browser, demo, engine, tmp_path):
     scene = replace(scene, cameras=tuple(replace(camera, name=MARKUP) for camera in demo.cameras[:3]))
     path = tmp_path / "a.html"
     first, notes = [replace(demo.cameras[4], name="here")], [(MARKUP, (0.0, 0.0, 0.0))]
-    write_page(path, make_page(scene, other, MARKUP + "{{DATA}}{{SCRIPT}}", first=first, notes=notes))
+    text, _ = make_page(scene, other, MARKUP + "{{DATA}}{{SCRIPT}}", first=first, notes=notes)
+    write_whole(path, text)
     with open_tab(browser, path) as tab:
         assert tab.page.title() == MARKUP + "{{DATA}}{{SCRIPT}}"
         assert MARKUP in tab.page.inner_text("h1")
@@ -732,8 +735,8 @@ def test_unsearchable_scenes_are_shown(browser: Any, tmp_path: Path) -> None:
     pixels, depths = alone.project(scene.gaussians.means)
     assert alone.in_image(pixels, depths).mean() > 0.9  # all but floaters, and no smaller than they must be
     assert (np.ptp(pixels, axis=0) > 0.7 * np.array([alone.width, alone.height])).any()
-    page = make_page(scene, QueryEngine(scene, no_encoder), "A", notes=[("here", (0.0, 0.0, 0.0))])
-    report = write_page(tmp_path / "a.html", page)
+    text, report = make_page(scene, QueryEngine(scene, no_encoder), "A", notes=[("here", (0.0, 0.0, 0.0))])
+    write_whole(tmp_path / "a.html", text)
     assert "autoencoder" in report.why_not
     with open_tab(browser, tmp_path / "a.html") as tab:
         assert tab.page.locator("#search").is_hidden()

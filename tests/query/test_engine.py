@@ -44,7 +44,7 @@ from langsplat_core.scene import (
 )
 from langsplat_core.semantics import relevancy as relevancies
 from langsplat_core.semantics.encoders import DEMO, OPEN_MODEL, keep_calibration
-from langsplat_core.semantics.relevancy import FEWEST, Scale, latent_relevancy, relevancy, relevancy_of
+from langsplat_core.semantics.relevancy import FEWEST, Scale, latent_relevancy, relevancy_of
 from tests.support.fakes import (
     DIM,
     PER_BLOB,
@@ -478,12 +478,10 @@ def test_published_relevancy_is_the_minimum_of_pairwise_softmaxes(linear):
     vectors = codec.decode(latents).astype(np.float64)
     pairs = np.exp(10 * (vectors @ phrases.T))[..., None], np.exp(10 * (vectors @ canonical.T))[:, None]
     want = (pairs[0] / (pairs[0] + pairs[1])).min(-1)
-    np.testing.assert_allclose(relevancy(vectors, phrases, canonical), want, atol=1e-12)
     for length in (1.0, 0.02):
         got = latent_relevancy(codec, np.float32(length) * latents, phrases, canonical)
         np.testing.assert_allclose(got, want, atol=1e-5)
     assert (latent_relevancy(codec, 0 * latents, phrases, canonical) == 0).all()
-    assert relevancy(vectors[:1], vectors[:1], vectors[:1]).tolist() == [[relevancies.FLOOR]]
 
 
 def test_cells_converge_to_exact_decoding():

@@ -21,8 +21,9 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.cameras import write_cameras
+from langsplat_core.io.files import write_whole
 from langsplat_core.io.scenes import check_keeps, save_scene, scene_files
-from langsplat_core.pipeline.webpage import make_page, write_page
+from langsplat_core.pipeline.webpage import make_page
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
@@ -357,7 +358,8 @@ def _page(viewer: Viewer) -> Callable[[Path, Scene, Progress], str]:
 
     def write(out: Path, scene: Scene, progress: Progress) -> str:
         engine = None if scene.language is None else services.engine(scene)
-        report = write_page(out, make_page(scene, engine, out.stem, progress, first, notes))
+        text, report = make_page(scene, engine, out.stem, progress, first, notes)
+        write_whole(out, text)
         return f"saved {out}: {report.bytes / 1e6:.1f} MB, opens in any browser"
 
     return write
