@@ -70,6 +70,8 @@ class Export:
             engine = None
             if scene.language is not None:
                 engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
+                if self.encoder:  # without it, a page is made that knows the phrasebook alone
+                    engine.load_encoder()
             first = [camera for camera in scene.cameras if self.view and camera.name == self.view][:1]
             if self.view and not first:
                 raise InputError(f"--view {self.view}: {self.scene} has no camera of this name")
@@ -84,10 +86,8 @@ class Export:
 class Convert:
     """Write any readable scene in another format, with its language field and cameras beside it.
 
-    A .ply (INRIA's) keeps everything. Rounded are .spz (Niantic's) and .sog (PlayCanvas's), a tenth of it,
-    and .glb, .gltf (KHR_gaussian_splatting), .usdc and .usda; .splat has no view dependence; losses are said.
-    Checkpoints of LangSplat, LangSplatV2, Occam's LGS, OpenGaussian, Feature-3DGS and 3D Gaussian Splatting
-    become such a scene (see docs/files.md for what to give), and a scene becomes checkpoints.
+    A .ply keeps everything; what another format rounds or has no room for is printed. Checkpoints of other
+    methods become a scene, and a scene becomes checkpoints: docs/files.md has what to give.
     """
 
     source: tyro.conf.Positional[Path]

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, sigmoid, unit
-from langsplat_core.errors import InputError, Tell, malformed
+from langsplat_core.errors import InputError, Tell, malformed, report_loss
 from langsplat_core.io.files import write_whole
 from langsplat_core.io.hostile import open_for_reading
 from langsplat_core.scene import Gaussians, Scene
@@ -30,8 +30,11 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 _ODD = ["", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x"]
 
 
-def to_bytes(values: Array) -> Array:
-    """Return numbers rounded and clipped to uint8."""
+def to_bytes(values: Array, what: str = "") -> Array:
+    """Return numbers (N, ...) rounded and clipped to uint8; reports how many rows of `what` that cuts."""
+    cut = ((values < -2) | (values > 257)).any(axis=tuple(range(1, values.ndim)))  # by more than rounding
+    if what and cut.any():
+        report_loss("%s of %d of %d Gaussians are beyond it and are cut", what, cut.sum(), cut.size)
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
@@ -126,7 +129,7 @@ def read_splat_scene(path: Path | str) -> Scene:
 def write_splat(path: Path | str, scene: Scene) -> None:
     """Write the Gaussians in their order, atomically, without their view dependence.
 
-    Colours and opacities are rounded to 1/255 (colours are clipped to 0..1), rotations to 1/128 per
+    Colours and opacities are rounded to 1/255 (colours are cut to 0..1, and reported), rotations to 1/128 per
     component; positions and scales stay exact. A row that cannot be drawn is written with opacity 0.
     """
     gaussians, valid = scene.gaussians, scene.gaussians.valid()
@@ -139,7 +142,8 @@ def write_splat(path: Path | str, scene: Scene) -> None:
     rows = np.zeros(len(gaussians), _RECORD)
     rows["position"][valid] = drawn.means
     rows["scale"][valid] = np.exp(drawn.log_scales)
-    rows["colour"][valid, :3] = to_bytes((0.5 + C0 * drawn.sh[:, 0].astype(np.float64)) * 255)
+    colours = 0.5 + C0 * drawn.sh[:, 0].astype(np.float64)
+    rows["colour"][valid, :3] = to_bytes(colours * 255, ".splat: the colours")
     rows["colour"][valid, 3] = to_bytes(sigmoid(drawn.opacity_logits) * 255)
     rows["rotation"][valid] = to_bytes(unit(drawn.quats_wxyz.astype(np.float64)) * 128 + 128)
     write_whole(path, rows.tobytes())

@@ -197,11 +197,8 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
         single = world.astype(np.float32)
     if ((single == world) | ~np.isfinite(world)).all():
         step = np.spacing(np.abs(scene.origin).max(), dtype=np.float32)
-        report_loss(
-            "%s: positions were rounded to steps of %g units, as float32 holds them so far from zero; export "
-            "them as double, or about an origin near them",
-            *(path, step),
-        )
+        what = "as float32 holds them so far from zero; export them as double, or about an origin near them"
+        report_loss("%s: positions were rounded to steps of %g units, %s", path, step, what)
     return scene
 
 

@@ -259,10 +259,9 @@ def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub
     """Write .spz version 3 or 4 in axes of `AXES`, which it records, atomically; rows keep their order.
 
     Positions are rounded to 1/4096 world unit, or finer for smaller Gaussians; scales to 1/16 in the
-    logarithm, within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1 (other writers round them to 1/16
-    and 1/8, for smaller files); colours and opacities to 1/255. A row that cannot be drawn is written with
-    opacity 0; sizes beyond the range are cut and reported. Raises InputError for a scene too large for 24
-    bits per coordinate, or if most sizes are beyond the range.
+    logarithm, within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1; colours and opacities to 1/255.
+    A row that cannot be drawn is written with opacity 0; what is beyond a range is cut and reported. Raises
+    InputError for a scene too large for 24 bits per coordinate, or if most sizes are beyond the range.
     """
     gaussians, valid = scene.gaussians, scene.gaussians.valid()
     drawn = mirrored(gaussians.take(valid), _signs_to_rdf(AXES[axes]))  # the map is its own inverse
@@ -279,10 +278,10 @@ def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub
     coded = {
         "positions": codes[..., None].view(np.uint8)[..., :3].reshape(-1, 9),
         "alphas": to_bytes(sigmoid(drawn.opacity_logits) * 255)[:, None],
-        "colours": to_bytes((drawn.sh[:, 0] * COLOUR_SCALE + 0.5) * 255),
+        "colours": to_bytes((drawn.sh[:, 0] * COLOUR_SCALE + 0.5) * 255, ".spz: the colours"),
         "scales": to_bytes((drawn.log_scales.clip(SMALLEST, LARGEST) + 10) * 16),
         "rotations": _rotation_codes(drawn.quats_wxyz),
-        "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128),
+        "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128, ".spz: the coefficients"),
     }
     flags = EXTENDED | (ANTIALIASED if scene.antialiased else 0)
     widths = _Header(MAGIC, version, 0, gaussians.sh_degree, 0, 0, 0).widths

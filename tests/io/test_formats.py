@@ -74,9 +74,11 @@ def check_bytes(got: Gaussians, want: Gaussians) -> None:
     assert np.abs(sigmoid(got.opacity_logits) - sigmoid(want.opacity_logits)).max() <= 0.5 / 255 + 1e-6
 
 
-def test_splat_is_written_and_read_back(tmp_path):
+def test_splat_is_written_and_read_back(tmp_path, caplog):
     want = random_gaussians(200, sh_degree=2)
+    want.sh[:3, 0] = 2.5  # a little brighter than white
     write_splat(tmp_path / "a.splat", Scene(want))
+    assert caplog.messages == [".splat: the colours of 3 of 200 Gaussians are beyond it and are cut"]
     assert (tmp_path / "a.splat").read_bytes() == splat_bytes(want)  # as of another encoder
     got = read_splat_scene(tmp_path / "a.splat").gaussians
     assert got.sh_degree == 0
@@ -145,13 +147,15 @@ def test_spz_is_exact_to_the_quantisation(put, version, degree):
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize(("axes", "turn"), [("rub", RUB), ("rdf", np.eye(3))])
-def test_spz_is_written_as_by_another_encoder(tmp_path, degree, antialiased, version, axes, turn):
+def test_spz_is_written_as_by_another_encoder(tmp_path, caplog, degree, antialiased, version, axes, turn):
     want = random_gaussians(150, sh_degree=degree)
+    want.sh[:7, -1, 1] = -1.5
     write_spz(tmp_path / "a.spz", Scene(want, antialiased=antialiased), version, axes)
     record = struct.pack("<III", 0xADBE0003, 4, AXES.index(axes.upper()) + 1)
     theirs = spz_bytes(want, version, flags=antialiased + 2, records=record, turn=turn)
     unzipped = gzip.decompress if version == 3 else bytes
     assert unzipped((tmp_path / "a.spz").read_bytes()) == unzipped(theirs)
+    assert (".spz: the coefficients of 7 of 150 Gaussians" in caplog.text) == (degree > 0)
     once = read_spz_scene(tmp_path / "a.spz").gaussians
     write_spz(tmp_path / "b.spz", Scene(once, antialiased=antialiased))  # a second turn loses nothing more
     again = read_spz_scene(tmp_path / "b.spz").gaussians

@@ -746,9 +746,6 @@ def test_unsearchable_scenes_are_shown(browser: Any, tmp_path: Path) -> None:
 
 
 def test_export_command_writes_a_page_or_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    save_scene(tmp_path / "s.ply", Scene(random_gaussians(4)))
-    with pytest.raises(InputError, match=r"written as \.html"):
-        Export(tmp_path / "s.ply", tmp_path / "room.png").run()
     hidden = replace(random_gaussians(4), opacity_logits=np.full(4, -np.inf))
     save_scene(tmp_path / "h.ply", Scene(hidden))
     with pytest.raises(InputError, match="nothing to export"):

@@ -19,6 +19,9 @@ def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[st
     from langsplat_core.extensions.checkpoints.importing import import_scene, read_foreign  # imports torch
 
     foreign = read_foreign(request.paths, request.levels)
+    if not foreign.told and (request.encoder is not None or request.phrases or request.levels):
+        what = "--encoder, --levels and --phrases are of features, and it has none; leave them out"
+        raise InputError(f"{request.paths[0]}: {what}")
     scene, loss = import_scene(foreign, request.encoder, request.phrases, request.codec, progress)
     lines = [f"{foreign.method}: {'; '.join(foreign.notes)}"]
     field = scene.language

@@ -484,9 +484,8 @@ def test_clusters_are_a_codebook(tmp_path, clip, number):
     index[:6] = range(6)
     index[6] = number  # of none
     np.savez(tmp_path / "cluster_lang.npz", leaf_feat=vectors, leaf_ind=index)
-    path = save_model(
-        tmp_path / "c.pth", GAUSSIANS, tensor(np.zeros((COUNT, 6))), tensor(np.zeros((COUNT, 6)))
-    )
+    zeros = tensor(np.zeros((COUNT, 6)))
+    path = save_model(tmp_path / "c.pth", GAUSSIANS, zeros, zeros)
     scene, _ = import_scene(read_foreign([path, tmp_path / "cluster_lang.npz"]), clip)
     field = scene.language
     seen = (index != 1) & (index < number)
@@ -532,5 +531,5 @@ def test_checkpoints_become_a_scene(tmp_path, checkpoints, capsys):
     scene = load_scene(tmp_path / "a.ply")
     assert set(scene.language.phrasebook) == {"apple", "red mug"}
     assert (scene.language.confidence == 1).all()
-    words = ("convert", tmp_path / "a.ply", tmp_path / "out", "--to", "langsplat")
-    assert "--codec.kind autoencoder" in refusal(capsys, *words)
+    for options, told in (("--to langsplat", "--codec.kind autoencoder"), ("--encoder demo", "it has none")):
+        assert told in refusal(capsys, "convert", tmp_path / "a.ply", tmp_path / "b.ply", *options.split())
