@@ -165,13 +165,20 @@ def merge(first: Scene, second: Scene) -> Scene:
 
     Gaussians of a scene without a language field get no feature. Settings of the whole scene and equal words
     are those of `first`; properties that only one has are left out. Raises InputError if only one is
-    antialiased, or if the language fields cannot be merged.
+    antialiased, if the language fields cannot be merged, and for scenes so far apart that float32 would round
+    the positions of `second` by more than the size of most of its Gaussians.
     """
     if first.antialiased != second.antialiased:
         raise InputError(
             "one scene was trained with antialiasing (Mip-Splatting) and the other without, so that no image "
             "is right for both; train one of them again"
         )
+    far = np.abs(second.in_world(second.bounds()[0]) - first.origin).max()
+    if len(second.gaussians) and np.log(np.spacing(np.float32(far))) > np.median(
+        second.gaussians.log_scales.max(axis=1)
+    ):
+        hint = "`langsplat register` finds what moves one to the other"
+        raise InputError(f"the scenes lie {far:.2g} units apart, too far for float32 positions; {hint}")
     second = place_scene(second, origin=first.origin)
     shared = [
         name for name, values in first.extras.items()

@@ -317,12 +317,13 @@ def test_merge_keeps_what_both_scenes_show_once(tmp_path, capsys):
     assert once(merge(first, Scene(random_gaussians(0))), len(first.gaussians), 0.1)[1] == 0
 
 
-def test_merge_refuses_scenes_of_two_encoders():
+def test_merge_refuses_scenes_of_two_encoders_or_far_apart():
     a, b = scene(0, "mug"), scene(5, "vase")
-    with pytest.raises(InputError, match="two text encoders"):
-        merge(a, replace(b, language=replace(b.language, encoder_id="another")))
-    with pytest.raises(InputError, match="antialiasing"):
-        merge(a, replace(b, antialiased=True))
+    far = np.full(3, 5e8)
+    other = {"language": replace(b.language, encoder_id="another"), "antialiased": True, "origin": far}
+    for told, name in zip(("two text encoders", "antialiasing", "units apart"), other, strict=True):
+        with pytest.raises(InputError, match=told):
+            merge(a, replace(b, **{name: other[name]}))
     nothing = Scene(random_gaussians(0))
     assert len(merge(a, nothing).gaussians) == len(merge(nothing, a).gaussians) == N
 
@@ -353,9 +354,8 @@ def test_scenes_are_laid_onto_each_other_and_merged(tmp_path, at):
     assert run("register", tmp_path / "b.ply", tmp_path / "a.ply", "--out", tmp_path / "to.json") == 0
     found = np.array(json.loads((tmp_path / "to.json").read_text())["matrix"])
     corners = at + np.eye(3)
-    np.testing.assert_allclose(
-        turn.points(corners) @ found[:3, :3].T + found[:3, 3], corners, rtol=0, atol=0.02
-    )
+    got = turn.points(corners) @ found[:3, :3].T + found[:3, 3]
+    np.testing.assert_allclose(got, corners, rtol=0, atol=0.02)
     told = ("--transform", tmp_path / "to.json")
     assert run("merge", tmp_path / "a.ply", tmp_path / "b.ply", "--out", tmp_path / "both.ply", *told) == 0
     both, count = load_scene(tmp_path / "both.ply"), len(room.gaussians)
