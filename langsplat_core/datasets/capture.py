@@ -91,12 +91,15 @@ class Capture:
         count to `DECIMALS`, so that a work folder also resumes on another processor, whose products of
         matrices differ in their last digits.
         """
-        digest, length = hashlib.blake2b(digest_size=16), near_power(self.extent())
-        for camera, image in ((self.cameras[i], self.images[i]) for i in indices):
+        digest = hashlib.blake2b(digest_size=16)
+        length = near_power(self.extent())
+        for index in indices:
+            camera = self.cameras[index]
             digest.update(repr((camera.name, camera.intrinsics)).encode())
             digest.update(_rounded(camera.world_to_camera / (1, 1, 1, length)).tobytes())
-            digest.update(np.ascontiguousarray(image).data)
-        for mask in (self.mask(i) for i in indices):
+            digest.update(np.ascontiguousarray(self.images[index]).data)
+        for index in indices:
+            mask = self.mask(index)
             digest.update(b"" if mask is None else np.packbits(mask).tobytes())
         digest.update(b"cut out" * self.cut_out)
         digest.update(_rounded(self.points / length).tobytes())
@@ -192,10 +195,8 @@ def report_lost_points(good: Array, source: str) -> None:
 # Photographs developed into a capture.
 
 
-def _is_cut_out(alpha: Array | None) -> bool:
+def _is_cut_out(alpha: Array) -> bool:
     """Return True where most of a photograph, or of its edge, is transparent."""
-    if alpha is None:
-        return False
     empty = alpha < SOLID
     edge = np.concatenate([empty[0], empty[-1], empty[:, 0], empty[:, -1]])
     return bool(empty.mean() > 0.5 or edge.mean() > 0.5)
@@ -280,16 +281,17 @@ def _report(told: Sequence[tuple[str, str]], masks: Sequence[Array | None]) -> N
 
 def _cut_out(masks: Sequence[Array | None], alphas: Sequence[Array | None], config: DatasetConfig) -> bool:
     """Return True if transparent pixels are empty background, and report how transparency is taken."""
-    if not (seen := sum(alpha is not None for alpha in alphas)):
+    given = [alpha for alpha in alphas if alpha is not None]
+    if not given:
         return False
-    cut_out = config.alpha == "background" or (
-        config.alpha == "auto" and 2 * sum(map(_is_cut_out, alphas)) > len(alphas)
-    )
+    cut_out = config.alpha == "background"
+    if config.alpha == "auto":
+        cut_out = 2 * sum(map(_is_cut_out, given)) > len(alphas)
     cut_out = cut_out and all(mask is None for mask in masks)  # masks say what does not count
-    said = "an empty background" if cut_out else "no part of the thing, and does not count"
+    said = "an empty background" if cut_out else "no part of the subject, and does not count"
     say = report_loss if config.alpha == "auto" else log.info
     message = "what is transparent in %d of %d photographs is %s; else: --alpha %s"
-    say(message, seen, len(alphas), said, "mask" if cut_out else "background")
+    say(message, len(given), len(alphas), said, "mask" if cut_out else "background")
     return cut_out
 
 
@@ -370,7 +372,8 @@ def with_taken(capture: Capture) -> Capture:
     facts = [exif_facts(photo.path) for photo in capture.photos]
     dates = sorted(each.taken for each in facts if each.taken)
     places = np.array([each.place for each in facts]).reshape(-1, 2)
-    named, said = np.isfinite(places).all(1), []
+    named = np.isfinite(places).all(1)
+    said = []
     if dates:
         said.append(f"{dates[0]:%Y-%m-%d %H:%M} to {dates[-1]:%Y-%m-%d %H:%M}")
     if named.any():

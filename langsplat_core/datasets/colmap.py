@@ -248,9 +248,10 @@ def _text_images(text: str, tell: Tell) -> list[ModelImage]:
             continue
         _, *pose, camera_id, name = line.split(maxsplit=9)
         images.append(_image(name, int(camera_id), np.array(pose, np.float64)))
-        if at < len(lines):  # every second line lists the 2D points of the image before it
-            paired = _lists_2d_points(lines[at])
-            bare, at = bare + (not paired), at + paired
+        if at < len(lines) and _lists_2d_points(lines[at]):  # the 2D points of this image
+            at += 1
+        elif at < len(lines):
+            bare += 1
     if stray or bare:
         tell(f"{stray} lines belong to no image, and {bare} images lack their 2D points")
     return images
@@ -348,11 +349,11 @@ def load_colmap(folder: Path, model_folder: Path, config: DatasetConfig, progres
 def located_photos(model: SparseModel, folder: Path) -> list[Photo]:
     """Return the model's images as photographs in `folder`, each name once."""
     find = finder(folder)
-    return [
-        Photo(path, name, model.lenses[image.camera_id], image.world_to_camera, mask=mask_beside(path))
-        for name, image in {image.name: image for image in model.images}.items()
-        for path in (find(name),)
-    ]
+    photos = []
+    for name, image in {image.name: image for image in model.images}.items():
+        path, lens = find(name), model.lenses[image.camera_id]
+        photos.append(Photo(path, name, lens, image.world_to_camera, mask=mask_beside(path)))
+    return photos
 
 
 def good_points(model: SparseModel, source: str = "") -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 A point in the camera's frame has *normalised* coordinates (x/z, y/z). A distortion maps normalised to
 distorted coordinates, and the pixel position is ``(fx * x_d + cx, fy * y_d + cy)``, with pixel centres
 at +0.5. Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fisheye camera model".
-Everything here is float64; it is the reference that resampling follows.
+Positions are float64; only the pixels that are interpolated at them are not.
 """
 
 from dataclasses import dataclass
@@ -113,11 +113,10 @@ def _radial_profile(distortion: Distortion) -> tuple[Array, Array]:
     return radii[:end], profile
 
 
-def _jacobian(distortion: Distortion, xy: Array, step: float = 1e-6) -> Array:
+def _jacobian(distortion: Distortion, xy: Array) -> Array:
     """Return (N, 2, 2) by central differences; Newton's method needs no better."""
-    columns = [
-        (distortion(xy + offset) - distortion(xy - offset)) / (2 * step) for offset in np.eye(2) * step
-    ]
+    step = 1e-6
+    columns = [(distortion(xy + move) - distortion(xy - move)) / (2 * step) for move in np.eye(2) * step]
     return np.stack(columns, -1)
 
 
@@ -160,7 +159,7 @@ def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
     left, top, right, bottom = _inner_rectangle(intrinsics)
     wide, high = intrinsics.fx * (right - left), intrinsics.fy * (bottom - top)
     if not (wide >= 1 and high >= 1):
-        raise InputError(f"a lens of fx {intrinsics.fx:g} leaves no undistorted picture; calibrate it again")
+        raise InputError(f"a lens of fx {intrinsics.fx:g} leaves no undistorted image; calibrate it again")
     scale = min(1.0, max_side / max(wide, high))
     width, height = max(1, int(wide * scale)), max(1, int(high * scale))
     fx, fy = intrinsics.fx * scale, intrinsics.fy * scale

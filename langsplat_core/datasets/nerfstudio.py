@@ -120,17 +120,19 @@ def _without_camera(photos: Mapping[str, Photo], frames: Sequence[Json]) -> set[
     return {p.name for p in beside if known.isdisjoint(accumulate(p.stem.split("_"), "{}_{}".format))}
 
 
-TOGETHER = (("fl_x", "fl_y"), ("cx", "cy"), ("w", "h"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3", "k4"))
+TOGETHER = ("fl_x", "fl_y"), ("cx", "cy"), ("w", "h")  # keys of which a file has all or none
+OF_LENSES = ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3", "k4")  # perspective, fisheye: it has one of these
 
 
 def _guesses(values: Json) -> Iterator[str]:
     """Yield what had to be guessed of a lens; the field of view alone is a whole one."""
     known = values.keys()
-    groups = [group for group in TOGETHER if known & set(group)]
-    lenses = [group for group in groups if group[0] == "k1"]
-    groups = [group for group in groups if group[0] != "k1" or not any(known >= set(one) for one in lenses)]
-    for absent in ([key for key in group if key not in known] for group in groups):
-        if absent and not (absent == ["fl_y"] and "camera_angle_y" in known):
+    is_whole_lens = any(known >= set(keys) for keys in OF_LENSES)
+    for keys in TOGETHER if is_whole_lens else (*TOGETHER, *OF_LENSES):
+        absent = [key for key in keys if key not in known]
+        if absent == ["fl_y"] and "camera_angle_y" in known:
+            continue
+        if 0 < len(absent) < len(keys):
             yield f"{', '.join(absent)} not given: taken from the others, or as none"
     if "fl_x" in known and not known & {"cx", "cy"}:
         yield "cx and cy not given: the middle of the photograph is taken"

@@ -217,14 +217,17 @@ def exif_facts(path: Path) -> ExifFacts:
     with suppress(TypeError, ValueError):  # absent, or not what the standard says
         taken = datetime.strptime(str(inner.get(_TAKEN) or exif.get(_CHANGED)), "%Y:%m:%d %H:%M:%S")
     with suppress(KeyError, TypeError, ValueError, ZeroDivisionError):
-        latitude, longitude = (
-            sum(float(part) / by for by, part in zip((1, 60, 3600), places[tag], strict=True))
-            * signs[places[tag - 1]]
-            for tag, signs in ((2, {"N": 1, "S": -1}), (4, {"E": 1, "W": -1}))
-        )
+        latitude = _degrees(places[2]) * {"N": 1, "S": -1}[places[1]]
+        longitude = _degrees(places[4]) * {"E": 1, "W": -1}[places[3]]
         if abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0, 0):
             place = latitude, longitude
     return ExifFacts(taken, place, " ".join(str(exif[tag]) for tag in (_MAKER, _MODEL) if tag in exif))
+
+
+def _degrees(parts: Any) -> float:
+    """Return an angle of EXIF data, which is degrees, minutes and seconds, in degrees."""
+    degrees, minutes, seconds = map(float, parts)
+    return degrees + minutes / 60 + seconds / 3600
 
 
 # Reading them.

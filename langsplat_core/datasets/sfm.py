@@ -30,7 +30,7 @@ SIDE = 1600  # px, longer side of the images that features are sought in
 SMALL = 1000  # px, the same in a first attempt; images up to this size are doubled in the second
 TRIED = "small.tried"  # file in a workspace that marks the attempt with small images as done
 MIN_PHOTOS = 3
-FEWEST = 0.5  # least share of the photographs that must be located
+LEAST_LOCATED = 0.5  # share of the photographs that must be located
 
 log = logging.getLogger("langsplat")
 
@@ -67,7 +67,9 @@ def load_photos(
         if row not in matches.located:
             lost.setdefault(matches.why(row), []).append(name)
     found = len(matches.located)
-    if model is None or (found < max(MIN_PHOTOS, FEWEST * len(files)) and not config.allow_few_cameras):
+    if model is None or (
+        found < max(MIN_PHOTOS, LEAST_LOCATED * len(files)) and not config.allow_few_cameras
+    ):
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
         raise InputError(
             f"only {found} of {len(files)} photographs could be located together "
@@ -80,11 +82,11 @@ def load_photos(
         share = f"{sum(map(len, lost.values()))} of {len(files)} photographs"
         what = "could not be located and are left out"
         report_loss("%s %s (%s); %s", share, what, _listed(lost, 5), matches.advice())
-    located = [
-        replace(copy, path=path, label=labels[path], upright=True, mask=photos.mask_beside(path))
-        for copy in located_photos(model, workspace / "images")
-        for path in (files[copy.label],)
-    ]
+    located = []
+    for copy in located_photos(model, workspace / "images"):
+        path = files[copy.label]
+        mask = photos.mask_beside(path)
+        located.append(replace(copy, path=path, label=labels[path], upright=True, mask=mask))
     return replace(develop(located, config, progress, *good_points(model)), matches=matches)
 
 
@@ -228,7 +230,7 @@ def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Pro
 def _triangulated(
     capture: Capture, views: Sequence[int], work: Path, progress: Progress
 ) -> tuple[Array, Array, str]:
-    """Return points, their colours, and why there are none, for people; "" where nothing failed."""
+    """Return points, their colours, and why there are none, in words; "" where nothing failed."""
     workspace = workspaces.open_workspace(work, ["known poses", 3, SIDE, capture.digest(views)])
     try:
         if not model_suffix(workspace / "sparse"):

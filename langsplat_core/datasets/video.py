@@ -12,6 +12,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.colour import HLG, PQ, UNSPECIFIED, to_srgb
+from langsplat_core.datasets.sfm import MIN_PHOTOS
 from langsplat_core.errors import FormatError, InputError, Tell, optional_imports, printable_line, report_loss
 from langsplat_core.io.files import shown
 from langsplat_core.io.hostile import MOST_PIXELS, open_for_reading
@@ -19,7 +20,6 @@ from langsplat_core.progress import Progress, silent
 
 # The content chooses the demuxer: of text it may be one that asks the network, or reads other files.
 ALLOWED = {"format_whitelist": "mov,matroska,avi,mpegts", "protocol_whitelist": "file"}
-FEWEST = 3  # images that finding cameras needs
 
 
 @optional_imports()
@@ -44,8 +44,8 @@ def kept_frames(video: Path, count: int, work: Path, progress: Progress = silent
     try:
         with open_for_reading(video)[0] as file, av.open(file, "r", options=dict(ALLOWED)) as container:
             written = _write(container, unfinished, count, progress)
-        if written < FEWEST:
-            raise InputError(f"{shown(video)}: has {written} images; at least {FEWEST} are needed")
+        if written < MIN_PHOTOS:
+            raise InputError(f"{shown(video)}: has {written} images; at least {MIN_PHOTOS} are needed")
         unfinished.rename(folder)
     # Damaged data, no stream of images, sizes that cannot be, or a place to read at that cannot be.
     except (av.FFmpegError, OSError, IndexError, ValueError, MemoryError) as error:
@@ -81,7 +81,8 @@ def _write(container: Any, folder: Path, count: int, progress: Progress) -> int:
         raise ValueError(f"pixels of {stream.sample_aspect_ratio}")
     told: set[str] = set()
     for frame in _decoded(container, stream, told.add):
-        share = (float(frame.time or first) - first) / max(last - first, 1e-9)
+        time = first if frame.time is None else float(frame.time)
+        share = (time - first) / max(last - first, 1e-9)
         span = min(int(share * count), count - 1)
         for done in [number for number in best if number < span]:
             _save(best.pop(done)[1], aspect, folder, told.add)

@@ -137,7 +137,8 @@ class Matches:
 
     def apart(self, groups: Sequence[Sequence[int]]) -> str:
         """Return in words what tells groups of rows apart beside matches; empty where nothing does."""
-        exif, found = self.exif or (ExifFacts(),) * len(self.names), []
+        exif = self.exif or (ExifFacts(),) * len(self.names)
+        found = []
         facts: dict[str, list[object]] = {
             "on other days": [each.taken and each.taken.date() for each in exif],
             "by other cameras": [each.camera or None for each in exif],
