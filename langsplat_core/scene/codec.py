@@ -1,7 +1,7 @@
 """Codecs, which compress CLIP vectors for Gaussians: unit vectors of D numbers to latents of d and back.
 
 They are fitted in `training.language.codec_fit`, and used in plain NumPy, without torch. Callers ask a codec
-for what they need (`cosines`, `distances`, `unique`) and never which kind it is.
+for what they need (`cosines`, `distances`, `unique`), not which kind it is.
 """
 
 import math
@@ -17,7 +17,7 @@ from langsplat_core.arrays import Array, check_array, pieces, unit
 from langsplat_core.errors import quoted
 
 SHORTEST = 1e-6  # a numeric latent of a smaller norm encodes no vector
-LARGEST = 65_535  # codewords: indices are 16 bits, and one index stays free for "no codeword"
+MOST_CODEWORDS = 65_535  # indices are 16 bits, and one index stays free for "no codeword"
 ROWS = 16_384  # vectors compared with all codewords at a time
 LARGEST_SUM = 1e15  # largest activation of a network: its square still fits float32
 PAIRS = 65_536  # pairs of latents compared at a time
@@ -241,7 +241,7 @@ def _layers(tensors: dict[str, Array], part: str) -> Layers:
 class CodebookCodec(Codec):
     """K codewords, unit vectors in CLIP space; a latent is the index of one, so latents cannot be blended."""
 
-    vectors: Array  # (K, D) float32 unit vectors, 1 <= K <= LARGEST
+    vectors: Array  # (K, D) float32 unit vectors, 1 <= K <= MOST_CODEWORDS
     palette: Array  # (K, 3) float32 in [0, 1]; similar codewords have similar colours
     kind: ClassVar[str] = "codebook"
     names: ClassVar[tuple[str, ...]] = ("vectors", "colours")
@@ -251,8 +251,8 @@ class CodebookCodec(Codec):
     def __post_init__(self) -> None:
         dims = check_array("codec vectors", self.vectors, ("K", "D"), dtype=np.float32)
         check_array("codec colours", self.palette, ("K", 3), dims, dtype=np.float32)
-        if not 1 <= dims["K"] <= LARGEST:
-            raise ValueError(f"codec vectors: {dims['K']} codewords; from 1 to {LARGEST} can be numbered")
+        if not 1 <= dims["K"] <= MOST_CODEWORDS:
+            raise ValueError(f"codec vectors: {dims['K']} codewords; 1 to {MOST_CODEWORDS} can be numbered")
 
     @property
     def dims(self) -> tuple[int, int]:
@@ -303,15 +303,17 @@ def principal_colours(vectors: Array, weights: Array) -> Array:
     Channels are the first three principal components (the numbers themselves if c = 3) between their 2 % and
     98 % quantiles; 0.5 where missing or constant. weights: (K,) >= 0, of the vectors in both statistics.
     """
-    axes, colours = vectors.astype(np.float64), np.full((len(vectors), 3), 0.5, np.float32)
+    colours = np.full((len(vectors), 3), 0.5, np.float32)
+    occurs = np.flatnonzero(weights > 0)
+    if len(occurs) == 0:
+        return colours
+    axes = vectors.astype(np.float64)
     if vectors.shape[1] != 3:
         centred = axes - (weights @ axes) / max(float(weights.sum()), 1e-30)
-        _, principal = np.linalg.eigh(
-            (centred * weights[:, None]).T @ centred + 1e-12 * np.eye(axes.shape[1])
-        )
+        scatter = (centred * weights[:, None]).T @ centred
+        _, principal = np.linalg.eigh(scatter + 1e-12 * np.eye(axes.shape[1]))
         axes = centred @ principal[:, ::-1][:, :3]
-    occurs = np.flatnonzero(weights > 0)
-    for axis, values in enumerate(axes.T if len(occurs) else ()):
+    for axis, values in enumerate(axes.T):
         ends = np.quantile(values[occurs], (0.02, 0.98), weights=weights[occurs], method="inverted_cdf")
         low, high = ends.tolist()
         if high - low > 1e-6:

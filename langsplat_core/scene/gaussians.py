@@ -15,14 +15,17 @@ from langsplat_core.progress import Progress, silent
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16}  # degree -> coefficients per colour channel
 LARGEST_COEFFICIENT = 1e20  # of the spherical harmonics: sums of sixteen and their gradients fit a float32
 FAULTS = (  # reasons for which a row is not drawn
-    *("position not finite", "scale not a number or above e^80", "rotation zero or not finite"),
-    *("opacity not a number", "colour not finite or above 1e20"),
+    "position not finite",
+    "scale not a number or above e^80",
+    "rotation zero or not finite",
+    "opacity not a number",
+    "colour not finite or above 1e20",
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N anisotropic Gaussians as float32 arrays. Invalid rows stay: backends drop and count them."""
+    """N anisotropic Gaussians as float32 arrays. Invalid rows stay, but are not drawn."""
 
     means: Array  # (N, 3) world units
     log_scales: Array  # (N, 3) natural logarithm of world units; -inf is a flat axis
@@ -128,8 +131,11 @@ _OPAQUE = 0.999  # largest opacity: the optical depth of 1 is infinite
 _TINY = 1e-30
 _GRID_BITS = 20  # bits of each coordinate in a Morton code
 _SPACED = (  # shifts and masks that put two free bits behind every bit
-    *((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F)),
-    *((4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)),
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
 )
 
 

@@ -176,7 +176,7 @@ class NodeGaussians:
 
 # Calibration of one text encoder's cosines: the probability that what a phrase names is present at all.
 
-LARGEST = 1e6  # of the coefficients of a calibration: cosines are rounded to 1e-7
+LARGEST_COEFFICIENT = 1e6  # of a calibration: cosines are rounded to 1e-7
 Fits = tuple[float, float, float]  # the best at each level, see `semantics.relevancy.Scale.fit`
 
 
@@ -196,9 +196,11 @@ class PlattScaling:
 
     def __post_init__(self) -> None:
         slopes = (self.whole, self.finer)
-        bounded = (np.abs([self.constant, *slopes, self.common]) <= LARGEST).all()
+        bounded = (np.abs([self.constant, *slopes, self.common]) <= LARGEST_COEFFICIENT).all()
         if not (bounded and sum(slopes) > 0 and 0.5 <= self.found <= 1):
-            raise ValueError(f"{self}: expected up to {LARGEST:g}, rising with fits, and found in [0.5, 1]")
+            raise ValueError(
+                f"{self}: expected up to {LARGEST_COEFFICIENT:g}, rising with fits, and found in [0.5, 1]"
+            )
 
     def probability(self, fits: Fits, common: float = 0.0) -> float:
         """Return the probability, in (0, 1), that what a phrase names is present; common: its mean fit."""
@@ -282,10 +284,10 @@ class LanguageField:
         check_array("canonical", self.canonical, ("C", big), dtype=np.float32)
         if len(self.canonical) == 0:
             raise ValueError("canonical: a phrase is compared with one other at least")
-        if not (0 < self.temperature <= LARGEST and 0 <= self.found <= 1):
+        if not (0 < self.temperature <= LARGEST_COEFFICIENT and 0 <= self.found <= 1):
             raise ValueError(
                 f"temperature {self.temperature} and found {self.found}; expected a positive number up to "
-                f"{LARGEST:g} and one in [0, 1]"
+                f"{LARGEST_COEFFICIENT:g} and one in [0, 1]"
             )
         if self.tree is not None:
             check_array("leaves", self.tree.leaves, ("N",), dims)

@@ -30,7 +30,7 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         if not (0 < self.width < math.inf and 0 < self.height < math.inf):
-            raise ValueError(f"a picture of {self.width}x{self.height} pixels")
+            raise ValueError(f"an image of {self.width}x{self.height} pixels")
         if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and min(self.fx, self.fy) > 0):
             raise ValueError("focal lengths must be positive and the principal point finite")
 
@@ -45,8 +45,7 @@ class Intrinsics:
         scale = min(width / self.width, height / self.height)
         cx = (self.cx - self.width / 2) * scale + width / 2
         cy = (self.cy - self.height / 2) * scale + height / 2
-        inner = {"fx": self.fx * scale, "fy": self.fy * scale, "cx": cx, "cy": cy}
-        return replace(self, width=width, height=height, **inner)
+        return replace(self, width=width, height=height, fx=self.fx * scale, fy=self.fy * scale, cx=cx, cy=cy)
 
     @property
     def fov_degrees(self) -> float:
@@ -81,11 +80,9 @@ class Camera(Intrinsics):
         if not is_rotation(matrix[:3, :3]) or np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-3:
             raise ValueError("world_to_camera: no rotation and shift, but scaled, mirrored or transposed")
         if (self.width % 1, self.height % 1) != (0, 0):
-            raise ValueError(f"a picture of {self.width}x{self.height} pixels: they must be whole")
+            raise ValueError(f"an image of {self.width}x{self.height} pixels: they must be whole")
         # Sizes of calibrations may be 640.0, or of a type in which products overflow.
-        whole = {"width": int(self.width), "height": int(self.height), "world_to_camera": matrix}
-        for name, value in whole.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(width=int(self.width), height=int(self.height), world_to_camera=matrix)
 
     @property
     def position(self) -> Array:
@@ -174,9 +171,11 @@ def look_at(
 
 
 NEAR = 0.05  # near plane over the median depth that cameras see, or over the radius if they see nothing
-LEAST_NEAR = 0.01  # its least value over the median depth: Gaussians nearer than that are fog before the lens
+LEAST_NEAR = 0.01  # its least value over the median depth: what is nearer veils the scene
 NEAREST, NEAR_OF_NEAREST = 0.01, 0.25  # quantile of depths that counts as the nearest; near plane over it
 NEAR_CAMERAS = 16  # cameras that are evaluated at most
+SAMPLES = 20_000  # Gaussians, at most, that tell where a scene is and how it lies
+WIDEST = 0.2  # least focal length over an image's width, 136 degrees: shorter ones belong to no lens
 
 
 def near_plane(gaussians: Gaussians, cameras: Sequence[Camera], most: float | None = None) -> float:
@@ -264,8 +263,7 @@ def about_origin(points: Array) -> tuple[Array, Array]:
 
 
 # Opening view of a scene without cameras: from where the scene covers most cells of a grid; lengths in radii.
-SAMPLES, TURNS, REACH, CELL = 20_000, 12, 3.0, 0.06
-WIDEST = 0.2  # least focal length over an image's width, 136 degrees: shorter ones belong to no lens
+TURNS, REACH, CELL = 12, 3.0, 0.06
 MORE = 1.25  # how many times the cells of the first side another has to cover to be preferred
 
 
@@ -382,7 +380,8 @@ class Scene:
         side, ahead = self._level(up)
         some = self.gaussians.take(np.arange(0, len(self.gaussians), len(self.gaussians) // SAMPLES + 1))
         offsets = (some.means[some.valid()] - centre) / radius
-        heights, covered, directions = offsets @ up, [], []
+        heights = offsets @ up
+        covered, directions = [], []
         for angle in np.arange(TURNS) * np.pi / TURNS:
             directions.append(np.cos(angle) * side + np.sin(angle) * ahead)
             places = np.stack([offsets @ np.cross(up, directions[-1]), heights], 1)

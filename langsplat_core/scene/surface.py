@@ -18,7 +18,7 @@ from langsplat_core.scene.language import LEVELS, NO_NODE, Tree
 
 NEIGHBOURS = 16
 FAINTEST = 1e-3  # least weight of a Gaussian, so that no mean divides by zero
-SOME = 1 << 18  # Gaussians whose distances are held at a time: all of five million take gigabytes
+AT_ONCE = 1 << 18  # Gaussians whose distances are held at a time: all of five million take gigabytes
 REACH = 4.0  # times the median distance of a Gaussian's neighbours: what is farther is another surface
 
 
@@ -87,7 +87,7 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
     tree = scipy.spatial.cKDTree(positions)
     neighbours, near = np.empty((len(rows), k), np.int32), np.empty((len(rows), k), bool)
     reach, middle = np.empty(len(rows)), slice((k - 1) // 2, k // 2 + 1)
-    for part in pieces(len(rows), SOME):
+    for part in pieces(len(rows), AT_ONCE):
         distances, found = (of.reshape(-1, k) for of in tree.query(positions[part], k=k, workers=-1))
         neighbours[part] = found
         reach[part] = REACH * distances[:, middle].mean(1) + 1e-12  # the median: distances ascend

@@ -209,28 +209,25 @@ C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901
 def sh_basis(directions: Array, count: int) -> Array:
     """Return (N, count) basis values at unit directions from the camera to the Gaussians."""
     x, y, z = np.moveaxis(directions, -1, 0)
-    values = [np.full_like(x, C0)]
-    if count > 1:
-        values += [-C1 * y, C1 * z, -C1 * x]
-    if count > 4:
-        values += [
-            C2[0] * x * y,
-            -C2[0] * y * z,
-            C2[1] * (2 * z * z - x * x - y * y),
-            -C2[0] * x * z,
-            C2[2] * (x * x - y * y),
-        ]
-    if count > 9:
-        values += [
-            -C3[0] * y * (3 * x * x - y * y),
-            C3[1] * x * y * z,
-            -C3[2] * y * (4 * z * z - x * x - y * y),
-            C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y),
-            -C3[2] * x * (4 * z * z - x * x - y * y),
-            C3[4] * z * (x * x - y * y),
-            -C3[0] * x * (x * x - 3 * y * y),
-        ]
-    return np.stack(values, -1)
+    values = [
+        np.full_like(x, C0),
+        -C1 * y,
+        C1 * z,
+        -C1 * x,
+        C2[0] * x * y,
+        -C2[0] * y * z,
+        C2[1] * (2 * z * z - x * x - y * y),
+        -C2[0] * x * z,
+        C2[2] * (x * x - y * y),
+        -C3[0] * y * (3 * x * x - y * y),
+        C3[1] * x * y * z,
+        -C3[2] * y * (4 * z * z - x * x - y * y),
+        C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -C3[2] * x * (4 * z * z - x * x - y * y),
+        C3[4] * z * (x * x - y * y),
+        -C3[0] * x * (x * x - 3 * y * y),
+    ]
+    return np.stack(values[:count], -1)
 
 
 def sh_rotations(rotation: Array, degree: int) -> list[Array]:

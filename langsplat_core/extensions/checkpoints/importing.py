@@ -41,7 +41,7 @@ from langsplat_core.io.scenes import warn_of_undrawable
 from langsplat_core.pipeline.language_field import field_of
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import LEVELS, AutoencoderCodec, Codec, Scene, about_origin
-from langsplat_core.scene.codec import LARGEST, SHORTEST
+from langsplat_core.scene.codec import MOST_CODEWORDS, SHORTEST
 from langsplat_core.semantics.encoders import OPEN_MODEL, load_text_encoder
 from langsplat_core.training.language.codec_fit import (
     CodecReport,
@@ -267,7 +267,7 @@ def _codec(
     if foreign.codec is not None:
         return foreign.codec, None
     clusters = foreign.clusters
-    if clusters is not None and len(clusters.vectors) <= LARGEST and config.kind == "codebook":
+    if clusters is not None and len(clusters.vectors) <= MOST_CODEWORDS and config.kind == "codebook":
         counts = np.bincount(clusters.index[clusters.index >= 0], minlength=len(clusters.vectors))
         used = np.flatnonzero((counts > 0) & _has_feature(clusters.vectors))
         if len(used) == 0:

@@ -17,7 +17,7 @@ from langsplat_core.extensions.geometry.planes import cloud, sample_surface
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, LanguageField, Scene, Tree
-from langsplat_core.scene.codec import LARGEST, CodebookCodec, Codec, principal_colours
+from langsplat_core.scene.codec import MOST_CODEWORDS, CodebookCodec, Codec, principal_colours
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.language import NO_NODE
 from langsplat_core.scene.surface import surface_areas
@@ -281,10 +281,10 @@ def _one_codec(a: LanguageField, b: LanguageField) -> tuple[Codec, Array]:
             "codebooks can be joined; train both with --codec.kind codebook"
         )
     count = len(mine.vectors)
-    if count + len(theirs.vectors) > LARGEST:
+    if count + len(theirs.vectors) > MOST_CODEWORDS:
         raise InputError(
-            f"codebooks of {count} and {len(theirs.vectors)} words are more than {LARGEST} together; train "
-            "one of the scenes with a smaller --codec.size"
+            f"codebooks of {count} and {len(theirs.vectors)} words are more than {MOST_CODEWORDS} together; "
+            "train one of the scenes with a smaller --codec.size"
         )
     latents = both([a.latents, b.latents + np.uint16(count)], axis=1)
     vectors = both([mine.vectors, theirs.vectors])
