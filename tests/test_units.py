@@ -405,7 +405,7 @@ def changed(case: Case) -> Found:
         sh=np.where(chair[:, None, None], -gaussians.sh, gaussians.sh),
     )
     engine = QueryEngine(replace(scene, gaussians=other), load_text_encoder)
-    found = changes(case.engine, engine, load_lifting_rasterizer("cpu"))
+    found = changes(case.engine, engine)
     assert found
     return {
         "kinds": Same([change.kind for change in found]),

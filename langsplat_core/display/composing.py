@@ -1,4 +1,4 @@
-"""Composition of images from channels on the CPU: a compiled kernel in float32, one pass over the pixels.
+"""Composition of images from channels on the CPU: compiled kernels in float32.
 
 `compose.frag.glsl` does the same on a graphics device; software OpenGL would take longer for it than the
 rasterizer does.

@@ -23,13 +23,13 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster.cpu import projection
 from langsplat_core.raster.cpu.tiles import depth_order
-from langsplat_core.raster.protocol import LiftingView, dilation, farthest
+from langsplat_core.raster.protocol import LiftingView, dilation, far_plane
 from langsplat_core.scene import Camera, Gaussians, look_at
 
 DEVICE = "cuda"
 RAW = ("means", "log_scales", "quats_wxyz", "opacity_logits")  # of what is drawn
 has_device = torch.cuda.is_available
-FARTHEST = 1e10  # world units: gsplat's default far plane
+FAR = 1e10  # world units: gsplat's default far plane
 
 
 # N Gaussians: the raw fields of `Gaussians` without sh, by name, as float32 tensors on the CUDA device.
@@ -91,7 +91,7 @@ def draw(
         width=camera.width,
         height=camera.height,
         near_plane=settings.near,
-        far_plane=min(farthest(settings), FARTHEST),
+        far_plane=min(far_plane(settings), FAR),
         eps2d=added if settings.antialiased else fitted,
         sh_degree=sh_degree,
         packed=False,

@@ -122,7 +122,7 @@ Rasterizer = Backend[View]
 LiftingRasterizer = Backend[LiftingView]
 
 
-def farthest(settings: RasterSettings) -> float:
+def far_plane(settings: RasterSettings) -> float:
     """Return the largest camera z at which Gaussians are drawn, world units."""
     return math.inf if settings.far is None else settings.far
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array, rotation_matrices, sigmoid, unit
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.protocol import LiftingView, dilation, farthest, tangent_limits
+from langsplat_core.raster.protocol import LiftingView, dilation, far_plane, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.scene.transform import sh_basis
 
@@ -57,7 +57,7 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
     means = np.where(valid[:, None], gaussians.means, 0).astype(np.float64)
     # Not a matrix product: BLAS may round equal rows differently, and equal depths tie by index.
     points = (means[:, None, :] * camera.rotation).sum(2) + camera.world_to_camera[:3, 3]
-    drawn = valid & (points[:, 2] > settings.near) & (points[:, 2] <= farthest(settings))
+    drawn = valid & (points[:, 2] > settings.near) & (points[:, 2] <= far_plane(settings))
     x, y, z = np.where(drawn[:, None], points, (0.0, 0.0, 1.0)).T
 
     # Clamp where the Jacobian is taken, not where the mean goes (EWA splatting's linearisation

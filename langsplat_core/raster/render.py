@@ -24,6 +24,8 @@ from langsplat_core.errors import expect
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, protocol
 from langsplat_core.scene import Camera, Gaussians, Scene
 
+SLACK = 1e-3  # px by which footprints are widened where one pixel's are chosen: backends round
+
 
 @overload
 def view_of(
@@ -123,39 +125,23 @@ def pixel_weights(
     """Return (M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and (M,) float32 weights.
 
     The weights, alpha_i T_i > 0, add up to the pixel's alpha; rasterizer and settings as in `view_of`. Only
-    Gaussians that could reach the pixel are projected, in the scene's order, so that the weights are those of
-    the whole view. The pixel must lie in the image.
+    Gaussians whose footprint covers the pixel are blended, and the weights are those of the whole view. The
+    pixel must lie in the image.
     """
+    from langsplat_core.compiled import shared_workers  # numba takes a second to import
+    from langsplat_core.raster.cpu import projection
+
     column, row = pixel
     formed = scene.raster_settings() if settings is None else settings
-    near = np.flatnonzero(_may_reach(scene.gaussians, camera, pixel, formed))
+    rows, at = projection.rows_of(scene.gaussians), projection.kernel_camera(camera, formed)
+    found = projection.project_all(rows, at, shared_workers())
+    boxes = found.geometry[found.drawn]
+    across = np.abs(boxes[:, projection.MEAN_X] - column - 0.5) <= boxes[:, projection.HALF_WIDTH] + SLACK
+    down = np.abs(boxes[:, projection.MEAN_Y] - row - 0.5) <= boxes[:, projection.HALF_HEIGHT] + SLACK
+    near = found.drawn[across & down].astype(np.int64)
     view = (rasterizer or _cpu()).view(scene.gaussians.take(near), camera, formed)
     chosen = np.zeros((camera.height, camera.width, 1), np.float32)
     chosen[row, column] = 1
     weights = np.asarray(view.gather(chosen))[:, 0]
     painting = weights > 0
     return near[painting], weights[painting]
-
-
-def _may_reach(
-    gaussians: Gaussians, camera: Camera, pixel: tuple[int, int], settings: RasterSettings
-) -> Array:
-    """Return (N,) bool, True for every Gaussian whose footprint may cover the pixel, and for few others.
-
-    The footprint's covariance is J R S S^T R^T J^T + dilation, so its largest eigenvalue is at most
-    |J|^2 s_max^2 + dilation with |J|^2 <= (f/z)^2 (1 + (x/z)^2 + (y/z)^2), and f^2 of an orthographic camera;
-    beyond sqrt(2 ln(1 / alpha_min)) deviations alpha is below the cut-off. A clamped J is only smaller.
-    """
-    with np.errstate(all="ignore"):  # invalid rows are dropped by the view
-        points = gaussians.means @ camera.rotation.T.astype(np.float32)  # float32: a sieve
-        x, y, z = np.ascontiguousarray((points + camera.world_to_camera[:3, 3].astype(np.float32)).T)
-        largest = np.float32(max(camera.fx, camera.fy)) * np.exp(gaussians.log_scales.max(1))
-        if not camera.orthographic:
-            x, y = x / z, y / z
-            largest *= np.sqrt(1 + x * x + y * y) / z
-        variance = largest**2 + np.float32(protocol.dilation(camera, settings).added)
-        reach = np.sqrt(np.float32(2 * np.log(1 / settings.alpha_min)) * variance) + 1
-        across = np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5))
-        down = np.abs(camera.fy * y + np.float32(camera.cy - pixel[1] - 0.5))
-        in_front = (z > 0.999 * settings.near) & (z < 1.001 * protocol.farthest(settings))
-        return np.asarray(in_front & ~(np.maximum(across, down) > 1.01 * reach))

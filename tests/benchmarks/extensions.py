@@ -28,7 +28,6 @@ from langsplat_core.extensions.geometry.mesh import fuse
 from langsplat_core.extensions.geometry.occupancy import find_occupancy, floor_map, map_axes
 from langsplat_core.extensions.geometry.planes import find_room
 from langsplat_core.extensions.library.changes import Change, changes
-from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import join_gaussians
 from tests.benchmarks.oracles import surface_points
@@ -447,11 +446,11 @@ class Said:
 
 def measure_changes(room: Room, masks: MaskOrigin) -> Iterator[Said]:
     captures = {"unchanged": SecondCapture(room, None), "changed": SecondCapture(room, alter)}
-    variant, rasterizer = Variant("the method", masks), load_lifting_rasterizer("cpu")
+    variant = Variant("the method", masks)
     first = room.engine(variant, room.capture.cameras)
     for what, second in captures.items():
         other, start = second.engine(variant, second.capture.cameras), time.perf_counter()
-        said = changes(first, other, rasterizer)
+        said = changes(first, other)
         yield matched(room.seed, what, second.done, said, time.perf_counter() - start)
 
 

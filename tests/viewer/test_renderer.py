@@ -15,7 +15,7 @@ from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, HEAT_BASE, Channels, Subject, heats
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
-from langsplat_core.raster.protocol import farthest
+from langsplat_core.raster.protocol import far_plane
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from langsplat_viewer.actions import editing, settings, viewpoint
@@ -316,7 +316,7 @@ def test_near_plane_follows_the_camera_and_clips():
     plain = image_formation(scene, SIDE)
     assert image_formation(scene, SIDE, Clip(0.01, 7.0)) == replace(plain, far=7.0)
     assert image_formation(scene, SIDE, Clip(3.0)) == replace(plain, near=3.0)
-    assert (plain.far, farthest(plain)) == (None, np.inf)
+    assert (plain.far, far_plane(plain)) == (None, np.inf)
     assert image_formation(replace(scene, antialiased=True), SIDE) == replace(plain, antialiased=True)
     near, far = depth_range(scene.gaussians, SIDE, BOOK_ALONE)  # of what is left
     assert 4.4 < near < far < 5.6

@@ -21,7 +21,6 @@ from langsplat_core.query.describe import Describer, likely_name
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.inventory import NAMES
-from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import LEVELS, Scene
 from langsplat_core.scene.surface import surface_areas
@@ -94,7 +93,6 @@ class _Piece:
 def changes(
     first: QueryEngine,
     second: QueryEngine,
-    rasterizer: LiftingRasterizer,
     placed: Array | None = None,
     describers: tuple[Describer, Describer] | None = None,
     progress: Progress = silent,
@@ -109,7 +107,7 @@ def changes(
     if placed is None:
         placed = moving(second.scene.origin - first.scene.origin).matrix
     into = similarity(placed).matrix
-    before, after = _evidence(first.scene, second.scene, into, rasterizer, progress)
+    before, after = _evidence(first.scene, second.scene, into, progress)
     if all(sums[:, 0].sum() > sums[:, 1].sum() for sums in (before, after)):
         report_loss("most of each scene lies elsewhere in the other; align them by --register or --transform")
     home = (first, before, np.eye(4)), (second, after, into)
@@ -139,9 +137,7 @@ def changes(
 _CHANNELS = 10
 
 
-def _evidence(
-    first: Scene, second: Scene, into: Array, rasterizer: LiftingRasterizer, progress: Progress
-) -> tuple[Array, Array]:
+def _evidence(first: Scene, second: Scene, into: Array, progress: Progress) -> tuple[Array, Array]:
     """Return (N, `_CHANNELS`) float64 of the Gaussians of both scenes."""
     there = similarity(into)
     back = there.inverse()
@@ -153,7 +149,7 @@ def _evidence(
     for done, camera in enumerate(own + others):
         progress("comparing the scenes", done / len(own + others))
         pair = ((first, camera), (second, back.camera(camera)))
-        views = [view_of(scene, at, rasterizer) for scene, at in pair]
+        views = [view_of(scene, at) for scene, at in pair]
         drawn = [splat_colours(view, scene.gaussians) for view, (scene, _) in zip(views, pair, strict=True)]
         looks = [to_lab(np.clip(image.colours, 0, 1)) for image in drawn]
         near, far = views[0].median_depth(), there.scale * views[1].median_depth()

@@ -20,7 +20,6 @@ from langsplat_core.extensions.library.index import Answers, Hit, Library, find,
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine, searchable
-from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LEVELS
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.scene.transform import IDENTITY, between_worlds
@@ -158,7 +157,7 @@ class Changes:
                 report_loss("without names: %s", error)
             if self.register:
                 placed = registered(scenes[1], scenes[0], scaled=unsure, progress=progress).transform
-            found = changes(first, second, load_lifting_rasterizer("cpu"), placed, describers, progress)
+            found = changes(first, second, placed, describers, progress)
         if self.json:
             listed = [{name: getattr(change, name) for name in STATED} for change in found]
             print_json({"metres_per_unit": unit.metres, "changes": in_world(listed, origin)})

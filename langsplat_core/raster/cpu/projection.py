@@ -30,7 +30,7 @@ from langsplat_core.raster.cpu.lanes import (
     scatter,
     where_at_least,
 )
-from langsplat_core.raster.protocol import dilation, farthest, tangent_limits
+from langsplat_core.raster.protocol import dilation, far_plane, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.scene.transform import C0, C1, C2, C3
 
@@ -95,7 +95,7 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
         **plane,
         **{side: float(limit) for side, limit in limits.items()},
         near=float(settings.near),
-        far=float(farthest(settings)),
+        far=float(far_plane(settings)),
         dilation=float(added),
         fitted=float(fitted),
         alpha_min=float(settings.alpha_min),

@@ -227,7 +227,7 @@ def label_weights(
 # Views.
 
 _LINE = 64  # bytes of a cache line; arrays begin with one
-_SPARE_BLOCKS = 16  # a view takes five, its gradients seven
+_SPARE_BLOCKS = 16  # a view takes four, its gradients one more
 _IDLE = 60  # requests after which a block that was not reused is freed
 
 

@@ -24,7 +24,7 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster.cpu.tiles import depth_order
 from langsplat_core.raster.opengl import shader, splat_shaders
-from langsplat_core.raster.protocol import View, dilation, farthest, mean_depth, tangent_limits
+from langsplat_core.raster.protocol import View, dilation, far_plane, mean_depth, tangent_limits
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 
 # glcontext looks for libGL.so first; images without development packages have only the versioned names.
@@ -134,7 +134,7 @@ class SceneTextures:
                 f"rasterizer 'opengl': {len(kept)} Gaussians exceed this driver's texture size; "
                 "use --backend cpu"
             )
-        self.geometry = self._layers(self._geometry(kept), np.dtype(np.float32))
+        self.geometry = self._layers(self._geometry(kept), "f4")
         sh = kept.sh.reshape(len(kept), 3 * kept.sh.shape[1])
         self.sh = self._layers(np.clip(sh, -HALF_MAX, HALF_MAX) if half else sh, "f2" if half else "f4")
         self.placement, self.shape, self.colours = (ctx.texture(self.size, 4, dtype="f4") for _ in range(3))
@@ -149,7 +149,7 @@ class SceneTextures:
         x, y, z = self._means
         a, b, c, d = camera.world_to_camera[2]
         depths = x * a + y * b + z * c + d
-        ahead = np.flatnonzero((depths > settings.near) & (depths <= farthest(settings))).astype(np.int32)
+        ahead = np.flatnonzero((depths > settings.near) & (depths <= far_plane(settings))).astype(np.int32)
         self._drawn = len(ahead)
         self.order.write(depth_order(depths, ahead, shared_workers())[::-1].tobytes())
 
@@ -171,15 +171,14 @@ class SceneTextures:
         free = np.zeros((len(kept), 1))
         return np.concatenate([kept.means, opacities[:, None], scales, free, quats], 1).astype(np.float32)
 
-    def _layers(self, values: Array, dtype: str | np.dtype) -> moderngl.TextureArray:
+    def _layers(self, values: Array, dtype: Literal["f2", "f4"]) -> moderngl.TextureArray:
         """Upload (n, C) values as a texture array of ceil(C / 4) RGBA layers."""
-        kind = np.dtype(dtype)
         layers = math.ceil(values.shape[1] / 4)
-        padded = np.zeros((layers, self.size[0] * self.size[1], 4), kind)
+        padded = np.zeros((layers, self.size[0] * self.size[1], 4), dtype)
         for layer in range(layers):
             part = values[:, 4 * layer : 4 * layer + 4]
             padded[layer, : len(part), : part.shape[1]] = part
-        texture = self._ctx.texture_array((*self.size, layers), 4, padded, dtype=f"f{kind.itemsize}")
+        texture = self._ctx.texture_array((*self.size, layers), 4, padded, dtype=dtype)
         texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return texture
 
@@ -302,13 +301,9 @@ class GlRasterizer:
 
     def project(self, view: "GlView") -> SceneTextures:
         """Return the scene's textures, with the projection and the draw order of `view` in them."""
-        scene = self.scene(view.gaussians)
-        if self._current is not view:
-            self._fill(scene, view)
-        return scene
-
-    def _fill(self, scene: SceneTextures, view: "GlView") -> None:
-        camera, settings = view.camera, view.settings
+        scene, camera, settings = self.scene(view.gaussians), view.camera, view.settings
+        if self._current is view:
+            return scene
         high = camera.position.astype(np.float32)
         added, fitted = dilation(camera, settings)
         set_uniforms(
@@ -334,10 +329,11 @@ class GlRasterizer:
         scene.sh.use(1)
         with drawing(self.ctx, scene.projected, moderngl.NOTHING):
             self._project_vao.render(moderngl.TRIANGLES, vertices=3)
-        wanted = (settings.near, farthest(settings), *camera.world_to_camera[2])
+        wanted = (settings.near, far_plane(settings), *camera.world_to_camera[2])
         if self._sorted != wanted:  # the order is kept when only the image plane changed
             scene.sort(camera, settings)
         self._current, self._sorted = view, wanted
+        return scene
 
     def _splat_program(self, values: int, depth: bool) -> moderngl.Program:
         key = (values, depth)

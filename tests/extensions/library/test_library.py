@@ -32,7 +32,6 @@ from langsplat_core.progress import Progress, Report
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import named
 from langsplat_core.query.rule import judge, scaling_of, triple
-from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Calibration, Gaussians, PlattScaling, Scene
 from langsplat_core.scene.transform import place_scene, rotating, transform_scene
 from langsplat_core.semantics.encoders import keep_calibration, load_text_encoder
@@ -247,7 +246,7 @@ def with_gaussians(scene: Scene, **changed: Array) -> Scene:
 
 def compared(first: Scene, second: Scene, placed: Array | None = None) -> tuple[Change, ...]:
     engines = [QueryEngine(scene, lambda _: FakeEncoder()) for scene in (first, second)]
-    return changes(*engines, load_lifting_rasterizer("cpu"), placed)
+    return changes(*engines, placed)
 
 
 @pytest.fixture
