@@ -140,7 +140,8 @@ class Tree:
         inside = self.leaves != NO_NODE
         own = np.bincount(self.leaves[inside], minlength=self.count)
         sizes = self.totals(own)
-        firsts, next_child, roots = sizes.tolist(), sizes.tolist(), 0
+        firsts = sizes.tolist()
+        next_child, roots = list(firsts), 0
         for node, parent in zip(range(self.count - 1, -1, -1), self.parents[::-1].tolist(), strict=True):
             first = roots if parent == NO_NODE else next_child[parent]
             if parent == NO_NODE:

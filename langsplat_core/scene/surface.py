@@ -78,9 +78,11 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
     valid, every = gaussians.valid(), surface_weights(gaussians, min_opacity)
     rows = np.flatnonzero(every)
     k = min(NEIGHBOURS, len(rows))
+    anchors = np.full(len(gaussians), -1, np.int32)
     if k == 0:
-        nothing = scipy.sparse.csr_matrix((0, 0), dtype=bool), np.full(len(valid), -1, np.int32)
-        return Surface(rows, np.zeros((0, 3)), np.zeros((0, 1), np.int32), np.zeros(0, np.float32), *nothing)
+        none = np.zeros((0, 1), np.int32)
+        no_links = scipy.sparse.csr_matrix((0, 0), dtype=bool)
+        return Surface(rows, np.zeros((0, 3)), none, np.zeros(0, np.float32), no_links, anchors)
     # In the order of a k-d tree's leaves: close Gaussians get close numbers.
     rows = rows[scipy.spatial.cKDTree(gaussians.means[rows].astype(np.float64)).indices]
     positions = gaussians.means[rows].astype(np.float64)
@@ -93,7 +95,6 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
         reach[part] = REACH * distances[:, middle].mean(1) + 1e-12  # the median: distances ascend
         near[part] = distances <= reach[part, None]
     weights = every[rows]
-    anchors = np.full(len(gaussians), -1, np.int32)
     anchors[rows] = np.arange(len(rows))
     faint = np.flatnonzero(valid & (anchors < 0))
     gap, nearest = tree.query(gaussians.means[faint].astype(np.float64), workers=-1)
