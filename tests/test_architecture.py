@@ -78,8 +78,7 @@ def rank(package: str) -> int:
 
 @cache
 def imported_modules(path: Path, types_too: bool) -> list[str]:
-    """Modules, and names in them, that a file imports, also inside functions; types_too: also what only type
-    checkers see."""
+    """Modules, and names in them, that a file imports, also inside functions; types_too: for checkers."""
     names = []
     waiting: list[ast.AST] = list(ast.parse(path.read_text()).body)
     while waiting:

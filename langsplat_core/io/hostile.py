@@ -360,8 +360,7 @@ def opened(
     """Open the image in a file or in bytes, for decoding within the block.
 
     name: for messages, by default the path. Raises PictureError if it cannot be opened, is of none of the
-    `kinds` (default: all that are read) or declares more than `most` pixels, and for any error of Pillow
-    within the block.
+    `kinds` (default: all that are read), declares more than `most` pixels, or fails within the block.
     """
     name = name or (str(source) if isinstance(source, Path) else "a picture in memory")
     try:

@@ -457,8 +457,7 @@ def _said(comments: Sequence[str], tell: Tell) -> tuple[bool, float | None]:
 def write_metres(path: Path | str, metres_per_unit: float) -> None:
     """Write metres per unit into the header of the PLY `path`; all other bytes stay as they are.
 
-    Raises InputError for another kind of file and a length that is not positive, FormatError for a header
-    that breaks the rules.
+    Raises InputError for another kind of file or a length that is not positive, FormatError for a bad header.
     """
     path = Path(path)
     if path.suffix.lower() != ".ply":

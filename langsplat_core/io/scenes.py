@@ -314,8 +314,7 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
     """Return the path of the companion of a scene that ends in `suffix`: `a/b.ply` -> `a/b<suffix>`.
 
     A SOG folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .sog or
-    .splat -> `a/b.spz<suffix>` and so on. For a symbolic link it is the companion of the target, if only that
-    exists.
+    .splat -> `a/b.spz<suffix>` and so on. A symbolic link has its target's, if only that exists.
     """
     scene = Path(scene)
     if any(scene.name == row.folder_file for row in formats()):

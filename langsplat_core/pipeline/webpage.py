@@ -3,8 +3,7 @@
 The file holds a compressed safetensors file (Gaussians of 8 and 16 bits, codes, codebook, words, regions)
 and the modules of `langsplat_core/web`. A phrase is answered there by the rule of `query.rule`:
 what does not depend on the phrase is computed here, so that little more than a product with the codebook is
-left. Gaussians that can never be drawn are left out; the others lie along a curve, so that neighbours
-compress well.
+left. Gaussians that can never be drawn are left out; the others lie along a curve, to compress well.
 """
 
 import base64
@@ -313,6 +312,7 @@ def _region_tables(engine: QueryEngine, codes: Array) -> dict[str, Array]:
         "share": share.data.astype(np.float32),
         "sizes": np.concatenate(regions.sizes).astype(np.uint32),
         "parents": regions.table.parents.astype(np.int32),
+        "touching": (engine.touching + count - len(regions.nodes[-1])).astype(np.int32),
         "places": scene.in_world(places),
         "boxes": scene.in_world(boxes).reshape(count, 6),
         "corners": corners.astype(np.float32).reshape(count, 24),

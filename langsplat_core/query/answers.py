@@ -233,6 +233,23 @@ def build_regions(tree: Tree, weights: Array) -> Regions:
     return Regions(tuple(nodes), np.stack(everywhere), weights, tuple(sizes), tuple(totals), table)
 
 
+BORDER = 0.2  # least share of the border of two touching wholes in all borders of either
+LARGER = 2.0  # most Gaussians of the first of the two, in those of the second
+
+
+def touching_wholes(regions: Regions, surface: Surface) -> Array:
+    """Return (P, 2) pairs of wholes, of which the first may be a piece of the thing that the second shows."""
+    count, of = len(regions.sizes[-1]), regions.everywhere[-1, surface.rows]
+    a, b = (of[ends] for ends in surface.ends)
+    apart = (a != b) & (a >= 0) & (b >= 0)
+    links = scipy.sparse.csr_matrix((np.ones(apart.sum()), (a[apart], b[apart])), (count, count))
+    shared = (links + links.T).tocoo()
+    borders, sizes = np.bincount(shared.row, shared.data, count), regions.sizes[-1]
+    pairs = np.stack([shared.row, shared.col], 1)
+    touch = shared.data >= BORDER * borders[pairs].max(1)
+    return pairs[touch & (sizes[shared.row] <= LARGER * sizes[shared.col])]
+
+
 def place_of(points: Array) -> tuple[Array, Array]:
     """Return the mean (3,) of the points nearest to the centre, and box (2, 3) of (K, 3) points, K >= 1."""
     points = points.astype(np.float64)

@@ -71,8 +71,7 @@ def run_phrase(
     It is a plain query, as by `QueryEngine.run`, if the grammar finds no structure, or if only the whole
     phrase is known (from a phrasebook). level: of what is searched for; what it is related to is searched at
     "auto". viewpoint: the camera for left, right, behind and in front, and for "nearest" and "farthest"
-    without an anchor. Raises InputError as `grammar.parse` does and for a missing viewpoint, EncoderError as
-    `QueryEngine.run`.
+    without an anchor. Raises as `parse` and `QueryEngine.run`, and InputError for a missing viewpoint.
     """
     tree = parse(text, engine.taught)
     if isinstance(tree, Atom):

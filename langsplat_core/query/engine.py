@@ -29,6 +29,7 @@ from langsplat_core.query.answers import (
     by_peak,
     by_regions,
     chance_in,
+    touching_wholes,
 )
 from langsplat_core.query.grammar import STOP_WORDS, check_names, named, only, thing_and_part
 from langsplat_core.query.instances import Instance, find_instances, find_wholes
@@ -185,7 +186,7 @@ class QueryEngine:
         fits, on = [self._own_fits(relevancy)], None
         if thing is not None:
             fits += [] if part is None else [part]
-            on = on_things(self.regions.table, thing)
+            on = on_things(self.regions.table, thing, self.touching)
         sought = named(phrase)
         judged = self.bars, scaling_of(self.calibration, sought, phrase), on
         decision = decide(self.regions.table, fits, sought, level, *judged)
@@ -272,6 +273,11 @@ class QueryEngine:
     def regions(self) -> Regions:
         """The tree's nodes at each level."""
         return build_regions(self.tree, surface_weights(self.scene.gaussians))
+
+    @cached_property
+    def touching(self) -> Array:
+        """The (P, 2) pairs of wholes that may be pieces of one thing, see `touching_wholes`."""
+        return touching_wholes(self.regions, self.surface)
 
     @cached_property
     def chance(self) -> Array | None:

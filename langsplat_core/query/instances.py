@@ -179,8 +179,7 @@ def find_wholes(
 ) -> tuple[Instance, ...] | None:
     """Return the instances among `members` as `find_instances` does, each one a voted whole.
 
-    even: (N,) relevancy in [0, 1], constant over a region. Needs no surface. Returns None if a visible member
-    is in no voted whole.
+    even: (N,) relevancy in [0, 1], constant over a region. None if a visible member is in no voted whole.
     """
     every = np.flatnonzero(members)
     seen, owner = surface_weights(gaussians)[every] > 0, wholes[every]

@@ -3,8 +3,7 @@
 A fit (`semantics.relevancy.Scale`) is the number of spreads by which a region is nearer to a phrase than
 everyday phrases are by chance, so one rule serves all encoders. The exported page has the table as JSON and
 `decide` in JavaScript (`web/rule.js`); the index over scans calls these functions for many scenes at once.
-The numbers were chosen on rooms 201 to 203, with the bundled encoder and CLIP's geometry; `common_share` on
-401 and 402, in four real spaces and with CLIP's geometry; the thresholds of things on these, 501 and 502.
+docs/answers.md says on which rooms the numbers were chosen.
 """
 
 from collections.abc import Mapping, Sequence
@@ -104,16 +103,19 @@ def region_relevancies(fits: Array) -> Array:
     return np.where(fits > RULE.nothing, sigmoid(fits), 0)
 
 
-def on_things(table: RegionTable, thing: Array) -> Array:
+def on_things(table: RegionTable, thing: Array, touching: Array) -> Array:
     """Return the (R,) bool regions in which parts of a thing may be, from its (R,) own fits.
 
-    They are the wholes that fit nearly as well as the best one, and all regions below them.
+    They are the wholes that fit nearly as well as the best one, those that touch one of these, and all
+    regions below them. touching: (P, 2) pairs of wholes, see `answers.touching_wholes`.
     """
     last = len(LEVELS) - 1
     whole, solid = table.level(last, region_fits(table, thing)), table.level(last, table.solid)
     best = float(whole[solid if solid.any() else slice(None)].max(initial=RULE.nothing))
     on = np.zeros(len(thing) + 1, bool)  # the last entry is what -1, no parent, indexes
-    on[len(thing) - len(whole) : -1] = whole >= RULE.least_fit(best, RULE.around)
+    wholes = on[len(thing) - len(whole) : -1]
+    wholes[:] = whole >= RULE.least_fit(best, RULE.around)
+    wholes[touching[wholes[touching[:, 1]], 0]] = True
     for _ in LEVELS[1:]:
         on[:-1] |= on[table.parents]
     return on[:-1]

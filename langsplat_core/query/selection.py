@@ -151,8 +151,7 @@ def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: fl
     """Return (N,) bool: centres in the image of `size` that no surface hides.
 
     A centre is visible if its depth is at most 1 + `behind` times that of the surface in its pixel. depths:
-    (H, W) camera z of the surface, world units, 0 where there is none; it may be coarser or finer than the
-    image.
+    (H, W) camera z of the surface, world units, 0 where there is none; of any resolution.
     """
     check_array("depths", depths, ("H", "W"))
     height, width = depths.shape

@@ -174,8 +174,7 @@ class PhraseEncoder:
 
         An encoder of a closed vocabulary gets only words, as any character that its tokenizer lacks might end
         the phrase. Raises InputError for a phrase without a letter or digit or with more tokens than the
-        model reads, UnknownWordError for words it was not taught, EncoderError for characters that it cannot
-        read.
+        model reads, UnknownWordError for words it was not taught, EncoderError for unreadable characters.
         """
         for text in texts:
             self._check(text)

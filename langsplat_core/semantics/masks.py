@@ -381,8 +381,7 @@ def _paint(lab: Array) -> Array:
 
     In CIELAB a, b and L + 16 are combinations of cube roots, so all three scale alike with the light on a
     surface: a / (L + 16) and b / (L + 16) hardly depend on it. Large chromas are compressed, since the eye
-    distinguishes them less well (0.045 is the factor of CIE 94), and since in deep shade the cube roots of
-    CIELAB become linear.
+    distinguishes them less well (0.045 is the factor of CIE 94) and cube roots are linear in deep shade.
     """
     lightness = np.maximum(lab[..., :1], 0)
     chromaticity = lab[..., 1:] * 66.0 / (lightness + 16)  # at L = 50 of the size of a and b

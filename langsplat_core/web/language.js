@@ -71,7 +71,8 @@ export class Language {
     this.tensors = Object.fromEntries(Object.entries(tensors).map(([name, { values }]) => [name, values]));
     [this.codewords, this.dim] = tensors.codebook.shape;
     this.gaussians = tensors.codes.shape[1];
-    this.regions = { counts: meta.counts, parents: this.tensors.parents, sizes: this.tensors.sizes };
+    const { parents, sizes, touching } = this.tensors;
+    this.regions = { counts: meta.counts, parents, sizes, touching };
     this.space = new Space(meta);
     this.keys = new Map(meta.keys.map((key, row) => [key, row]));
     this.taught = new Map(meta.taught.map((word, row) => [phraseKey(word.name), { ...word, row }]));

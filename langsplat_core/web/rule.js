@@ -2,7 +2,7 @@
 // (`rule`) comes from and is explained.
 //
 // Regions are { counts, parents, sizes } of all levels one after the other, subparts first; `parents` has the
-// region of the level above, -1 for none.
+// region of the level above, -1 for none; `touching` pairs of wholes of which the first may be a piece of the second.
 
 // [page]
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
@@ -99,13 +99,17 @@ export function isWithin(regions, region, others) {
   return region >= 0 && (others.has(region) || isWithin(regions, regions.parents[region], others));
 }
 
-// Whether parts of a thing may be in each region: in the wholes that fit nearly as well as the best, and below them.
+// Whether parts of a thing may be in each region: in the wholes that fit nearly as well as the best, in those that
+// touch one of these, and below them.
 export function onThings(rule, regions, own) {
   const thing = regionFits(rule, regions, own);
   const level = regions.counts.length - 1;
   const best = bestRelevancy(rule, regions, regionRelevancies(rule, thing), level);
   const least = leastFit(rule, fitOf(rule, best), rule.around);
-  return Array.from(thing, (_, region) => thing[wholeOf(regions, region)] >= least);
+  const { touching } = regions;
+  const pieces = new Set(touching.filter((_, i) => i % 2 === 0 && thing[touching[i + 1]] >= least));
+  const on = (whole) => thing[whole] >= least || pieces.has(whole);
+  return Array.from(thing, (_, region) => on(wholeOf(regions, region)));
 }
 
 // The least fit of a member of an answer. share: factor of the reach.

@@ -1,5 +1,4 @@
-"""Exported pages in a real browser: images against the OpenGL backend's, answers against Python's, and what a
-hostile scene can do."""
+"""Exported pages in a real browser: images as the OpenGL backend's, answers as Python's, hostile scenes."""
 
 import itertools
 import json
@@ -47,7 +46,7 @@ PARTS = "keyboard,handle,wheel,screen,leg,spout,lid,wing,propeller,ear,nose,flam
 NAMES = [name.strip() for name in f"{THINGS},{PARTS}".split(",")]
 MIXED = [f"{colour} {thing}" for colour in ("red", "blue", "yellow") for thing in NAMES[:10]]
 OWNED = ["duck beak", "teapot lid", "laptop screen", "the Red Mug!", "  blue, gift ", "penguin’s beak"]
-PHRASES = [*NAMES, *MIXED, *OWNED, "rocket fins", "wooden table", "green car"]
+PHRASES = [*NAMES, *MIXED, *OWNED, "table keyboard", "wooden table", "green car"]
 MARKUP = '<img src=x onerror="window.escaped=1"></script><script>window.escaped=2</script>'
 FIELDS = ("level", "scores", "fits", "peak", "probability", "found", "verdict", "place", "box")
 

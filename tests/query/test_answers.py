@@ -11,9 +11,11 @@ from langsplat_core.io.sidecar import Words
 from langsplat_core.query.answers import (
     QueryResult,
     Regions,
+    build_regions,
     by_peak,
     by_regions,
     smoothed,
+    touching_wholes,
 )
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
@@ -47,11 +49,12 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN
-from langsplat_core.scene.surface import SMALLEST, build_surface
+from langsplat_core.scene.surface import SMALLEST, build_surface, surface_weights
 from langsplat_core.semantics.relevancy import FLOOR, Scale, TextEncoder, fit_of
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field
 from tests.support.scenes import (
+    chain_of_levels,
     random_gaussians,
     regions_of,
     tree_of_wholes,
@@ -309,21 +312,30 @@ def test_the_best_part_of_a_region_counts_a_quarter():
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "level", "answer"),
+    ("first", "second", "touching", "level", "answer"),
     [
-        (2.0, -1.0, "auto", (0, [True, False])),
-        (2.0, 1.0, "auto", (0, [False, True])),  # nearly as much the thing
-        (2.0, -1.0, "whole", (2, [True, False])),
+        (2.0, -1.0, [0, 1], "auto", (0, [True, False])),
+        (2.0, 1.0, [0, 1], "auto", (0, [False, True])),  # nearly as much the thing
+        (2.0, -1.0, [1, 0], "auto", (0, [False, True])),  # may be a piece of the thing
+        (2.0, -1.0, [0, 1], "whole", (2, [True, False])),
     ],
 )
-def test_parts_are_looked_for_on_wholes_that_fit_their_thing(first, second, level, answer):
+def test_parts_are_looked_for_on_wholes_of_their_thing(first, second, touching, level, answer):
     own = np.array([1.5, 2.5, 0.0, 0.0, 0.5, 3.0])
-    on = on_things(TWO, np.array([-2.0, -2.0, -2.0, -2.0, first, second]))
+    on = on_things(TWO, np.array([-2.0, -2.0, -2.0, -2.0, first, second]), np.array([touching]))
     decision = decide(TWO, [own], "part of a thing", level, BARS, None, on)
     assert (decision.level, decision.inside.tolist()) == answer
     assert decision.fits == decide(TWO, [own], "part of a thing", level, BARS, None).fits
     inside = decide(TWO, [own], "inside", level, BARS, None, on)  # nothing off the thing is evidence
     assert inside.fits == pytest.approx(fit_of(np.array(decision.scores)).tolist())
+
+
+def test_touching_wholes_share_a_fifth_of_their_borders():
+    x, y = np.mgrid[:24, :24].reshape(2, -1)
+    things = np.select([(x > 7) & (x % 3 < 2) & (y < 2), x < 2, x < 7], [1 + x // 3, 2, 1])  # tiles, strips
+    gaussians = unturned_gaussians(np.stack([x, y, 0 * x], 1).astype(np.float32), -1.0, 5.0)
+    regions = build_regions(chain_of_levels(things.astype(np.int32)), surface_weights(gaussians))
+    assert touching_wholes(regions, build_surface(gaussians)).tolist() == [[1, 0], [2, 1]]
 
 
 def test_part_is_chosen_by_its_phrase_and_its_own_word():
@@ -347,8 +359,7 @@ GAP = unit(RNG.normal(size=DIM))
 
 def row_of(things: list[int], seed: int) -> Scene:
     """A row of things of these kinds and of pieces of a wall, of which there is no mask, apart from each
-    other. Their vectors have a cosine of 0.6 and more with each other, whatever they are; most of the rest is
-    no matter of words."""
+    other. Their vectors have a cosine of 0.6 and more with each other, whatever they are."""
     rng = np.random.default_rng(seed)
     things = things + PIECES * [WALL]
     looks = FEATURES[things] + 0.2 * unit(rng.normal(size=(len(things), DIM)))

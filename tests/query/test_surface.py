@@ -119,8 +119,7 @@ def plain_typical_step(surface: Surface, field: LanguageField, level: int) -> fl
 
 
 def plain_regions(surface: Surface, field: LanguageField, level: int) -> list[int]:
-    """Felzenszwalb and Huttenlocher, with sets: the first member of each Gaussian's region, within those of
-    the level above."""
+    """Felzenszwalb and Huttenlocher, with sets: the first member of each Gaussian's region."""
     steps, typical = [], plain_typical_step(surface, field, level)
     above = None if level == 2 else plain_regions(surface, field, level + 1)
     things = None if level < 2 or field.tree is None else field.tree.leaves
@@ -164,8 +163,7 @@ def on_surface_of(regions: Regions, surface: Surface) -> np.ndarray:
 
 
 def assert_sound(regions: Regions, surface: Surface) -> None:
-    """Numbered from 0 without a gap, sizes as counted, each within one above, none over a gap of the surface
-    and none too small."""
+    """Numbered from 0 without a gap, sizes as counted, each within one above, none over a gap or small."""
     _, parts = connected_components(surface.links, directed=False)
     every = on_surface_of(regions, surface)
     for level, (of, sizes) in enumerate(zip(every, regions.sizes, strict=True)):

@@ -488,8 +488,7 @@ def taught_word(name: str, dims: int) -> TaughtWord:
 
 
 def searched(path: Path) -> float:
-    """Asks a field, describes it, and draws the answer and its latents: numbers that can be read may still be
-    none to reckon with."""
+    """Asks a field, describes it, and draws the answer and its latents: numbers may be read but useless."""
     field = read_language(path, SCENE.means)
     vector = unit(np.random.default_rng(0).normal(size=field.codec.vector_dim)).astype(np.float32)
     scene = Scene(SCENE, replace(field, phrasebook={"cup": vector}))

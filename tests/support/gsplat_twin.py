@@ -1,8 +1,7 @@
 """A twin of `gsplat.rasterization` in plain PyTorch, as of gsplat 1.5.3, for the CPU.
 
 Arithmetic and its order are those of gsplat's CUDA code, in float32, without tiles: every pixel is asked of
-every Gaussian. One camera, no packing, no depth modes: what `raster.gsplat` asks for, by names that the
-installed gsplat takes.
+every Gaussian. One camera, no packing, no depth modes: what `raster.gsplat` asks for.
 
 What this cannot show: gsplat's own Python code, whether its kernels compile, the digits that
 `-use_fast_math` costs, the order of their atomic sums, and everything about time and memory.

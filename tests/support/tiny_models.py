@@ -1,5 +1,4 @@
-"""Encoders, segmenters and a room small enough to be made while a test runs, models in the layout of Hugging
-Face."""
+"""Encoders, segmenters (in Hugging Face's layout) and a room, small enough to be made while a test runs."""
 
 import json
 import os

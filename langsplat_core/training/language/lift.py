@@ -1,8 +1,7 @@
 """Lifting: from masks in photographs to unit CLIP vectors of Gaussians.
 
 Each Gaussian gets the geometric median, or the weighted mean, of the vectors of its masks; a codec encodes
-these afterwards. Averages are taken in CLIP space, since half way between two latents may lie the latent of a
-third object.
+these afterwards. Averages are taken in CLIP space: between two latents may lie that of a third object.
 
 The mask weights ``W^T onehot(mask)`` are the pixels of every mask in every photograph that each Gaussian
 paints. Targets are constant on masks, so this sparse matrix carries vectors of any length from photographs to
@@ -266,8 +265,7 @@ def lift_weights(weights: "scipy.sparse.csr_matrix", vectors: Array, robust: boo
     """Return (3, n, D) float32 unit vectors, zero where unobserved, and (3, n) float32 confidence.
 
     Confidence is the total blending weight, in pixels. weights: (n, 3 G) of n Gaussians in G groups of masks,
-    level after level; vectors: (G, D) float32 unit vectors of the groups; robust: take the geometric median
-    instead of the mean.
+    level after level; vectors: (G, D) float32 unit vectors of the groups; robust: by geometric medians.
     """
     lifted = np.zeros((len(LEVELS), weights.shape[0], vectors.shape[1]), np.float32)
     confidences = np.zeros((len(LEVELS), weights.shape[0]), np.float32)
@@ -382,8 +380,7 @@ def lift_by_gradient(
 ) -> tuple[Array, Array]:
     """Return (3, N, d) float32 unit latents and (3, N) confidence, both as in `lift_latents`.
 
-    Latents are zero where unobserved. config: number of steps, learning rate and start. Deterministic for a
-    given seed on the CPU.
+    Latents are zero where unobserved. config: steps, learning rate, start. Deterministic on the CPU.
     """
     start, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
     import torch  # takes seconds; other modes do not need it

@@ -154,8 +154,7 @@ def find_tree(
 def link_disagreement(surface: Surface, mask_weights: MaskWeights, progress: Progress = silent) -> Array:
     """Return the (E,) share of views and levels in which the ends of each link are in different masks.
 
-    Only views and levels with a mask at both ends count, weighted by the lower of their pixels, at most
-    `ENOUGH`.
+    Only views and levels with a mask at both ends count, by the lower of their pixels, at most `ENOUGH`.
     """
     first, second = surface.ends
     apart, seen = np.zeros(len(first), np.float32), np.zeros(len(first), np.float32)
@@ -406,8 +405,7 @@ def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
 def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> tuple[Array, Array]:
     """Return label maps (3, H, W) int32, as of `masks.label_maps`, and the (M,) node of each region.
 
-    drawn: (H, W) patches, -1 for none; cuts: (P,) node of each patch at each level; least: least share of the
-    image of a region.
+    drawn: (H, W) patches, -1 for none; cuts: (P,) node of each patch at each level; least: share of an image.
     """
     maps = np.full((len(cuts), *drawn.shape), -1, np.int32)
     shown, there = np.zeros(0, int), drawn >= 0

@@ -1,5 +1,4 @@
-"""Files of other methods: what is found in them, which belong together, what is refused, what becomes of
-them."""
+"""Files of other methods: what is found in them, which belong together, what is refused."""
 
 import json
 import logging
