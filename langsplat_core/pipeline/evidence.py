@@ -18,12 +18,14 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.pipeline.report import REPORT, stated_figures, work_folder
+from langsplat_core.io.cameras import SUFFIX as CAMERAS
+from langsplat_core.io.cameras import read_cameras
+from langsplat_core.pipeline.report import PREVIEW, REPORT, stated_figures, work_folder
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.render import view_of
-from langsplat_core.scene import LEVELS, NO_NODE, Scene
+from langsplat_core.scene import LEVELS, NO_NODE, Camera, Scene
 from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from langsplat_core.training.language.lift import SHOWN, VOTE
@@ -156,6 +158,8 @@ def _nearest(seen: ImageFeatures, shown: Array) -> tuple[int, float]:
 
 # What training kept beside a scene.
 
+SAME = 1e-3  # of a rotation matrix's entries: between cameras of one training, written and read again
+
 
 def kept_features(path: Path, scene: Scene, work: Path | None = None) -> Sequence[ImageFeatures]:
     """Return masks and vectors of a scene's photographs, from `work` or beside it; InputError without."""
@@ -167,7 +171,17 @@ def kept_features(path: Path, scene: Scene, work: Path | None = None) -> Sequenc
             f"{store.folder}: {what}; evidence needs the masks that `langsplat train` keeps beside a scene, "
             "which bundled and imported ones come without: train it, or name its folder with --work"
         )
+    trained = store.folder.with_name(PREVIEW).with_suffix(CAMERAS)
+    if exists(trained) and not _alike(scene.cameras, read_cameras(trained)):
+        raise InputError(f"{trained}: cameras of another scene; name this one's own folder with --work")
     return store.of([camera.name for camera in scene.cameras])
+
+
+def _alike(cameras: Sequence[Camera], trained: Sequence[Camera]) -> bool:
+    """Return whether cameras may be those of a training, of a scene moved, turned or scaled since."""
+    known = {camera.name: camera.rotation for camera in trained}
+    turns = [camera.rotation.T @ known[camera.name] for camera in cameras if camera.name in known]
+    return bool(turns) and bool(np.ptp(turns, 0).max() < SAME)  # one and the same for all
 
 
 def is_kept(path: Path, scene: Scene) -> bool:

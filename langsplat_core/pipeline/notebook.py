@@ -76,6 +76,7 @@ def draw(
     scene: Scene, size: tuple[int, int] = (960, 540), answer: QueryResult | ComposedResult | None = None
 ) -> Image.Image:
     """Return an image of a scene; an `answer` as heat, from the nearest camera that has it in its image."""
+    expect(scene, Scene, "load_scene(path) returns one")
     fitted = [camera.fitted(*size) for camera in scene.cameras]
     camera = fitted[0] if fitted else scene.framing_camera(size)
     answer = answer.answer if isinstance(answer, ComposedResult) else answer

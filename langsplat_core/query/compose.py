@@ -13,7 +13,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import EncoderError, InputError, expect
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult, locate, place_of
 from langsplat_core.query.engine import QueryEngine
@@ -73,6 +73,7 @@ def run_phrase(
     "auto". viewpoint: the camera for left, right, behind and in front, and for "nearest" and "farthest"
     without an anchor. Raises as `parse` and `QueryEngine.run`, and InputError for a missing viewpoint.
     """
+    expect(engine, QueryEngine, "QueryEngine(scene, encoder) makes one")
     tree = parse(text, engine.taught)
     if isinstance(tree, Atom):
         return ComposedResult(engine.run(tree.text, level, progress), tree)

@@ -20,7 +20,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import RasterSettings
-from langsplat_core.errors import expect
+from langsplat_core.errors import InputError, expect
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, protocol
 from langsplat_core.scene import Camera, Gaussians, Scene
 
@@ -49,7 +49,10 @@ def view_of(
     rasterizer: by default that of the CPU, whose views can lift; settings of image formation: by default
     those that the scene was trained with.
     """
+    expect(scene, Scene, "load_scene(path) returns one")
     expect(camera, Camera, "scene.cameras has those of a scene, look_at makes one")
+    if isinstance(rasterizer, str):
+        raise InputError(f"no name alone; say view_of(scene, camera, load_rasterizer({rasterizer!r}))")
     formed = scene.raster_settings() if settings is None else settings
     return (rasterizer or _cpu()).view(scene.gaussians, camera, formed)
 

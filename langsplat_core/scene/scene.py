@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 import langsplat_core
 from langsplat_core.arrays import Array, across, affine, check_array, unit
 from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.errors import expect
 from langsplat_core.scene.gaussians import Gaussians
 from langsplat_core.scene.language import LanguageField
 
@@ -285,6 +286,10 @@ class Scene:
     origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) float64, zero unless the scene is far off
 
     def __post_init__(self) -> None:
+        expect(self.gaussians, Gaussians, "load_scene(path) makes a scene of a file")
+        object.__setattr__(self, "cameras", tuple(self.cameras))
+        for camera in self.cameras:
+            expect(camera, Camera, "look_at makes one")
         object.__setattr__(self, "origin", np.asarray(self.origin, np.float64))
         if self.origin.shape != (3,) or not (np.abs(self.origin) <= FARTHEST).all():
             raise ValueError(f"an origin of {self.origin}: expected three numbers up to {FARTHEST:g}")

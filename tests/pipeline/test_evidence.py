@@ -274,8 +274,10 @@ def test_a_training_keeps_all_that_is_needed(tmp_path):
     answer = replace(engine.run("red mug", "whole"), members=whole == np.bincount(whole[whole >= 0]).argmax())
     found = find_evidence(engine, answer, ["red mug"], seen)
     assert found.votes or found.others
-    with pytest.raises(InputError, match="--work"):
-        kept_features(tmp_path / "b.ply", scene)
+    other = replace(scene, cameras=tuple(replace(one, name=scene.cameras[-1].name) for one in scene.cameras))
+    for place, of in ("b.ply", scene), ("a.ply", other):
+        with pytest.raises(InputError, match="--work"):
+            kept_features(tmp_path / place, of)
 
 
 def test_a_taught_word_is_compared_with_what_was_shown(engine, features):

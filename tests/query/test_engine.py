@@ -152,11 +152,9 @@ def test_wrong_kinds_are_named_and_arrays_are_not_printed():
         (lambda: render(scene, 0), "expected a Camera, got int; scene.cameras has those of a scene"),
         (lambda: render("a.ply", scene.cameras[0]), "expected a Scene, got str; load_scene"),
         (lambda: save_scene("a.ply", scene.gaussians), "expected a Scene, got Gaussians; Scene\\(gaussians"),
+        (lambda: Scene("a.ply"), "expected a Gaussians, got str; load_scene"),
         (lambda: draw(scene, answer="mug"), "expected a QueryResult, got str; run_phrase"),
-        (
-            lambda: train_scene("photographs", "a.ply", {}),
-            "expected settings such as TrainConfig.*, got dict",
-        ),
+        (lambda: train_scene("p", "a.ply", {}), "expected settings such as TrainConfig.*, got dict"),
     ):
         with pytest.raises(InputError, match=said):
             wrong()
