@@ -90,7 +90,6 @@ def _group(name: str, words: Sequence[str] = ()) -> Any:
 
 
 def _members(group: str) -> list[str]:
-    """Return the names of a group's commands, without the group's own."""
     return [name.split(" ")[1] for name in registry.references("commands") if name.startswith(f"{group} ")]
 
 

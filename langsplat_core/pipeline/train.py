@@ -232,7 +232,6 @@ def _language(
 
 
 def _mean(scores: Iterable[float | None]) -> float | None:
-    """Return the mean of the scores that could be measured; None where none could."""
     measured = [score for score in scores if score is not None]
     return float(np.mean(measured)) if measured else None
 

@@ -237,10 +237,13 @@ BORDER = 0.2  # least share of the border of two touching wholes in all borders 
 LARGER = 2.0  # most Gaussians of the first of the two, in those of the second
 
 
-def touching_wholes(regions: Regions, surface: Surface) -> Array:
-    """Return (P, 2) pairs of wholes, of which the first may be a piece of the thing that the second shows."""
-    count, of = len(regions.sizes[-1]), regions.everywhere[-1, surface.rows]
-    a, b = (of[ends] for ends in surface.ends)
+def touching_wholes(regions: Regions, ends: tuple[Array, Array], rows: Array) -> Array:
+    """Return (P, 2) pairs of wholes, of which the first may be a piece of the thing that the second shows.
+
+    ends: of the links of a surface, as numbers on it; rows: its Gaussians.
+    """
+    count = len(regions.sizes[-1])
+    a, b = (regions.everywhere[-1, rows[numbers]] for numbers in ends)
     apart = (a != b) & (a >= 0) & (b >= 0)
     links = scipy.sparse.csr_matrix((np.ones(apart.sum()), (a[apart], b[apart])), (count, count))
     shared = (links + links.T).tocoo()

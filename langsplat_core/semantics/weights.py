@@ -101,7 +101,6 @@ def local_path(model: str) -> Path:
 
 
 def _is_hugging_face(folder: Path) -> bool:
-    """Return True if a folder holds weights and their configuration as transformers saves them."""
     return bool(weight_files(folder)) and (folder / CONFIG).is_file()
 
 

@@ -335,7 +335,8 @@ def test_touching_wholes_share_a_fifth_of_their_borders():
     things = np.select([(x > 7) & (x % 3 < 2) & (y < 2), x < 2, x < 7], [1 + x // 3, 2, 1])  # tiles, strips
     gaussians = unturned_gaussians(np.stack([x, y, 0 * x], 1).astype(np.float32), -1.0, 5.0)
     regions = build_regions(chain_of_levels(things.astype(np.int32)), surface_weights(gaussians))
-    assert touching_wholes(regions, build_surface(gaussians)).tolist() == [[1, 0], [2, 1]]
+    surface = build_surface(gaussians)
+    assert touching_wholes(regions, surface.ends, surface.rows).tolist() == [[1, 0], [2, 1]]
 
 
 def test_part_is_chosen_by_its_phrase_and_its_own_word():

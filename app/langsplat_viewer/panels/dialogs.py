@@ -4,6 +4,7 @@ import os
 import shutil
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -40,7 +41,8 @@ class StartPage:
     def __init__(self, folder: Path | None) -> None:
         """`folder`: of the preferences, with the thumbnails."""
         self._folder = folder
-        self._cards: list[tuple[Path, ui.Picture, np.ndarray | None]] = []
+        self._cards: list[tuple[Path, np.ndarray | None]] = []
+        self._pictures: defaultdict[Path, ui.Picture] = defaultdict(ui.Picture)
 
     def _look_up(self, viewer: Viewer) -> None:
         """List the bundled scene and the recent files that are there, each with its thumbnail."""
@@ -49,7 +51,7 @@ class StartPage:
             if kept is not None:
                 with suppress(LangSplatError), opened(kept) as file:
                     image = np.asarray(file.convert("RGB"))
-            self._cards.append((path, ui.Picture(), image))
+            self._cards.append((path, image))
 
     def draw(self, viewer: Viewer, area: ui.Area) -> None:
         """Draw it over the scene's area, while it is wanted."""
@@ -76,11 +78,11 @@ class StartPage:
         with theme.styled(frame_padding=hello_imgui.em_to_vec2(0.8, 0.45)):
             ui.verbs(viewer, "Open a scene ...", "Train from photographs ...", "First steps")
         imgui.dummy(ImVec2(0, hello_imgui.em_size(0.8)))
-        for number, (path, picture, image) in enumerate(self._cards):
+        for number, (path, image) in enumerate(self._cards):
             if number % columns:
                 imgui.same_line()
             with imgui_ctx.push_id(str(number)):
-                if _card(path, None if image is None else picture.texture(image), card):
+                if _card(path, None if image is None else self._pictures[path].texture(image), card):
                     opening.open_file(viewer, path)
         imgui.dummy(ImVec2(0, hello_imgui.em_size(0.4)))
         work, text = viewer.worker.current, "Drop a scene, a project or a folder of photographs here"

@@ -285,7 +285,6 @@ def _times(x: cp.Point, y: cp.Point) -> cp.Point:
 
 @helper
 def _mixed(p: Any, x: cp.Point, q: Any, y: cp.Point) -> cp.Point:
-    """Return p x + q y."""
     return p * x[0] + q * y[0], p * x[1] + q * y[1], p * x[2] + q * y[2]
 
 

@@ -218,7 +218,6 @@ class _Views:
 
 
 def _halved(camera: Camera, image: Array, mask: Array | None) -> tuple[Camera, Array, Array | None]:
-    """Return the view at half its size, unless a side is below 64 px."""
     if min(camera.width, camera.height) < 64:
         return camera, image, mask
     return shrunk_view(camera, image, mask, (camera.width // 2, camera.height // 2))
@@ -370,8 +369,7 @@ def _first_gaussians(
     return training.initial_gaussians(capture, indices, config.sh_degree, config.max_gaussians, config.seed)
 
 
-# Few photographs can be overfitted, and from some number of steps on they are: views that were held out get
-# worse. That number grows with the photographs (docs/experiments.md).
+# From some number of steps on held-out views get worse; it grows with the photographs (docs/experiments.md).
 VISITS = 64  # steps for each of few photographs, after which held-out views gain no more ...
 MEMBERS = 2  # ... but of another training, merged with it: an ensemble (Lakshminarayanan et al. 2017)
 

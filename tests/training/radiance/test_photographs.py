@@ -109,7 +109,6 @@ def cameras() -> list[Camera]:
 
 
 def wall(camera: Camera) -> Array:
-    """Return (GRID, GRID) depths of the wall."""
     patches = camera.resized(GRID, GRID)
     ray = patches.unproject(patches.pixel_centres(), np.ones((GRID, GRID))) - camera.position
     return -camera.position[2] / ray[..., 2]
