@@ -99,7 +99,6 @@ def _flat(value: Any) -> Iterator[Any]:
 
 
 def _shown(value: Any) -> str:
-    """Return a value as it would be typed, cut short where it is long."""
     text = " ".join(map(_word, _flat(value)))
     return text if len(text) <= 40 else f"{text[:36]} ..."
 

@@ -225,7 +225,6 @@ def exif_facts(path: Path) -> ExifFacts:
 
 
 def _degrees(parts: Any) -> float:
-    """Return an angle of EXIF data, which is degrees, minutes and seconds, in degrees."""
     degrees, minutes, seconds = map(float, parts)
     return degrees + minutes / 60 + seconds / 3600
 

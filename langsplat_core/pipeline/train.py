@@ -15,7 +15,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from uuid import uuid4
 
 import numpy as np
@@ -70,6 +70,8 @@ def train_scene(  # noqa: PLR0913  what the command has as options
     some. `until` "gaussians": a scene without a language field, which a later call adds to it.
     """
     dataset, out = Path(dataset), Path(out)
+    if until not in get_args(Until):
+        raise InputError(f"until {until!r}: no stage that a training ends at; there are {get_args(Until)}")
     check_settings(config)
     language_field.check_lift(config)
     if out.suffix.lower() != ".ply":

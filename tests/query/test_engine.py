@@ -155,6 +155,7 @@ def test_wrong_kinds_are_named_and_arrays_are_not_printed():
         (lambda: Scene("a.ply"), "expected a Gaussians, got str; load_scene"),
         (lambda: draw(scene, answer="mug"), "expected a QueryResult, got str; run_phrase"),
         (lambda: train_scene("p", "a.ply", {}), "expected settings such as TrainConfig.*, got dict"),
+        (lambda: train_scene("p", "a.ply", {}, until="masks"), "until 'masks': no stage .*'language"),
     ):
         with pytest.raises(InputError, match=said):
             wrong()
@@ -453,8 +454,6 @@ D = 16
 
 
 def smooth_codec(rng: np.random.Generator) -> AutoencoderCodec:
-    """A random autoencoder of three numbers with weights of moderate size."""
-
     def layer(a: int, b: int) -> tuple[Array, Array]:
         weights = rng.normal(size=(b, a)) * (1.6 / a**0.5)
         return weights.astype(np.float32), (0.3 * rng.normal(size=b)).astype(np.float32)
