@@ -401,7 +401,7 @@ def write_gltf(path: Path | str, scene: Scene) -> None:
 def node_of(scene: Scene) -> dict[str, Any]:
     """Return the entries of the node of a scene, whose content is in glTF's axes relative to its origin.
 
-    Its matrix turns the scene's up to y, and scales to metres if the scale is known; its extras undo that.
+    Its matrix turns the scene's up to y, and scales to metres if the scale is known; its extras say how.
     """
     turn = turning(SIGNS * scene.up(), AXES["y"])
     there = turn.then(moving(turned_origin(turn.rotation * SIGNS, scene.origin)))

@@ -50,7 +50,7 @@ from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, kept_calibra
 from langsplat_core.semantics.relevancy import FEWEST, Scale, TextEncoder, everyday_vectors, relevancy_of
 
 BATCH = 512  # phrases that are encoded at a time
-SAMPLE = 200_000  # Gaussians that tell which regions touch; the surface of 5 million takes half a minute
+SAMPLE = 200_000  # Gaussians, about, that tell which regions touch; the surface of a million takes 5 s
 
 LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
 

@@ -51,7 +51,7 @@ Layout = Callable[[str, Path], Converted | None]  # id for messages, file -> Non
 def open_weights(model: str, path: Path, device: str) -> Weights:
     """Return the weights at a path from `weights_path`, for a device as `torch_device` takes it.
 
-    Other layouts than Hugging Face's are read by extensions. EncoderError for a damaged file or layout.
+    Other layouts than Hugging Face's are read by extensions. EncoderError for a damaged or unknown file.
     """
     device = torch_device(device)
     if path.is_dir() and _is_hugging_face(path):
