@@ -25,13 +25,7 @@ from langsplat_core.datasets.photos import ExifFacts, exif_facts
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.scene.transform import moving, rotating, scaling
-from tests.support.photographs import (
-    poses,
-    write_model,
-    write_nerfstudio,
-    write_photos,
-    write_picture,
-)
+from tests.support.photographs import poses, write_model, write_nerfstudio, write_photos, write_picture
 from tests.support.scenes import random_camera, ring
 
 

@@ -40,14 +40,7 @@ from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene, look_at
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
-from tests.support.photographs import (
-    CONFIG,
-    mask_file,
-    poses,
-    refuse,
-    write_colmap,
-    write_photos,
-)
+from tests.support.photographs import CONFIG, mask_file, poses, refuse, write_colmap, write_photos
 from tests.support.processes import files_of_at_most, stop_at
 
 
@@ -414,12 +407,7 @@ def test_focal_length_follows_from_pixels_per_inch(unit, millimetres, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "tags",
-    [
-        {},
-        {FOCAL_TAG: 18.0, PLANE_X: 4500.0, PLANE_UNIT: 77},
-        {FOCAL_TAG: 1e6, PLANE_X: 1e9},
-    ],
+    "tags", [{}, {FOCAL_TAG: 18.0, PLANE_X: 4500.0, PLANE_UNIT: 77}, {FOCAL_TAG: 1e6, PLANE_X: 1e9}]
 )
 def test_implausible_exif_lenses_are_left_out(tags: dict[int, float], tmp_path: Path) -> None:
     assert on_film(tagged(tmp_path / "a.jpg", tags)) is None

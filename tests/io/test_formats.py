@@ -28,14 +28,7 @@ from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.raster.reference import colours
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from langsplat_core.scene.transform import AXES as UP
-from langsplat_core.scene.transform import (
-    moving,
-    rotating,
-    scaling,
-    similarity,
-    transform_gaussians,
-    turning,
-)
+from langsplat_core.scene.transform import moving, rotating, scaling, similarity, transform_gaussians, turning
 from tests.support.file_samples import (
     C0,
     assert_refused,

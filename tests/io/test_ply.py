@@ -167,11 +167,7 @@ def test_other_encodings_keep_metres(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "dtype"),
-    [
-        *((name, "f4") for name in ("x", "f_rest_3", "two words", "a\nb", "")),
-        ("a", "i8"),
-        ("a", "?"),
-    ],
+    [*((name, "f4") for name in ("x", "f_rest_3", "two words", "a\nb", "")), ("a", "i8"), ("a", "?")],
 )
 def test_writer_refuses_what_no_header_can_hold(tmp_path, name, dtype):
     with pytest.raises(InputError):

@@ -13,12 +13,7 @@ from langsplat_core.cli import query
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline.encoder_check import bundled_room
-from langsplat_core.pipeline.evidence import (
-    Evidence,
-    find_evidence,
-    kept_features,
-    kept_photographs,
-)
+from langsplat_core.pipeline.evidence import Evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.query.compose import run_phrase, with_masks
 from langsplat_core.query.describe import Describer

@@ -16,12 +16,7 @@ from langsplat_core.raster.cpu.tiles import depth_order
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera
-from tests.support.backends import (
-    BAND,
-    assert_close_off_cuts,
-    assert_gradient,
-    reference_gradients,
-)
+from tests.support.backends import BAND, assert_close_off_cuts, assert_gradient, reference_gradients
 from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 
 CPU, REFERENCE = CpuRasterizer(), ReferenceRasterizer()

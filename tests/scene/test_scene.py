@@ -28,13 +28,7 @@ from langsplat_core.scene.transform import (
 )
 from tests.support.file_samples import assert_same, random_field
 from tests.support.hard_cases import balls
-from tests.support.scenes import (
-    covariances,
-    random_camera,
-    random_gaussians,
-    repeated,
-    without_perspective,
-)
+from tests.support.scenes import covariances, random_camera, random_gaussians, repeated, without_perspective
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e4, 1e15, 3e38])

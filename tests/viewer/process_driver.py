@@ -119,11 +119,7 @@ class Rider:
 
 
 def ride(
-    scene: Path,
-    count: int,
-    seconds: float,
-    size: tuple[int, int],
-    budget: float = MOVING_BUDGET,
+    scene: Path, count: int, seconds: float, size: tuple[int, int], budget: float = MOVING_BUDGET
 ) -> Orbiting:
     def load(path: Path) -> Scene:
         found = load_scene(path)

@@ -422,12 +422,7 @@ def test_other_files_of_version_1_open_and_mean_the_same():
     assert second.seconds == 2.0
     assert second.pose.span == pytest.approx(4.705585)
     assert load_preferences(SAVED) == Preferences(
-        "light",
-        1.25,
-        ("/scenes/blobs.ply",),
-        ("Search", "Notes"),
-        "viridis",
-        ("things", "grid"),
+        "light", 1.25, ("/scenes/blobs.ply",), ("Search", "Notes"), "viridis", ("things", "grid")
     )
 
 

@@ -23,14 +23,7 @@ from langsplat_core.progress import silent
 from langsplat_core.scene import CANONICAL_PHRASES, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.language.codec_fit import everyday_vocabulary
-from tests.support.file_samples import (
-    assert_same,
-    autoencoder,
-    geometry,
-    save_model,
-    tensor,
-    training_state,
-)
+from tests.support.file_samples import assert_same, autoencoder, geometry, save_model, tensor, training_state
 from tests.support.processes import refusal, run
 from tests.support.scenes import random_gaussians
 from tests.support.tiny_models import tiny_clip

@@ -9,14 +9,7 @@ import torch
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig
 from langsplat_core.progress import Progress
-from langsplat_core.scene import (
-    NO_NODE,
-    Codec,
-    Gaussians,
-    LanguageField,
-    LinearCodec,
-    codec_from_tensors,
-)
+from langsplat_core.scene import NO_NODE, Codec, Gaussians, LanguageField, LinearCodec, codec_from_tensors
 from langsplat_core.scene.codec import KINDS, CodebookCodec, principal_colours
 from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.relevancy import Scale
