@@ -366,9 +366,8 @@ def mapped(case: Case) -> Found:
         "words": Same(sorted(set(words.tolist()))),
         "voxels": Surface(world[0], by=cell),
         "collider": Surface(world[1], by=cell),
-        "goal": Near(
-            goal["distance"], cell
-        ),  # of equally near places, which is seen from follows from single cells
+        # of equally near places, which is seen from follows from single cells
+        "goal": Near(goal["distance"], cell),
         **({} if case.turned else {"grid": Places(world[2], by=2 * cell / room().bounds()[1])}),
     }
 

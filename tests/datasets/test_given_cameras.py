@@ -611,9 +611,8 @@ def test_a_wide_fisheye_is_cut_at_the_largest_angle() -> None:
 
 
 def test_a_lens_that_folds_over_is_cut_before_the_fold() -> None:
-    folding = PhotoIntrinsics(
-        640, 480, 300.0, 300.0, 320.0, 240.0, BrownDistortion(-0.4)
-    )  # folds at radius 0.91
+    folds_at_0_91 = BrownDistortion(-0.4)
+    folding = PhotoIntrinsics(640, 480, 300.0, 300.0, 320.0, 240.0, folds_at_0_91)
     camera = pinhole_for(folding, 2000)
     corner = np.hypot(camera.cx / camera.fx, camera.cy / camera.fy)
     assert 0.5 < corner < 0.92

@@ -210,9 +210,7 @@ def test_photographs_are_read_as_srgb(case: str, tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(data)
     told: list[str] = []
     found = shown_patches(np.asarray(read_photo(tmp_path / "a.png", True, told.append)))
-    assert np.abs(found.astype(int) - PATCHES).max() <= (
-        3 if case in ("cICP of HLG", "cICP of PQ") else 2
-    )  # of 8 bits
+    assert np.abs(found.astype(int) - PATCHES).max() <= (3 if case in ("cICP of HLG", "cICP of PQ") else 2)
     assert not told
 
 

@@ -139,9 +139,7 @@ def test_rounded_positions_are_drawn_and_told_of_once(tmp_path, caplog):
     gaussians = random_gaussians(N)
     rounded = (gaussians.means + np.array(FAR[0])).astype(np.float32)
     write_ply(tmp_path / "a.ply", replace(gaussians, means=rounded))
-    write_language(
-        tmp_path / "a.langsplat.safetensors", random_field(N), rounded
-    )  # of before there were origins
+    write_language(tmp_path / FIELD, random_field(N), rounded)  # of before there were origins
     replace(gaussians, means=gaussians.means + np.array(FAR[0]))  # by nobody who could have an origin
     assert "rounded to 0.5 units: give Scene an origin" in caplog.text
     got = load_scene(tmp_path / "a.ply")

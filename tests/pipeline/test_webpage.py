@@ -703,9 +703,8 @@ def test_page_turns_fills_the_screen_saves_and_prints(browser: Any, thin: Path) 
 
 def test_history_is_shown_before_the_view_rests(browser: Any, thin: Path) -> None:
     with open_tab(browser, thin) as tab:
-        tab.run(
-            "async () => clearTimeout(Object.assign((await langsplat).page, { keepUp() {} }).rest)"
-        )  # never
+        never = "async () => clearTimeout(Object.assign((await langsplat).page, { keepUp() {} }).rest)"
+        tab.run(never)
         tab.page.keyboard.press("l")
         tab.run("async () => (await langsplat).page.search('ball')")
         tab.page.keyboard.press("f")

@@ -19,15 +19,6 @@ from langsplat_core.query.instances import (
     find_wholes,
     oriented_box,
 )
-from langsplat_core.query.selection import (
-    Projected,
-    Regions,
-    in_polygon,
-    in_rectangle,
-    in_stroke,
-    on_surface,
-    project,
-)
 from langsplat_core.scene import NO_NODE, Gaussians, LanguageField, Scene, look_at
 from langsplat_core.scene import surface as surfaces
 from langsplat_core.scene.surface import Surface, build_surface
@@ -157,12 +148,12 @@ def assert_same_partition(got, want) -> None:
     assert pairs == len(np.unique(got)) == len(np.unique(want))
 
 
-def on_surface_of(regions: Regions, surface: Surface) -> np.ndarray:
+def on_surface_of(regions: selection.Regions, surface: Surface) -> np.ndarray:
     """Return (3, M) region of every Gaussian of the surface."""
     return regions.everywhere[:, surface.rows]
 
 
-def assert_sound(regions: Regions, surface: Surface) -> None:
+def assert_sound(regions: selection.Regions, surface: Surface) -> None:
     """Numbered from 0 without a gap, sizes as counted, each within one above, none over a gap or small."""
     _, parts = connected_components(surface.links, directed=False)
     every = on_surface_of(regions, surface)
@@ -219,7 +210,7 @@ def test_borders_of_regions_on_a_line(meaning, known, things, finer, whole):
         assert_same_partition(of, np.broadcast_to(want, 80)[surface.rows])
 
 
-def plain_means(surface: Surface, regions: Regions, values: np.ndarray) -> list[np.ndarray]:
+def plain_means(surface: Surface, regions: selection.Regions, values: np.ndarray) -> list[np.ndarray]:
     """Region by region, in float64."""
     weights = surface.weights.astype(np.float64)
     of_surface = values.astype(np.float64)[:, surface.rows]
@@ -230,7 +221,7 @@ def plain_means(surface: Surface, regions: Regions, values: np.ndarray) -> list[
 
 
 @pytest.fixture(scope="module")
-def scattered() -> tuple[Surface, Regions]:
+def scattered() -> tuple[Surface, selection.Regions]:
     """Random Gaussians, a third of them faint and some far from all others."""
     rng = np.random.default_rng(4)
     gaussians = random_gaussians(3000)
@@ -364,12 +355,12 @@ SIZE = (80, 60)
 
 
 @pytest.fixture
-def seen() -> Projected:
+def seen() -> selection.Projected:
     """Places all over the picture and beyond it, a few of them behind the camera."""
     rng = np.random.default_rng(3)
     depths = rng.uniform(0.5, 9.0, 700)
     depths[:30] = -1.0
-    return Projected(rng.uniform(-10, 95, (700, 2)), depths)
+    return selection.Projected(rng.uniform(-10, 95, (700, 2)), depths)
 
 
 def plainly_from_segment(x: float, y: float, start, end) -> float:
@@ -379,14 +370,14 @@ def plainly_from_segment(x: float, y: float, start, end) -> float:
     return hypot(x - x0 - t * (x1 - x0), y - y0 - t * (y1 - y0))
 
 
-def from_line(seen: Projected, line) -> np.ndarray:
+def from_line(seen: selection.Projected, line) -> np.ndarray:
     """Return (N,) distances from the line, pixels, by a loop."""
     return np.array(
         [min(plainly_from_segment(x, y, a, b) for a, b in pairwise(line.tolist())) for x, y in seen.pixels]
     )
 
 
-def within(seen: Projected) -> np.ndarray:
+def within(seen: selection.Projected) -> np.ndarray:
     """Return (N,) bool: ahead and in the image."""
     return (seen.depths > 0) & (seen.pixels >= 0).all(1) & (seen.pixels < SIZE).all(1)
 
@@ -395,20 +386,20 @@ def test_polygon_holds_points_by_the_even_odd_rule(seen):
     box = np.array([[20, 5], [60, 5], [60, 40], [20, 40.0]])
     hole = box * 0.5 + (20, 11.25)  # a second turn inside the first
     for outline, wanted in (
-        (box, in_rectangle(seen, box[0], box[2])),
-        (box[::-1], in_rectangle(seen, box[2], box[0])),
+        (box, selection.in_rectangle(seen, box[0], box[2])),
+        (box[::-1], selection.in_rectangle(seen, box[2], box[0])),
         (
             np.concatenate([box, box[:1], hole, hole[:1]]),
-            in_rectangle(seen, box[1], box[3]) & ~in_rectangle(seen, hole[3], hole[1]),
+            selection.in_rectangle(seen, box[1], box[3]) & ~selection.in_rectangle(seen, hole[3], hole[1]),
         ),
     ):
         sure = (
             from_line(seen, np.concatenate([outline, outline[:1]])) > 1.5
-        )  # a pixel on the edge counts whole
+        )  # on the edge a pixel counts whole
         assert wanted[sure].sum() > 20
-        np.testing.assert_array_equal(in_polygon(seen, outline, SIZE)[sure], wanted[sure])
+        np.testing.assert_array_equal(selection.in_polygon(seen, outline, SIZE)[sure], wanted[sure])
     for few in (np.zeros((0, 2)), np.array([[0.0, 0.0], [80.0, 60.0]])):
-        assert not in_polygon(seen, few, SIZE).any()
+        assert not selection.in_polygon(seen, few, SIZE).any()
 
 
 def test_stroke_is_as_wide_as_its_brush(seen):
@@ -417,32 +408,32 @@ def test_stroke_is_as_wide_as_its_brush(seen):
         away = from_line(seen, line)
         wanted, sure = (away <= radius) & within(seen), np.abs(away - radius) > 1.5
         assert 10 < wanted.sum() < 300
-        np.testing.assert_array_equal(in_stroke(seen, line, radius, SIZE)[sure], wanted[sure])
-    assert not in_stroke(seen, np.zeros((0, 2)), 12.0, SIZE).any()
+        np.testing.assert_array_equal(selection.in_stroke(seen, line, radius, SIZE)[sure], wanted[sure])
+    assert not selection.in_stroke(seen, np.zeros((0, 2)), 12.0, SIZE).any()
 
 
 def test_points_behind_the_camera_are_never_inside():
     camera = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
     means = np.array([[0, 0, 0], [0, 0, -9], [0, 0, -5], [nan, 0, 0], [inf, 0, 0]], np.float32)
-    seen = project(means, camera)
+    seen = selection.project(means, camera)
     assert seen.depths.tolist() == [5.0, -1.0, -1.0, -1.0, -1.0]
     np.testing.assert_allclose(seen.pixels[0], (40, 30))
     everywhere = np.array([[-9, -9], [90, -9], [90, 70], [-9, 70.0]])
     only_the_first = [True, False, False, False, False]
-    assert in_polygon(seen, everywhere, SIZE).tolist() == only_the_first
-    assert in_stroke(seen, everywhere, 99.0, SIZE).tolist() == only_the_first
-    assert on_surface(seen, np.zeros((60, 80)), SIZE).tolist() == only_the_first
+    assert selection.in_polygon(seen, everywhere, SIZE).tolist() == only_the_first
+    assert selection.in_stroke(seen, everywhere, 99.0, SIZE).tolist() == only_the_first
+    assert selection.on_surface(seen, np.zeros((60, 80)), SIZE).tolist() == only_the_first
 
 
 @pytest.mark.parametrize("coarser", [1, 4])
 def test_points_behind_the_surface_are_hidden(seen, coarser):
     depths = np.full((60 // coarser, 80 // coarser), 4.0)
     depths[:, : 40 // coarser] = 0  # nothing is drawn there, and nothing hides
-    found = on_surface(seen, depths, SIZE, behind=0.05)
+    found = selection.on_surface(seen, depths, SIZE, behind=0.05)
     (x, y), z = seen.pixels.T, seen.depths
     in_picture = (z > 0) & (x >= 0) & (x < 80) & (y >= 0) & (y < 60)
     assert found.tolist() == (in_picture & ((x < 40) | (z <= 4.2))).tolist()
-    assert 0 < found.sum() < in_rectangle(seen, np.zeros(2), np.array(SIZE)).sum()
+    assert 0 < found.sum() < selection.in_rectangle(seen, np.zeros(2), np.array(SIZE)).sum()
 
 
 # Instances: taken apart where the surface is, against plain graphs and float64 means.
@@ -481,11 +472,11 @@ def test_every_ball_is_an_instance_with_its_figures():
     for instance, ball in zip(found, (1, 2, 0), strict=True):
         own = np.flatnonzero((number == ball) & members)
         assert instance.members.tolist() == own.tolist()
-        on_surface = np.flatnonzero(np.isin(surface.rows, own))
-        weights = surface.weights[on_surface].astype(np.float64) / surface.weights[on_surface].sum()
-        points = surface.positions[on_surface]
-        assert instance.score == pytest.approx(smooth[on_surface].max(), abs=1e-6)
-        assert instance.mean == pytest.approx(weights @ relevancy[surface.rows[on_surface]], abs=1e-6)
+        there = np.flatnonzero(np.isin(surface.rows, own))
+        weights = surface.weights[there].astype(np.float64) / surface.weights[there].sum()
+        points = surface.positions[there]
+        assert instance.score == pytest.approx(smooth[there].max(), abs=1e-6)
+        assert instance.mean == pytest.approx(weights @ relevancy[surface.rows[there]], abs=1e-6)
         np.testing.assert_allclose(instance.centre, weights @ points, atol=1e-6)
         np.testing.assert_allclose(instance.box, np.quantile(points, [0.02, 0.98], axis=0), atol=1e-12)
         assert instance.share == pytest.approx(

@@ -227,7 +227,7 @@ NAMED = [pytest.param(case, id=case.name) for case in CASES]
 
 
 def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) -> Seen:
-    """Everything the table's docstring promises of every case."""
+    """Everything the table promises of every case."""
     if case.only and backend.name not in case.only:
         pytest.skip("too long for this backend")
     if backend.gsplat and case.name in BEYOND_GSPLAT:

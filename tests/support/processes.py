@@ -457,9 +457,8 @@ def use_on_windows(folder: Path) -> None:
     for suffix in 2 * (".ply", ".sog"):
         assert run("convert", scene, folder / f"s{suffix}") == 0
     assert run("convert", scene, folder / "aux.ply") == 2
-    threading.Timer(
-        0.5, saved.with_suffix(".langsplat.safetensors").open("rb").close
-    ).start()  # another program
+    of_another_program = saved.with_suffix(".langsplat.safetensors").open("rb")
+    threading.Timer(0.5, of_another_program.close).start()
     assert run("teach", saved, "--at", "412,230", "--name", duck) == 0
     assert run("scale", saved, "--metres-per-unit", "2") == 0
     assert run("query", saved, duck, "blue gift") == 0

@@ -307,9 +307,8 @@ def test_keyframes_are_changed_and_changes_undone(opened):
     first, second, third = opened.state.session.keyframes
     viewpoint.put_keyframe(opened, second, replace(second, seconds=5.0))
     assert times(opened) == [0, 4, 5]
-    viewpoint.put_keyframe(
-        opened, opened.state.session.keyframes[2], replace(second, seconds=4.0)
-    )  # is there
+    there = replace(second, seconds=4.0)  # where another is
+    viewpoint.put_keyframe(opened, opened.state.session.keyframes[2], there)
     assert times(opened) == [0, 4, 4.01]
     viewpoint.put_keyframe(opened, first)
     assert times(opened) == [4, 4.01]

@@ -19,13 +19,6 @@ from langsplat_core.extensions.benchmarks.labels import (
     read_lerf_ovs,
     without_suffix,
 )
-from langsplat_core.extensions.benchmarks.profiles import (
-    LERF_PROFILES,
-    OVS_PROFILES,
-    MapRule,
-    read_maps,
-    voted,
-)
 from langsplat_core.extensions.benchmarks.raster_speed import reference_window
 from langsplat_core.extensions.benchmarks.report import (
     Evaluated,
@@ -157,8 +150,8 @@ def test_eval_scores_the_bundled_scene_on_a_written_set(rooms, tmp_path, capsys,
 
 # The protocols' rules against plain loops.
 
-CODE_RULE = LERF_PROFILES["langsplat-code"].rule
-PLAIN_RULE = MapRule(1, 1.0, "mirror", "peak", True, 0.7, "none", 1, 1, False)
+CODE_RULE = profiles.LERF_PROFILES["langsplat-code"].rule
+PLAIN_RULE = profiles.MapRule(1, 1.0, "mirror", "peak", True, 0.7, "none", 1, 1, False)
 
 
 def plain_mean(values: np.ndarray, window: int, inside: bool) -> np.ndarray:
@@ -190,20 +183,20 @@ def looped_vote(mask: np.ndarray, clipped: bool) -> np.ndarray:
 def test_ties_and_flat_maps():
     mask = np.zeros((8, 8), bool)
     mask[:, :4] = True
-    assert not voted(mask, "inside", 40).any()  # the window is the whole picture: 32 of 64
+    assert not profiles.voted(mask, "inside", 40).any()  # the window is the whole picture: 32 of 64
     mask[0, 4] = True
-    assert voted(mask, "inside", 40).all()
+    assert profiles.voted(mask, "inside", 40).all()
     flat = np.zeros((1, 2, 3))
     flat[0, 0, 1] = flat[0, 1, 2] = 0.5
     assert profiles.peak_pixels(flat, replace(PLAIN_RULE, ties=True)).tolist() == [[1, 0], [2, 1]]
     assert profiles.peak_pixels(flat, PLAIN_RULE).tolist() == [[1, 0]]
-    assert not read_maps(np.full((3, 40, 40), 0.55), CODE_RULE).mask.any()
+    assert not profiles.read_maps(np.full((3, 40, 40), 0.55), CODE_RULE).mask.any()
 
 
 def test_the_code_cuts_the_blend_at_seven_tenths_of_its_range():
     maps = np.random.default_rng(1).uniform(0.4, 0.6, size=(3, 40, 50))
     maps[1, 10:30, 10:30] += 0.3
-    answer = read_maps(maps, CODE_RULE)
+    answer = profiles.read_maps(maps, CODE_RULE)
     blend = 0.5 * (plain_mean(maps[1], 30, False) + maps[1])
     cut = blend.min() + 0.7 * (blend.max() - blend.min())
     assert answer.level == 1
@@ -214,19 +207,19 @@ def test_the_code_cuts_the_blend_at_seven_tenths_of_its_range():
 
 
 def test_3d_ovs_takes_the_level_that_is_highest_inside_its_mask():
-    rule = OVS_PROFILES["langsplat-paper"].rule
+    rule = profiles.OVS_PROFILES["langsplat-paper"].rule
     maps = np.full((3, 5, 5), 0.1)
     maps[0, :2], maps[1, 3:, 3:], maps[2] = 0.5, 0.9, 0.4  # 0.4 itself is not above 0.4
     maps[0, 4, 4] = 0.95  # the highest pixel, but 0.54 on average
-    answer = read_maps(maps, rule)
+    answer = profiles.read_maps(maps, rule)
     assert (answer.level, answer.mask.sum()) == (1, 4)
-    assert not read_maps(np.full((3, 5, 5), 0.4), rule).mask.any()
+    assert not profiles.read_maps(np.full((3, 5, 5), 0.4), rule).mask.any()
 
 
 # Whole benchmarks on labels and answers whose scores are known by construction.
 
-DIRECT = LERF_PROFILES["direct-3d"]
-CODE = LERF_PROFILES["langsplat-code"]
+DIRECT = profiles.LERF_PROFILES["direct-3d"]
+CODE = profiles.LERF_PROFILES["langsplat-code"]
 PLAIN = replace(CODE, rule=replace(CODE.rule, window=1, vote="none", peak_window=1))
 
 
@@ -322,7 +315,9 @@ def test_an_empty_label_is_left_out_not_scored(tmp_path):
     silhouette(tmp_path / "maps" / "00", "cup", block(0, 0, 9, 9))
     silhouette(tmp_path / "maps" / "00", "wall", np.zeros((30, 40), bool))
     subject = Evaluated(maps=tmp_path / "maps")
-    report = run_benchmark(read_3d_ovs(tmp_path / "s"), OVS_PROFILES["direct-3d"], subject, no_encoder)
+    report = run_benchmark(
+        read_3d_ovs(tmp_path / "s"), profiles.OVS_PROFILES["direct-3d"], subject, no_encoder
+    )
     assert [query.phrase for query in report.queries] == ["cup"]
     assert "1 labels left out: 00: wall (empty mask)" in table(report)
 
@@ -407,7 +402,7 @@ def of_phrase(report, phrase):
 def test_our_own_answer_in_views_that_are_matched_by_name(blobs_on_disk):
     """The only label is of the second view; the first has other masks."""
     tmp_path, views = blobs_on_disk
-    report = of_scene(tmp_path, OVS_PROFILES["ours"])
+    report = of_scene(tmp_path, profiles.OVS_PROFILES["ours"])
     assert {query.phrase for query in report.queries} == set(WORDS)
     assert min(of_phrase(report, word).iou for word in ("mug", "book")) > 0.95
     first, second = seen(0, views[0]), seen(0, views[1])
@@ -418,14 +413,14 @@ def test_our_own_answer_in_views_that_are_matched_by_name(blobs_on_disk):
 def test_the_papers_absolute_cut(blobs_on_disk):
     """What is as far from the phrase as from the canonical ones has relevancy 0.5, which is above 0.4."""
     tmp_path, views = blobs_on_disk
-    mug = of_phrase(of_scene(tmp_path, OVS_PROFILES["langsplat-paper"]), "mug")
+    mug = of_phrase(of_scene(tmp_path, profiles.OVS_PROFILES["langsplat-paper"]), "mug")
     covered = render(blob_scene(), views[1]).alpha > 0.3
     assert mug.iou == pytest.approx((seen(0, views[1]) & covered).sum() / covered.sum())
 
 
 def test_direct_3d_draws_the_members_alone(blobs_on_disk):
     tmp_path, views = blobs_on_disk
-    book = of_phrase(of_scene(tmp_path, OVS_PROFILES["direct-3d"]), "book")
+    book = of_phrase(of_scene(tmp_path, profiles.OVS_PROFILES["direct-3d"]), "book")
     alone = render(blob_scene().take(np.arange(PER_BLOB, 2 * PER_BLOB)), views[1]).alpha > 0.7
     truth = seen(1, views[1])
     assert book.iou == pytest.approx((alone & truth).sum() / (alone | truth).sum())
@@ -436,7 +431,7 @@ def test_a_view_that_is_missing_and_words_that_are_unknown(blobs_on_disk, caplog
     tmp_path, _ = blobs_on_disk
     ovs_view(tmp_path / "data", "photo.2.x", {"mug": block(0, 0, 9, 9, (160, 120))}, (160, 120))
     ovs_view(tmp_path / "data", "photo.1.x", {"zebra": block(0, 0, 9, 9, (160, 120))}, (160, 120))
-    report = of_scene(tmp_path, OVS_PROFILES["ours"])
+    report = of_scene(tmp_path, profiles.OVS_PROFILES["ours"])
     assert "1 labelled frames have no camera: photo.2.x" in caplog.text
     text = table(report)
     assert "not answered (no camera of that name), 1 queries: photo.2.x: mug" in text
@@ -451,7 +446,7 @@ def test_scenes_and_labels_that_do_not_fit(blobs_on_disk):
     def refused(match: str, data) -> None:
         one = Evaluated(scene=tmp_path / "blobs.ply")
         with pytest.raises(InputError, match=match):
-            run_benchmark(read_3d_ovs(data), OVS_PROFILES["ours"], one, lambda _: FakeEncoder())
+            run_benchmark(read_3d_ovs(data), profiles.OVS_PROFILES["ours"], one, lambda _: FakeEncoder())
 
     ovs_view(tmp_path / "other", "00", {"mug": block(0, 0, 9, 9)})
     refused("none of the scene's views", tmp_path / "other")

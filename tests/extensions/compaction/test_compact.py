@@ -11,21 +11,6 @@ from langsplat_core.datasets import Capture
 from langsplat_core.errors import STRICTNESS, InputError
 from langsplat_core.extensions.compaction import compact
 from langsplat_core.extensions.compaction.clean import CleanConfig, CleanReport, clean, find_floaters
-from langsplat_core.extensions.compaction.compact import (
-    ALONE,
-    BudgetConfig,
-    Compact,
-    MeasuringView,
-    Views,
-    choose_views,
-    compact_scene,
-    contributions,
-    draw,
-    estimated_loss,
-    find_reduction,
-    psnr_losses,
-    smallest,
-)
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.progress import silent
 from langsplat_core.raster.reference import ReferenceRasterizer
@@ -38,7 +23,7 @@ from tests.support.processes import contents
 from tests.support.scenes import random_gaussians, tree_of_wholes
 
 N = 400
-CONFIG = BudgetConfig(max_psnr_loss=0.3, max_side=64)
+CONFIG = compact.BudgetConfig(max_psnr_loss=0.3, max_side=64)
 
 
 def cameras() -> tuple[Camera, ...]:
@@ -73,12 +58,12 @@ def test_a_contribution_bounds_what_its_removal_changes():
     camera = cameras()[0].resized(32, 24)
     for row in range(12):
         one = gaussians.take([row])
-        score = contributions(Scene(one), [camera])[0]
+        score = compact.contributions(Scene(one), [camera])[0]
         weight = ReferenceRasterizer().view(one, camera).splat(np.ones((1, 1)))[0]
         colour = np.maximum(one.sh[0, 0].astype(float) * 0.28209479177387814 + 0.5, 0)
         distance = np.linalg.norm(colour * (1 - weight), axis=-1)  # |c - C|, with C = w c
         total = (weight[..., 0] * distance).sum()
-        exact = np.sqrt(weight.sum() * (weight[..., 0] * (distance**2 + ALONE**2)).sum())
+        exact = np.sqrt(weight.sum() * (weight[..., 0] * (distance**2 + compact.ALONE**2)).sum())
         assert score == pytest.approx(exact, rel=1e-4, abs=1e-6)
         assert score >= total * (1 - 1e-4)
 
@@ -86,22 +71,22 @@ def test_a_contribution_bounds_what_its_removal_changes():
 def test_loss_without_photographs_is_that_of_uncorrelated_errors(scene):
     """Photographs made as the picture plus noise of known strength: measured and derived loss agree."""
     view = scene.cameras[0].resized(256, 192)
-    less, picture = scene.take(np.arange(N) % 9 > 0), draw(scene, view)
-    plain = MeasuringView(view, picture)
+    less, picture = scene.take(np.arange(N) % 9 > 0), compact.draw(scene, view)
+    plain = compact.MeasuringView(view, picture)
     noise = np.random.default_rng(0).normal(0, 10 ** (-30 / 20), picture.shape)
-    measured = psnr_losses(less, [replace(plain, photograph=picture + noise)], 30.0)[0]
-    derived = psnr_losses(less, [plain], 30.0)[0]
+    measured = compact.psnr_losses(less, [replace(plain, photograph=picture + noise)], 30.0)[0]
+    derived = compact.psnr_losses(less, [plain], 30.0)[0]
     assert measured > 0.5
     assert derived == pytest.approx(measured, abs=0.1)  # the noise is finite: 147 000 numbers
-    assert estimated_loss(1e-3, 30.0) == pytest.approx(10 * np.log10(2))
+    assert compact.estimated_loss(1e-3, 30.0) == pytest.approx(10 * np.log10(2))
 
 
 def test_gaussians_that_any_view_needs_are_kept(scene):
-    chosen = choose_views(scene, None, CONFIG, silent)
-    keep, _ = find_reduction(scene, chosen, chosen.measured(scene), CONFIG)
+    chosen = compact.choose_views(scene, None, CONFIG, silent)
+    keep, _ = compact.find_reduction(scene, chosen, chosen.measured(scene), CONFIG)
     every = (*chosen.ranking, *chosen.measuring)
-    score = contributions(scene, every)
-    each = [contributions(scene, [view]) for view in every]
+    score = compact.contributions(scene, every)
+    each = [compact.contributions(scene, [view]) for view in every]
     np.testing.assert_array_equal(score, np.max(each, axis=0))
     assert 0 < (~keep).sum() < N
     assert score[~keep].max() <= score[keep].min()
@@ -109,7 +94,7 @@ def test_gaussians_that_any_view_needs_are_kept(scene):
 
 def test_compact_file_keeps_budget_order_and_companions(scene, source, tmp_path):
     out = tmp_path / "out.ply"
-    report = compact_scene(source, out, CONFIG)
+    report = compact.compact_scene(source, out, CONFIG)
     small = load_scene(out)
     assert report.after.gaussians == len(small.gaussians) < 0.9 * N
     rows = small.extras["age"].astype(int)
@@ -119,8 +104,8 @@ def test_compact_file_keeps_budget_order_and_companions(scene, source, tmp_path)
     np.testing.assert_array_equal(small.language.latents, scene.language.latents[:, rows])
     np.testing.assert_array_equal(small.language.tree.leaves, scene.language.tree.leaves[rows])
     assert len(small.cameras) == len(scene.cameras)
-    measured = choose_views(scene, None, CONFIG, silent).measured(scene)
-    losses = psnr_losses(small, measured, CONFIG.assumed_psnr)
+    measured = compact.choose_views(scene, None, CONFIG, silent).measured(scene)
+    losses = compact.psnr_losses(small, measured, CONFIG.assumed_psnr)
     assert losses.mean() == pytest.approx(report.loss)
     assert report.loss <= CONFIG.max_psnr_loss
     assert report.before.memory_bytes == 4 * N * (3 + 3 + 4 + 1 + 12 + 1 + 3 * 4) + 4 * N  # leaves
@@ -131,7 +116,7 @@ def test_compact_file_keeps_budget_order_and_companions(scene, source, tmp_path)
 
 def test_a_scene_without_cameras_is_seen_from_a_ring(scene, tmp_path):
     save_scene(tmp_path / "bare.ply", replace(scene, cameras=(), language=None))
-    report = compact_scene(tmp_path / "bare.ply", tmp_path / "out.ply", replace(CONFIG, views=12))
+    report = compact.compact_scene(tmp_path / "bare.ply", tmp_path / "out.ply", replace(CONFIG, views=12))
     assert "ring" in report.views_from
     centre, radius = scene.bounds()
     for camera in scene.spiral_cameras(12, (64, 48)):
@@ -147,7 +132,7 @@ def test_a_scene_without_cameras_is_seen_from_a_ring(scene, tmp_path):
 def test_compact_refuses_unwritable_outputs(source, tmp_path, capsys, loss, out, named):
     """The source itself, an unknown format, and one whose eight bits alone cost more."""
     before = contents(tmp_path)
-    command = Compact(source, out=tmp_path / out, config=replace(CONFIG, max_psnr_loss=loss))
+    command = compact.Compact(source, out=tmp_path / out, config=replace(CONFIG, max_psnr_loss=loss))
     assert command_line.main("langsplat", lambda: command) == 2
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert said.startswith("langsplat: ")
@@ -159,17 +144,19 @@ def test_strict_refuses_a_loss_before_the_work(scene, tmp_path, monkeypatch):
     save_scene(tmp_path / "a.ply", replace(scene, metres_per_unit=0.5))
     monkeypatch.setattr(STRICTNESS, "on", True)
     with pytest.raises(InputError, match="no room for"):
-        compact_scene(tmp_path / "a.ply", tmp_path / "b.spz", CONFIG, None, lambda *_: pytest.fail("worked"))
+        compact.compact_scene(
+            tmp_path / "a.ply", tmp_path / "b.spz", CONFIG, None, lambda *_: pytest.fail("worked")
+        )
 
 
 def test_unforeseen_loss_leaves_the_old_file(source, tmp_path, monkeypatch):
     out = tmp_path / "out.ply"
-    compact_scene(source, out, CONFIG)
+    compact.compact_scene(source, out, CONFIG)
     old = contents(tmp_path)
 
     monkeypatch.setattr(compact, "psnr_losses", lambda *_: np.array([0.0, 9.0]))  # a loss nobody foresaw
     with pytest.raises(InputError):
-        compact_scene(source, out, CONFIG)
+        compact.compact_scene(source, out, CONFIG)
     assert contents(tmp_path) == old
 
 
@@ -177,23 +164,23 @@ def test_bisection_weighs_counts_against_sh_degrees():
     def loss_of(count: int, sh_degree: int) -> float:
         return (1000 - count) / 1000 + 0.1 * (1 - sh_degree)
 
-    count, degree = smallest(1000, 1, loss_of, 0.3)
+    count, degree = compact.smallest(1000, 1, loss_of, 0.3)
     assert degree == 0  # 800 of 14 numbers beat 700 of 23
     assert 800 <= count <= 800 + 1000 // 256 + 1
-    assert smallest(1000, 1, lambda *_: 1.0, 0.3) is None
-    assert smallest(1000, 1, lambda *choice: 0.0 if choice == (1000, 1) else 1.0, 0.3) == (1000, 1)
+    assert compact.smallest(1000, 1, lambda *_: 1.0, 0.3) is None
+    assert compact.smallest(1000, 1, lambda *choice: 0.0 if choice == (1000, 1) else 1.0, 0.3) == (1000, 1)
 
 
 def test_photographs_held_out_from_training_measure(scene, source, tmp_path, monkeypatch):
     """The dataset has two views more than the scene was trained on, and noise that the scene lacks."""
     rng = np.random.default_rng(0)
     shot = [replace(camera, name=f"v{i}") for i, camera in enumerate(scene.cameras)]
-    pictures = [draw(scene, camera) for camera in shot]
+    pictures = [compact.draw(scene, camera) for camera in shot]
     noisy = [np.clip(255 * p + rng.normal(0, 12, p.shape), 0, 255).astype(np.uint8) for p in pictures]
     capture = Capture(tuple(shot), tuple(noisy), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     monkeypatch.setattr(compact, "load_capture", lambda *_: capture)
     save_scene(source, replace(scene, cameras=tuple(shot[2:])))
-    report = compact_scene(source, tmp_path / "out.ply", CONFIG, photos=tmp_path)
+    report = compact.compact_scene(source, tmp_path / "out.ply", CONFIG, photos=tmp_path)
     assert (report.ranking_views, report.measuring_views) == (12, 2)
     assert report.assumed_psnr is None
     assert report.before.psnr - report.after.psnr == pytest.approx(report.loss)
@@ -202,7 +189,7 @@ def test_photographs_held_out_from_training_measure(scene, source, tmp_path, mon
     strangers = replace(capture, images=tuple(255 - image for image in noisy))
     monkeypatch.setattr(compact, "load_capture", lambda *_: strangers)
     with pytest.raises(InputError, match="something else"):
-        compact_scene(source, tmp_path / "out.ply", CONFIG, photos=tmp_path)
+        compact.compact_scene(source, tmp_path / "out.ply", CONFIG, photos=tmp_path)
 
 
 # Floaters go, the surface stays, and the budget holds.
@@ -235,7 +222,7 @@ def dirty() -> Scene:
 def cleaned(scene: Scene, **changes: float) -> tuple[Array, CleanReport]:
     """Without photographs."""
     config = replace(CLEAN, **changes)
-    return clean(scene, choose_views(scene, None, config, silent), config)
+    return clean(scene, compact.choose_views(scene, None, config, silent), config)
 
 
 def test_floaters_are_told_from_the_wall(dirty):
@@ -250,8 +237,8 @@ def test_floaters_are_told_from_the_wall(dirty):
 def test_photographs_let_all_floaters_go(dirty):
     """Of the wall alone: without floaters its images are these."""
     wall, held = dirty.take(WALL), dirty.cameras[1::3]
-    photographs = tuple((255 * draw(wall, camera)).round().astype(np.uint8) for camera in held)
-    keep, report = clean(dirty, Views(dirty.cameras[::3], held, photographs, "here"), CLEAN)
+    photographs = tuple((255 * compact.draw(wall, camera)).round().astype(np.uint8) for camera in held)
+    keep, report = clean(dirty, compact.Views(dirty.cameras[::3], held, photographs, "here"), CLEAN)
     np.testing.assert_array_equal(np.flatnonzero(~keep), FLOATERS)
     assert (report.regions, report.free_space, report.kept) == (11, 1, 0)
     assert report.loss < -1

@@ -18,19 +18,6 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LEVELS, NO_NODE, Camera, LinearCodec, Tree
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.training.language import lift
-from langsplat_core.training.language.lift import (
-    PAIR,
-    SAME,
-    MaskWeights,
-    count_votes,
-    find_instances,
-    group_masks,
-    lift_by_gradient,
-    lift_latents,
-    lift_sample,
-    lift_weights,
-    view_pairs,
-)
 from tests.support.processes import stop_at
 from tests.support.scenes import (
     LIFTED_DIM,
@@ -48,7 +35,7 @@ def gaussians():
 
 
 def ungrouped(views):
-    return group_masks([features.vectors for _, features in views], groups=10_000)
+    return lift.group_masks([features.vectors for _, features in views], groups=10_000)
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
@@ -72,7 +59,7 @@ def test_a_mask_weight_is_the_weight_inside_the_mask(gaussians, backend):
 def test_masks_of_one_group_are_one_column(gaussians):
     views = make_views()
     mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, views)
-    groups = group_masks([features.vectors for _, features in views], groups=4)
+    groups = lift.group_masks([features.vectors for _, features in views], groups=4)
     assert groups.vectors.shape == (4, LIFTED_DIM)
     apart = mask_weights.block(0, ungrouped(views)).toarray().reshape(25, 3, 21)
     together = np.zeros((25, 3, 4))
@@ -86,7 +73,7 @@ def test_groups_hold_what_says_the_same():
     centres = unit(rng.normal(size=(6, LIFTED_DIM)))
     labels = rng.integers(6, size=300)
     vectors = unit(centres[labels] + 0.02 * rng.normal(size=(300, LIFTED_DIM))).astype(np.float32)
-    groups = group_masks(np.split(vectors, [100, 100, 250]), groups=6)  # the second view has no masks
+    groups = lift.group_masks(np.split(vectors, [100, 100, 250]), groups=6)  # the second view has no masks
     found = groups.of_mask
     assert len({(a, b) for a, b in zip(found, labels, strict=True)}) == 6
     np.testing.assert_allclose((groups.vectors[found] * centres[labels]).sum(1), 1, atol=0.01)
@@ -96,7 +83,7 @@ def test_more_masks_than_can_be_numbered_are_refused(gaussians):
     labels = np.full((3, 6, 8), -1, np.int32)
     many = ImageFeatures(labels, np.zeros((70_000, 1), np.float32))
     with pytest.raises(ValueError, match="70000 masks; at most 65 535"):
-        view_pairs(ReferenceRasterizer(), gaussians, random_camera(0, 8, 6), many)
+        lift.view_pairs(ReferenceRasterizer(), gaussians, random_camera(0, 8, 6), many)
 
 
 # Things from masks, against the rule written out with sets.
@@ -109,7 +96,7 @@ def view(of_row, level: int = WHOLE, weights: Array | None = None) -> Array:
     """Pairs of a view in which row i is all in mask `of_row[i]`, or unseen."""
     of_row = np.asarray(of_row)
     seen = np.flatnonzero(of_row != UNSEEN)
-    pairs = np.zeros(len(seen), PAIR)
+    pairs = np.zeros(len(seen), lift.PAIR)
     pairs["row"], pairs["mask"], pairs["level"] = seen, of_row[seen], level
     pairs["weight"] = 1 if weights is None else weights[seen]
     return pairs
@@ -120,7 +107,7 @@ def counts_of(views: Sequence[Array]) -> list[int]:
 
 
 def found(views: Sequence[Array], count: int, **options: int) -> Array:
-    return find_instances(MaskWeights(list(views), counts_of(views), count), **options)
+    return lift.find_instances(lift.MaskWeights(list(views), counts_of(views), count), **options)
 
 
 def random_views(seed: int, count: int = 240, views: int = 8) -> list[Array]:
@@ -165,7 +152,7 @@ def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
         for b, other in enumerate(claims):
             both = len(mine & other)
             union = len(mine & seen[of_view[b]]) + len(other & seen[of_view[a]]) - both
-            if of_view[a] != of_view[b] and both > SAME * union:
+            if of_view[a] != of_view[b] and both > lift.SAME * union:
                 old, new = names[a], names[b]
                 names = [new if name == old else name for name in names]
     kept = sorted({name for name, claim in zip(names, claims, strict=True) if claim})
@@ -176,9 +163,8 @@ def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
 def test_gaussians_belong_to_the_instance_they_paint_most(seed, level):
     views = random_views(seed)
     counts, things = counts_of(views), found(views, 240, level=level)
-    np.testing.assert_array_equal(
-        find_instances(MaskWeights(views, counts, 240, 37), level), things
-    )  # blocks
+    in_blocks = lift.find_instances(lift.MaskWeights(views, counts, 240, 37), level)
+    np.testing.assert_array_equal(in_blocks, things)
     numbers = np.array(plain_masks_of_things(views, level))
     weights = np.zeros((240, numbers.max() + 1))
     for first, pairs in zip(np.cumsum([0, *counts]), views, strict=False):
@@ -220,11 +206,11 @@ CASES = {
     "a mask over two things merges neither": (
         [view(HALVES), view(1 - HALVES), view(np.zeros(40, int))], HALVES
     ),
-    "no masks": ([np.zeros(0, PAIR)] * 2, np.full(5, NO_NODE)),
+    "no masks": ([np.zeros(0, lift.PAIR)] * 2, np.full(5, NO_NODE)),
     "views without masks": (
-        [np.zeros(0, PAIR), view(np.zeros(12, int)), np.zeros(0, PAIR), view(np.zeros(12, int))], np.zeros(12)
+        2 * [np.zeros(0, lift.PAIR), view(np.zeros(12, int))], np.zeros(12)
     ),
-    "no Gaussians": ([np.zeros(0, PAIR)], np.zeros(0)),
+    "no Gaussians": ([np.zeros(0, lift.PAIR)], np.zeros(0)),
 }  # fmt: skip
 
 
@@ -269,9 +255,9 @@ def test_votes_count_masks_of_just_one_node():
         photograph((rows >= 13).astype(int), 1),  # 13 and 27: overlaps of 0.65, 0.74 and 0.675
         photograph(0 * rows, 2, seen=8),  # 24 pixels show nothing
         photograph(0 * rows, 2, seen=9),  # the part that is seen is all that counts
-        np.zeros(0, PAIR),
+        np.zeros(0, lift.PAIR),
     ]
-    votes = count_votes(tree, MaskWeights(views, [1, 2, 2, 1, 1, 0], 40))
+    votes = lift.count_votes(tree, lift.MaskWeights(views, [1, 2, 2, 1, 1, 0], 40))
     assert votes.tolist() == [[3, 1], [2, 1], [3, 1]]
 
 
@@ -282,12 +268,12 @@ def test_votes_count_masks_of_just_one_node():
 def lifting(gaussians):
     """MaskWeights and ungrouped masks of three views."""
     views = make_views()
-    groups = group_masks([features.vectors for _, features in views])
+    groups = lift.group_masks([features.vectors for _, features in views])
     return find_mask_weights(ReferenceRasterizer(), gaussians, views), groups
 
 
 def test_mean_lift_weights_vectors_by_blending_weights(gaussians, lifting):
-    vectors, confidence = lift_sample(*lifting, np.arange(25), robust=False)
+    vectors, confidence = lift.lift_sample(*lifting, np.arange(25), robust=False)
     assert vectors.shape == (3, 25, LIFTED_DIM)
     assert (vectors[0] == 0).all()
     assert (confidence[0] == 0).all()
@@ -305,14 +291,14 @@ def test_mean_lift_weights_vectors_by_blending_weights(gaussians, lifting):
 
 def test_lifting_a_sample_equals_its_rows_of_the_whole(lifting):
     mask_weights, groups = lifting
-    whole, weight = lift_weights(mask_weights.block(0, groups), groups.vectors, robust=True)
+    whole, weight = lift.lift_weights(mask_weights.block(0, groups), groups.vectors, robust=True)
     rows = np.array([0, 3, 7, 8, 22, 24])
     again = replace(mask_weights, block_size=8)
     assert again.blocks == [(0, 8), (8, 16), (16, 24), (24, 25)]
-    some, confidence = lift_sample(again, groups, rows, robust=True)
+    some, confidence = lift.lift_sample(again, groups, rows, robust=True)
     np.testing.assert_allclose(some, whole[:, rows], atol=1e-6)
     np.testing.assert_allclose(confidence, weight[:, rows], rtol=1e-6)
-    assert lift_sample(again, groups, rows[:0], robust=True)[0].shape == (3, 0, LIFTED_DIM)
+    assert lift.lift_sample(again, groups, rows[:0], robust=True)[0].shape == (3, 0, LIFTED_DIM)
 
 
 def test_median_outvotes_a_wrong_mask_that_the_mean_follows():
@@ -322,8 +308,8 @@ def test_median_outvotes_a_wrong_mask_that_the_mean_follows():
     vectors = unit(np.concatenate([np.tile(good, (7, 1)), np.tile(bad, (3, 1))]) + noise).astype(np.float32)
     # Of one Gaussian, at level "whole".
     weights = csr_matrix(np.repeat([[0, 0, 1]], 10, 1).astype(np.float32))
-    mean = lift_weights(weights, vectors, robust=False)[0][2, 0]
-    median = lift_weights(weights, vectors, robust=True)[0][2, 0]
+    mean = lift.lift_weights(weights, vectors, robust=False)[0][2, 0]
+    median = lift.lift_weights(weights, vectors, robust=True)[0][2, 0]
     assert median @ good > 0.98
     assert median @ good > mean @ good + 0.02
     converged = unit(vectors.sum(0))
@@ -335,7 +321,9 @@ def test_median_outvotes_a_wrong_mask_that_the_mean_follows():
 def test_views_without_masks_lift_nothing(gaussians):
     empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, LIFTED_DIM), np.float32))
     mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, [(random_camera(0, 8, 6), empty)])
-    vectors, confidence = lift_sample(mask_weights, group_masks([empty.vectors]), np.arange(25), robust=True)
+    vectors, confidence = lift.lift_sample(
+        mask_weights, lift.group_masks([empty.vectors]), np.arange(25), robust=True
+    )
     assert vectors.shape == (3, 25, LIFTED_DIM)
     assert not vectors.any()
     assert not confidence.any()
@@ -348,7 +336,7 @@ def test_one_pass_is_the_weighted_mean_of_latents():
     gaussians = random_gaussians(25, 3)
     views = make_views()
     codec = LinearCodec(np.eye(LIFTED_DIM, dtype=np.float32)[:4])
-    latents, confidence = lift_latents(ReferenceRasterizer(), gaussians, views, codec)
+    latents, confidence = lift.lift_latents(ReferenceRasterizer(), gaussians, views, codec)
     total, weight = np.zeros((25, 4)), np.zeros(25)
     for camera, features in views:
         weights = dense_weights(gaussians, camera)
@@ -399,8 +387,8 @@ def l1(latents: Array, pairs: list[tuple[Camera, ImageFeatures]]) -> float:
 def test_descent_from_the_mean_lowers_the_loss():
     pairs = views()
     cpu = load_lifting_rasterizer("cpu")
-    start, confidence = lift_latents(cpu, GAUSSIANS, pairs, CODEC)
-    latents, same = lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, replace(SHORT, steps=300))
+    start, confidence = lift.lift_latents(cpu, GAUSSIANS, pairs, CODEC)
+    latents, same = lift.lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, replace(SHORT, steps=300))
     np.testing.assert_array_equal(confidence, same)
     assert l1(latents, pairs) < l1(start, pairs)
     assert not latents[0].any()  # no masks at this level
@@ -411,8 +399,8 @@ def test_descent_from_the_mean_lowers_the_loss():
 @pytest.mark.long
 def test_backends_descend_to_the_same_latents():
     pairs = views()
-    fast = lift_by_gradient(load_lifting_rasterizer("cpu"), GAUSSIANS, pairs, CODEC, SHORT)[0]
-    slow = lift_by_gradient(load_lifting_rasterizer("reference"), GAUSSIANS, pairs, CODEC, SHORT)[0]
+    fast = lift.lift_by_gradient(load_lifting_rasterizer("cpu"), GAUSSIANS, pairs, CODEC, SHORT)[0]
+    slow = lift.lift_by_gradient(load_lifting_rasterizer("reference"), GAUSSIANS, pairs, CODEC, SHORT)[0]
     cosines = (unit(fast[2]) * unit(slow[2])).sum(1)
     assert np.median(cosines) > 0.9999  # the sign of a difference near zero may turn: single ones move
     assert l1(fast, pairs) == pytest.approx(l1(slow, pairs), abs=2e-3)
@@ -421,18 +409,20 @@ def test_backends_descend_to_the_same_latents():
 @pytest.mark.long
 def test_published_start_at_zero_descends_under_its_normalisation():
     pairs, config = views(), replace(SHORT, start="zeros-as-published")
-    latents, _ = lift_by_gradient(load_lifting_rasterizer("cpu"), GAUSSIANS, pairs, CODEC, config)
+    latents, _ = lift.lift_by_gradient(load_lifting_rasterizer("cpu"), GAUSSIANS, pairs, CODEC, config)
     assert l1(latents, pairs) < 0.99 * l1(np.zeros_like(latents), pairs)
 
 
 @pytest.mark.long
 def test_gradient_lift_is_deterministic_and_interruptible(monkeypatch):
     pairs, cpu = views(), load_lifting_rasterizer("cpu")
-    one = lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT)[0]
+    one = lift.lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT)[0]
     monkeypatch.setattr(lift, "KEPT_BYTES", 0)  # every view is projected anew
-    two = lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT)[0]
+    two = lift.lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT)[0]
     np.testing.assert_array_equal(one, two)
-    other = lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, replace(SHORT, seed=1))[0]
+    other = lift.lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, replace(SHORT, seed=1))[0]
     assert not np.array_equal(one, other)
     with pytest.raises(WorkCancelledError):
-        lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT, progress=stop_at("training language features"))
+        lift.lift_by_gradient(
+            cpu, GAUSSIANS, pairs, CODEC, SHORT, progress=stop_at("training language features")
+        )
