@@ -154,34 +154,14 @@ def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | 
     return values
 
 
-def heat_ranges(
-    answers: Answers, scale: tuple[float, float] | None = None, everywhere: bool = False
-) -> Ranges:
-    """Return the values of `heats` at heat 0 and 1 of each slot, by `scale`, in relevancies, or its own."""
-
-    def ends(answer: Answer) -> tuple[float, float]:
-        low, high = answer.heat_range
-        coldest, hottest = scale or answer.heat_range
-        if everywhere:
-            return -coldest, -hottest
-        first, last = (HEAT_BASE + (1 - HEAT_BASE) * (end - low) / (high - low) for end in (coldest, hottest))
-        return first, last
-
-    return _ranges(answers, ends)
-
-
-def member_ranges(answers: Answers, *_: object) -> Ranges:
-    """Range of members for each slot, which are 0 or 1; a weak match is half as opaque."""
-    return _ranges(answers, lambda answer: (0.0, 1.0))
-
-
-def _ranges(answers: Answers, ends: Callable[[Answer], tuple[float, float]]) -> Ranges:
-    """Return the range of each slot; weak matches reach half of it."""
-    ranges = [NO_HEAT] * len(answers)
-    for slot, answer in painted(answers).items():
-        low, high = ends(answer)
-        ranges[slot] = low, low + (high - low) / STRENGTH[answer.verdict]
-    return tuple(ranges)
+def _heat_ends(answer: Answer, scale: tuple[float, float] | None, everywhere: bool) -> tuple[float, float]:
+    """Return the values of `heats` at the ends of `scale`, in relevancies, or of the answer's own range."""
+    low, high = answer.heat_range
+    coldest, hottest = scale or answer.heat_range
+    if everywhere:
+        return -coldest, -hottest
+    first, last = (HEAT_BASE + (1 - HEAT_BASE) * (end - low) / (high - low) for end in (coldest, hottest))
+    return first, last
 
 
 def latents(subject: Subject) -> Array | None:
@@ -268,8 +248,6 @@ class DisplayRow:
     label: str  # on its button
     drawing: Drawing
     channel: Callable[[Subject], Array | None] | Literal["depth"] | None = None  # (N, 1 to 3), or camera z
-    # of the answers, by `PictureConfig.heat_scale`; and whether heat is of everything
-    ranges: Callable[[Answers, tuple[float, float] | None, bool], Ranges] = lambda answers, scale, every: ()
     uses_map: bool = False  # it shows numbers by the colour map
     by_level: bool = False  # it has a button for each semantic level
     needs_query: bool = False  # shows answers
@@ -279,13 +257,29 @@ class DisplayRow:
         """True where it shows the language field."""
         return self.needs_query or self.by_level
 
+    def ranges(
+        self, answers: Answers, scale: tuple[float, float] | None = None, everywhere: bool = False
+    ) -> Ranges:
+        """Return the range of each slot, half of which weak matches reach; () where no answers are shown.
+
+        scale: that of heat, in relevancies, by default each answer's own; everywhere: heat is of everything.
+        """
+        if not self.needs_query:
+            return ()
+        ranges = [NO_HEAT] * len(answers)
+        for slot, answer in painted(answers).items():
+            hot = self.drawing is Drawing.HEAT
+            low, high = _heat_ends(answer, scale, everywhere) if hot else (0.0, 1.0)
+            ranges[slot] = low, low + (high - low) / STRENGTH[answer.verdict]
+        return tuple(ranges)
+
 
 _ROWS = (
     DisplayRow("rgb", "Colours", Drawing.COLOURS),
     DisplayRow("depth", "Depth", Drawing.DEPTH, "depth", uses_map=True),
     DisplayRow("alpha", "Alpha", Drawing.ALPHA),
-    DisplayRow("relevancy", "Relevancy", Drawing.HEAT, heats, heat_ranges, uses_map=True, needs_query=True),
-    DisplayRow("segmentation", "Segmentation", Drawing.SEGMENTS, members, member_ranges, needs_query=True),
+    DisplayRow("relevancy", "Relevancy", Drawing.HEAT, heats, uses_map=True, needs_query=True),
+    DisplayRow("segmentation", "Segmentation", Drawing.SEGMENTS, members, needs_query=True),
     DisplayRow("latent", "Latent", Drawing.SUMS, latents, by_level=True),
     DisplayRow("tree", "Tree", Drawing.SUMS, nodes, by_level=True),
 )

@@ -15,7 +15,7 @@ from PIL import Image
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
-from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats
+from langsplat_core.display.displays import DISPLAYS, Channels, Subject, heats
 from langsplat_core.errors import expect
 from langsplat_core.pipeline.webpage import PageReport, make_page
 from langsplat_core.query.answers import QueryResult
@@ -88,7 +88,8 @@ def draw(
         camera = min(fitted, key=partial(view_distance, place=answer.place), default=camera)
     drawn = render(scene, camera, heats(Subject(len(scene.gaussians), answers=[answer])))
     heat = Channels(drawn.colours, drawn.alpha, drawn.values)
-    return Image.fromarray(compose(heat, PictureConfig(display="relevancy"), heat_ranges([answer])))
+    ranges = DISPLAYS["relevancy"].ranges([answer])
+    return Image.fromarray(compose(heat, PictureConfig(display="relevancy"), ranges))
 
 
 def view_distance(camera: Camera, place: Array) -> float:

@@ -24,10 +24,8 @@ from langsplat_core.display.displays import (
     STRIPE_PX,
     Channels,
     Subject,
-    heat_ranges,
     heats,
     mapped,
-    member_ranges,
     members,
     nodes,
     painted,
@@ -38,7 +36,7 @@ from tests.support.scenes import chain_of_levels, random_answer
 
 PICTURE = PictureConfig()
 HEAT = PictureConfig(display="relevancy", heat_opacity=1.0)
-RANGES = ((0.5, 0.9),)
+RANGES, HEATED = ((0.5, 0.9),), DISPLAYS["relevancy"]
 FOUND = random_answer(360, 1)
 WEAK, ABSENT = replace(FOUND, verdict="weak match"), replace(FOUND, verdict="not here")
 
@@ -56,21 +54,21 @@ def test_displays_are_those_of_the_settings():
     assert len({row.label for row in DISPLAYS.values()}) == len(DISPLAYS)
 
 
-@pytest.mark.parametrize(("channel", "ranges"), [(heats, heat_ranges), (members, member_ranges)])
-def test_absent_answers_paint_nothing(channel, ranges):
+@pytest.mark.parametrize(("channel", "display"), [(heats, "relevancy"), (members, "segmentation")])
+def test_absent_answers_paint_nothing(channel, display):
     assert channel(Subject(360, answers=(ABSENT,))) is None
     values = channel(Subject(360, answers=(ABSENT, FOUND)))
     assert not values[:, 0].any()
     assert values[:, 1].any()
-    assert ranges((ABSENT, FOUND, None))[0] == NO_HEAT
+    assert DISPLAYS[display].ranges((ABSENT, FOUND, None))[0] == NO_HEAT
     assert painted((ABSENT, FOUND, None)) == {1: FOUND}
 
 
 def test_a_weak_match_is_never_hotter_than_half():
-    (low, high), (weak_low, weak_high) = heat_ranges((FOUND, WEAK))
+    (low, high), (weak_low, weak_high) = HEATED.ranges((FOUND, WEAK))
     assert (low, high) == pytest.approx((HEAT_BASE, 1))
     assert (high - weak_low) / (weak_high - weak_low) == pytest.approx(0.5)
-    assert member_ranges((FOUND, WEAK)) == ((0.0, 1.0), (0.0, 2.0))
+    assert DISPLAYS["segmentation"].ranges((FOUND, WEAK)) == ((0.0, 1.0), (0.0, 2.0))
 
 
 def heat_of(values: np.ndarray, ranges) -> np.ndarray:
@@ -82,7 +80,7 @@ def heat_of(values: np.ndarray, ranges) -> np.ndarray:
 @pytest.mark.parametrize("scale", [None, (0.4, 0.95)])
 def test_heat_is_of_the_members_by_what_is_chosen(of, scale):
     shown = {"smooth": FOUND.smooth, "own": FOUND.relevancy[2], "node": FOUND.even}[of]
-    values, ranges = heats(Subject(360, answers=(FOUND,), heat=of)), heat_ranges((FOUND,), scale)
+    values, ranges = heats(Subject(360, answers=(FOUND,), heat=of)), HEATED.ranges((FOUND,), scale)
     low, high = scale or FOUND.heat_range
     inside = FOUND.members
     assert (values[inside] >= np.float32(HEAT_BASE)).all()
@@ -96,7 +94,7 @@ def test_heat_of_a_level_and_of_everything_is_of_every_gaussian(level, of):
     values = heats(Subject(360, answers=(FOUND,), level=level, heat=of))
     low, high = FOUND.heat_range
     own = FOUND.relevancy[2 if level is None else level]
-    heat = heat_of(values, heat_ranges((FOUND,), everywhere=True))
+    heat = heat_of(values, HEATED.ranges((FOUND,), everywhere=True))
     assert_allclose(heat, np.clip((own - low) / (high - low), 0, 1), atol=1e-5)
     assert (values <= 0).all()  # no pixel is inside of anything
 

@@ -20,7 +20,7 @@ from langsplat_core.cli.app import parse
 from langsplat_core.cli.export import Export
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
-from langsplat_core.display.displays import Channels, Subject, heat_ranges, heats
+from langsplat_core.display.displays import DISPLAYS, Channels, Subject, heats
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import write_whole
 from langsplat_core.io.scenes import load_scene, save_scene
@@ -129,7 +129,8 @@ def test_page_draws_heat_and_latents_as_opengl_does(tab, demo, engine, gl, measu
     camera, origin = demo.cameras[3], demo.bounds()[0]
     answer = engine.run("teddy bear")
     ours = tab.image(camera, origin, "relevancy", "teddy bear")
-    values, ranges = heats(Subject(len(demo.gaussians), answers=[answer])), heat_ranges([answer])
+    values = heats(Subject(len(demo.gaussians), answers=[answer]))
+    ranges = DISPLAYS["relevancy"].ranges([answer])
     compare(measured, "demo, heat", ours, drawn(gl, demo, camera, values, display="relevancy", ranges=ranges))
     ours = tab.image(camera, origin, "latent")
     theirs = drawn(gl, demo, camera, demo.language.colours[2], display="latent")
