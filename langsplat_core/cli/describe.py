@@ -17,7 +17,7 @@ from langsplat_core.cli.arguments import EncoderOption, JsonOption, Needs, Train
 from langsplat_core.cli.query import Unit, basis_fields, camera_of, in_world
 from langsplat_core.cli.run import aligned, print_json
 from langsplat_core.config import CountOrZero, Level, PictureConfig
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import InputError
 from langsplat_core.io import sidecar as files
 from langsplat_core.io.files import check_output_file, locked
 from langsplat_core.io.scenes import check_writable, companion_path
@@ -223,10 +223,7 @@ class Teach:
         if not self.into.exists():
             return ()
         words = files.read_words(self.into)
-        try:
-            check_words(field, words)
-        except EncoderError as error:
-            raise EncoderError(f"{self.into}: {error}") from None
+        check_words(field, words)
         return words.words
 
 

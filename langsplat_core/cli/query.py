@@ -2,7 +2,7 @@
 
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -80,21 +80,21 @@ def in_world(content: Any, origin: Array) -> Any:
     }
 
 
-def instance_lines(instances: Sequence[Instance], unit: Unit) -> list[str]:
-    """Return aligned lines under a heading, one for each instance; none without instances."""
+def instance_lines(instances: Sequence[Mapping[str, Any]], unit: Unit) -> list[str]:
+    """Return aligned lines under a heading, one for each entry of `listed`; none without instances."""
     if not instances:
         return []
     rows = [("", "score", "share", "Gaussians", f"centre, {unit.name}", f"size, {unit.name}")]
     rows += [
         (
-            str(number),
-            f"{instance.score:.3f}",
-            f"{100 * instance.share:.0f} %",
-            f"{instance.count}",
-            unit.place(instance.centre),
-            unit.format(instance.size, " x "),
+            str(one["number"]),
+            f"{one['score']:.3f}",
+            f"{100 * one['share']:.0f} %",
+            f"{one['gaussians']}",
+            unit.place(one["centre"]),
+            unit.format(one["size"], " x "),
         )
-        for number, instance in enumerate(instances, 1)
+        for one in instances
     ]
     return aligned(rows)
 
@@ -190,40 +190,24 @@ class QueryScene:
             raise InputError("no phrase given; for example: langsplat query scene.ply 'blue gift'")
         explain = _Explainer(self, scene) if self.why is not None else None
         camera = camera_of(scene, self.camera or 0) if scene.cameras or self.camera else None
-        engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
-        unit = Unit(self.scale or scene.metres_per_unit, scene.origin)
+        words = None if self.taught is None else read_words(self.taught)
+        engine = QueryEngine(scene, once(load_text_encoder), encoder_id=self.encoder, words=words)
         texts = self._askable(engine, camera)
         outlined = self._outlined(scene, texts) if self.segmenter else {}
-        drawn = camera if self.camera is not None or len(texts) <= CHANNELS_AT_ONCE else None
-        if camera is not drawn:
-            log.info("pixels of more than %d phrases are found with --camera INDEX", CHANNELS_AT_ONCE)
-        view = None if drawn is None else view_of(scene, drawn)
-        asked: dict[str, tuple[dict[str, Any], list[str]]] = {}  # phrase -> answer, lines of its things
+        view = self._view(scene, camera, len(texts))
         # One after the other: an answer has a number for every Gaussian and level.
-        for text in dict.fromkeys(texts):
-            result, tree, of = self._ask(engine, text, camera)
-            masked = compose.with_masks(engine, result, outlined[text][0]) if outlined else None
-            result = result if masked is None else masked.answer
-            answer = _answer(result, camera) | {"reading": None if tree is None else unparse(tree)}
-            answer |= {} if view is None else _pixel(view, engine, result, self.mode)
-            things = engine.instances(result, self.instances) if result.found else ()
-            counts = result.found or (isinstance(tree, Counted) and result.verdict == "weak match")
-            number = compose.count_instances(engine, result) if counts else compose.InstanceCount(0, 0, 0)
-            answer |= {"count": {"best": number.best, "least": number.least, "most": number.most}}
-            because = {} if explain is None else {"evidence": explain(engine, result, of)}
-            answer |= basis_fields(engine) | {"metres_per_unit": unit.metres, **listed(things), **because}
-            asked[text] = answer, instance_lines(things, unit) + _reasons(**because)
-            if masked is not None:
-                counted = f"outlined in {outlined[text][1]} of {len(scene.cameras)} photographs"
-                answer["photographs_with_masks"] = outlined[text][1]
-                asked[text][1].insert(0, _found_by(masked, answer, things, counted))
+        asked = {
+            text: self._answered(engine, text, camera, view, outlined.get(text), explain)
+            for text in dict.fromkeys(texts)
+        }
         if explain is not None:
             explain.write()
         if self.json:
-            print_json(in_world([asked[text][0] for text in texts], scene.origin))
+            print_json(in_world([asked[text] for text in texts], scene.origin))
             return
-        for answer, table in map(asked.__getitem__, texts):
-            print(*_lines(answer, unit), *table, sep="\n")
+        unit = Unit(self.scale or scene.metres_per_unit, scene.origin)
+        for text in texts:
+            print(*_lines(asked[text], unit, len(scene.cameras)), sep="\n")
         print(f"answers: {engine.basis.long}")
 
     @property
@@ -241,6 +225,14 @@ class QueryScene:
                 scene, lambda camera: segment(photographs[camera.name], phrases), progress
             )
         return dict(zip(phrases, zip(shares.T, counts.tolist(), strict=True), strict=True))
+
+    def _view(self, scene: Scene, camera: Camera | None, count: int) -> View | None:
+        """Return the view in which the pixels of `count` phrases are found; None where none is wanted."""
+        if camera is not None and (self.camera is not None or count <= CHANNELS_AT_ONCE):
+            return view_of(scene, camera)
+        if camera is not None:
+            log.info("pixels of more than %d phrases are found with --camera INDEX", CHANNELS_AT_ONCE)
+        return None
 
     def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
         """Return the phrases that can be asked; report others on stderr, raise if none is left."""
@@ -264,6 +256,35 @@ class QueryScene:
         for reason, same in reasons.items():
             print(f"langsplat: not asked: {', '.join(map(repr, same))}: {reason}", file=sys.stderr)
         return [phrase for phrase in phrases if phrase not in unasked]
+
+    def _answered(
+        self,
+        engine: QueryEngine,
+        text: str,
+        camera: Camera | None,
+        view: View | None,
+        outlined: tuple[Array, int] | None,
+        explain: "_Explainer | None",
+    ) -> dict[str, Any]:
+        """Return the answer to a phrase with its instances, ready for JSON; what is printed is made of it."""
+        result, tree, of = self._ask(engine, text, camera)
+        masked = None if outlined is None else compose.with_masks(engine, result, outlined[0])
+        result = result if masked is None else masked.answer
+        answer = _answer(result, camera) | {"reading": None if tree is None else unparse(tree)}
+        answer |= {} if view is None else _pixel(view, engine, result, self.mode)
+        things = engine.instances(result, self.instances) if result.found else ()
+        counts = result.found or (isinstance(tree, Counted) and result.verdict == "weak match")
+        number = compose.count_instances(engine, result) if counts else compose.InstanceCount(0, 0, 0)
+        metres = self.scale or engine.scene.metres_per_unit
+        answer |= {"count": asdict(number)} | basis_fields(engine) | {"metres_per_unit": metres}
+        answer |= listed(things)
+        if explain is not None:
+            answer["evidence"] = explain(engine, result, of)
+        if masked is not None and outlined is not None:
+            answer |= {"photographs_with_masks": outlined[1], "found_by": masked.found_by()}
+            for entry, thing in zip(answer["instances"], things, strict=True):
+                entry["found_by"] = masked.found_by(thing.members)
+        return answer
 
     def _ask(
         self, engine: QueryEngine, text: str, camera: Camera | None
@@ -320,27 +341,6 @@ class _Explainer:
             Image.fromarray(np.concatenate(self._sheets)).save(temporary, "PNG")
 
 
-def _found_by(
-    masked: compose.MaskedAnswer, answer: dict[str, Any], things: Sequence[Instance], counted: str
-) -> str:
-    """Add "found_by" to an answer, ready for JSON, and to its instances; return it as a line of text."""
-    by = [masked.found_by(thing.members) for thing in things]
-    for entry, found_by in zip(answer["instances"], by, strict=True):
-        entry["found_by"] = found_by
-    answer["found_by"] = masked.found_by()
-    listed = (f", {by.count(found_by)} listed by {found_by}" for found_by in dict.fromkeys(by))
-    return f"  found by {masked.found_by()}: {counted}{''.join(listed)}"
-
-
-def _reasons(evidence: dict[str, Any] | None = None) -> list[str]:
-    if evidence is None:
-        return []
-    votes = [row for row in evidence["rows"] if row["agrees"]]
-    ends = [] if not votes else [("best", votes[0]), ("worst", votes[-1])]
-    said = [f"{name} {row['photograph']}, fit {row['fit']:+.2f}" for name, row in ends]
-    return [f"  why: {'; '.join([evidence['summary'], *said])}"]
-
-
 def once(load: LoadEncoder, instead: str = "") -> LoadEncoder:
     """Return `load`, or that of `instead`, called once for each encoder, also where a hub is out of reach."""
     known: dict[str, TextEncoder | EncoderError] = {}
@@ -358,14 +358,6 @@ def once(load: LoadEncoder, instead: str = "") -> LoadEncoder:
         return found
 
     return load_once
-
-
-def _engine(scene: Scene, load: LoadEncoder, encoder: str, taught: Path | None) -> QueryEngine:
-    words = None if taught is None else read_words(taught)
-    try:
-        return QueryEngine(scene, load, encoder_id=encoder, words=words)
-    except EncoderError as error:
-        raise EncoderError(f"{taught}: {error}") from None
 
 
 def _answer(result: QueryResult, camera: Camera | None) -> dict[str, Any]:
@@ -400,18 +392,31 @@ def _pixel(view: View, engine: QueryEngine, result: QueryResult, mode: str) -> d
     return {"pixel": [column, row], "pixel_score": score}
 
 
-def _lines(answer: dict[str, Any], unit: Unit) -> list[str]:
-    """Return an answer as text: its verdict and where it is, then how the phrase was read."""
-    verdict, reading, count = answer["said"], answer["reading"], answer["count"]
+def _lines(answer: dict[str, Any], unit: Unit, photographs: int) -> list[str]:
+    """Return an answer as text: its verdict and place, how it was read and found, its instances, and why."""
+    verdict, count = answer["said"], answer["count"]
     best, least, most = count["best"], count["least"], count["most"]
     if most > 1 or (most and not answer["found"]):
         verdict += f", {best} of them" + ("" if least == most else f" ({least} to {most})")
     place = "-" if answer["place"] is None else f"{unit.place(answer['place'])} {unit.name}"
-    said = (
+    lines = [
         f"{answer['phrase']}: {verdict}, score {answer['score']:.3f} at level {answer['level']}, "
         f"place {place}, pixel {answer['pixel']}"
-    )
-    return [said] if reading is None else [said, f"  read as: {reading}"]
+    ]
+    if answer["reading"] is not None:
+        lines.append(f"  read as: {answer['reading']}")
+    if "found_by" in answer:
+        by = [entry["found_by"] for entry in answer["instances"]]
+        outlined = f"outlined in {answer['photographs_with_masks']} of {photographs} photographs"
+        each = (f", {by.count(one)} listed by {one}" for one in dict.fromkeys(by))
+        lines.append(f"  found by {answer['found_by']}: {outlined}{''.join(each)}")
+    lines += instance_lines(answer["instances"], unit)
+    if (evidence := answer.get("evidence")) is not None:
+        votes = [row for row in evidence["rows"] if row["agrees"]]
+        ends = {"best": votes[0], "worst": votes[-1]} if votes else {}
+        fits = [f"{name} {vote['photograph']}, fit {vote['fit']:+.2f}" for name, vote in ends.items()]
+        lines.append(f"  why: {'; '.join([evidence['summary'], *fits])}")
+    return lines
 
 
 @dataclass(frozen=True)
@@ -445,7 +450,8 @@ class Select:
             raise InputError(f"{self.out.parent}: no such folder for {self.out.name}; make it first")
         scene = searchable(self.scene)
         unit = Unit(self.scale or scene.metres_per_unit, scene.origin)
-        engine = _engine(scene, load_text_encoder, self.encoder, self.taught)
+        words = None if self.taught is None else read_words(self.taught)
+        engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder, words=words)
         answers = [found_answer(engine, text, self.level) for text in self.texts]
         answer = answers[0] if len(answers) == 1 else compose.joined(answers, all_needed=True)
         found = engine.instances(answer)
@@ -471,6 +477,6 @@ class Select:
             }
             print_json(in_world(content, unit.origin))
             return
-        print("\n".join(instance_lines(found, unit)))
+        print("\n".join(instance_lines(listed(found)["instances"], unit)))
         of = f"all but the {selected} selected" if self.remove else f"of {selected} selected Gaussians"
         print(f"{self.out}: {written} Gaussians, {of}")

@@ -348,6 +348,7 @@ class Words:
     encoder_id: str
     canonical: Array  # (4, D) float32 unit text vectors of its canonical phrases, which identify it
     words: tuple[TaughtWord, ...]
+    path: Path | None = None  # the file that they were read from
 
 
 def write_words(path: Path | str, words: Words) -> None:
@@ -367,7 +368,7 @@ def read_words(path: Path | str) -> Words:
             check_array("taught", word.vectors, ("T", "D"), dims)
         if len({word.key for word in words}) != len(words):
             raise ValueError("two taught words have one name")
-        return Words(about["encoder"], tensors["canonical"], words)
+        return Words(about["encoder"], tensors["canonical"], words, path)
 
 
 def _narrow(tensor: Array) -> Array:

@@ -481,8 +481,9 @@ class QueryEngine:
 def check_words(field: LanguageField, words: Words) -> None:
     """Raise EncoderError unless taught words are of a field's encoder, by its canonical vectors."""
     if not same_vectors(words.canonical, field.canonical):
+        which = f"{words.path}: these words" if words.path else "these words"
         raise EncoderError(
-            f"these words were taught with {words.encoder_id}, the scene was made with {field.encoder_id}; "
+            f"{which} were taught with {words.encoder_id}, the scene was made with {field.encoder_id}; "
             "teach them in a scene of that encoder"
         )
 
