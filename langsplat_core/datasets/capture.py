@@ -1,7 +1,6 @@
 """Captures: photographs with known cameras, as every loader returns them.
 
-The module also chooses the views that are held out, estimates the length of a unit, and draws random points
-in view of the cameras.
+The module also chooses the views that are held out, the length of a unit, and random points in view.
 """
 
 import hashlib
@@ -24,6 +23,7 @@ from langsplat_core.datasets.photos import (
     Layers,
     Photo,
     View,
+    content,
     counted,
     developer,
     exif_facts,
@@ -106,6 +106,11 @@ class Capture:
         digest.update(self.colours.tobytes())
         return digest.hexdigest()
 
+    def contents(self) -> dict[str, str]:
+        """Return a digest of each photograph's file by the name of its camera."""
+        rows = zip(self.cameras, self.photos, strict=False)  # there are no files of images made otherwise
+        return {camera.name: content(photo.path)[:16] for camera, photo in rows}
+
     def shrunk(self, indices: Sequence[int], longer_side: int) -> "Capture":
         """Return the photographs at `indices`, at most `longer_side` pixels long, with the points of all."""
         views: list[View] = []
@@ -119,8 +124,7 @@ class Capture:
     def read_at(self, indices: Sequence[int], longer_side: int) -> "Capture":
         """Return photographs, bit for bit as a dataset has them that is read at this size.
 
-        The points stay those of all. Without files, images are `shrunk`. InputError if a file can no longer
-        be read.
+        The points stay those of all. Without files, images are `shrunk`. InputError for an unreadable file.
         """
         if not self.photos or longer_side >= max(max(self.images[index].shape) for index in indices):
             return self.shrunk(indices, longer_side)

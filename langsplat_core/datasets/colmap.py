@@ -145,10 +145,7 @@ def _content(path: Path, quiet: bool = False) -> Any:
 def lens_of(name: str, width: int, height: int, parameters: Array) -> PhotoIntrinsics:
     """Return the lens of a model's camera; ValueError for an unknown kind or impossible parameters."""
     if name not in LENSES:
-        raise ValueError(
-            f"{printable_line(name, 40)} is no camera that is read here; undistort the photographs with "
-            "`colmap image_undistorter`"
-        )
+        raise ValueError(f"{printable_line(name, 40)} is not read; run `colmap image_undistorter` first")
     _, formula, keys = LENSES[name]
     values = dict(zip(keys.split(), map(float, parameters), strict=True))
     if not np.isfinite(parameters).all():
@@ -340,9 +337,7 @@ def load_colmap(folder: Path, model_folder: Path, config: DatasetConfig, progres
     if without := {path.name for path in present} - {photo.path.name for photo in there}:
         share = f"cameras for only {len(there)} of the {len(present)} photographs beside it"
         lost = shortened(without)
-        report_loss(
-            "%s has %s, and another model may have more: without %s", shown(model_folder), share, lost
-        )
+        report_loss("%s has %s; another model may have more: without %s", shown(model_folder), share, lost)
     return develop(there, config, progress, *good_points(model, "the COLMAP model"))
 
 

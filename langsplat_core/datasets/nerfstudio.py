@@ -196,9 +196,7 @@ def _distortion(values: Json) -> Distortion:
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
         return FisheyeDistortion(k1, k2, k3, k4)
     if model not in PERSPECTIVE:
-        raise ValueError(
-            f'"camera_model" {quoted(model)} is not one of {", ".join(PERSPECTIVE)}, OPENCV_FISHEYE'
-        )
+        raise ValueError(f"camera_model {quoted(model)} is none of {', '.join(PERSPECTIVE)}, OPENCV_FISHEYE")
     if k4 != 0:
         raise ValueError('"k4" has no agreed meaning for a perspective lens; undistort the photographs first')
     return BrownDistortion(k1, k2, p1, p2, k3)

@@ -1,5 +1,6 @@
 """Photographs on disk: finding them, reading them whatever their kind, and resampling them to pinholes."""
 
+import hashlib
 import logging
 import math
 import os
@@ -59,6 +60,15 @@ def find_photos(folder: Path, below: int = 0) -> list[Path]:
     return found + [photo for path in inside for photo in find_photos(path, below - 1)]
 
 
+def content(path: Path) -> str:
+    """Return a digest of a file's content, the same for copies; empty if it may not be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""
+
+
 def photo_folder(folder: Path) -> tuple[Path, list[Path]]:
     """Return the folder of the photographs of a dataset, and these; none where there are none.
 
@@ -96,10 +106,8 @@ def say_unread(folder: Path, photos: Sequence[Path]) -> None:
     if videos:
         log.warning("%d videos are not read, train each by itself: %s", len(videos), shortened(videos))
     if more:
-        remedy = "move them beside the others if they belong to them"
-        log.warning(
-            "%d photographs in other folders are not read: %s; %s", len(more), shortened(more), remedy
-        )
+        what = f"are not read: {shortened(more)}; move them beside the others if they belong to them"
+        log.warning("%d photographs in other folders %s", len(more), what)
 
 
 def finder(folder: Path) -> Callable[[str], Path]:

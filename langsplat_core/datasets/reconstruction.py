@@ -126,9 +126,8 @@ def triangulate(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -
             model.add_image_with_trivial_frame(image, pose)
     attempts = folder / "attempts"
     attempts.mkdir(exist_ok=True)
-    result = pycolmap.triangulate_points(
-        reconstruction=model, **_paths(folder, attempts), options=_repeatable()
-    )
+    paths = _paths(folder, attempts)
+    result = pycolmap.triangulate_points(reconstruction=model, **paths, options=_repeatable())
     store_model(result, folder)
 
 

@@ -3,7 +3,6 @@
 Both are found by structure from motion in a process of its own (`reconstruction`), kept in ``work/sfm-*``.
 """
 
-import hashlib
 import logging
 import shutil
 from collections.abc import Sequence
@@ -40,13 +39,11 @@ def load_photos(
 ) -> Capture:
     """Locate photographs in or below `folder` (kept in ``work/sfm-*``) and load them; see `load_capture`."""
     if len(paths) < MIN_PHOTOS:
-        raise InputError(
-            f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed, each sharing "
-            "at least two thirds of its view with the next"
-        )
+        needed = f"at least {MIN_PHOTOS} are needed, {workspaces.SHARING}"
+        raise InputError(f"{folder} has {len(paths)} photographs; {needed}")
     labels = {path: path.relative_to(folder).as_posix() for path in paths}
-    contents = [(labels[path], _content(path)) for path in paths]
-    masked = [(labels[path], _content(mask)) for path in paths if (mask := photos.mask_beside(path))]
+    contents = [(labels[path], photos.content(path)) for path in paths]
+    masked = [(labels[path], photos.content(mask)) for path in paths if (mask := photos.mask_beside(path))]
     workspace = workspaces.open_workspace(work, ["photographs", 5, SMALL, SIDE, contents, masked])
     files = numbered(paths)
     told = (workspace / TRIED).exists()
@@ -55,21 +52,17 @@ def load_photos(
             workspaces.run_apart(_locate, workspace, files, workspace=workspace, progress=progress)
         except workspaces.FAILURES as error:
             reason = str(error).partition("\n")[0]
-            raise InputError(
-                f"structure from motion failed ({reason}); remove {workspace} and try again"
-            ) from None
+            raise InputError(f"no cameras were found ({reason}); remove {workspace} and try again") from None
     model = _stored_model(workspace) if model_suffix(workspace / "sparse") else None
-    matches = workspaces.read_matches(
-        workspace, files, {image.name for image in model.images} if model else ()
-    )
+    placed = {image.name for image in model.images} if model else set()
+    matches = workspaces.read_matches(workspace, files, placed)
     lost: dict[str, list[str]] = {}  # by the reason
     for row, name in enumerate(labels.values()):
         if row not in matches.located:
             lost.setdefault(matches.why(row), []).append(name)
     found = len(matches.located)
-    if model is None or (
-        found < max(MIN_PHOTOS, LEAST_LOCATED * len(files)) and not config.allow_few_cameras
-    ):
+    few = found < max(MIN_PHOTOS, LEAST_LOCATED * len(files)) and not config.allow_few_cameras
+    if model is None or few:
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
         raise InputError(
             f"only {found} of {len(files)} photographs could be located together "
@@ -93,15 +86,6 @@ def load_photos(
 def numbered(paths: Sequence[Path]) -> dict[str, Path]:
     """Return photographs by their names in the workspace."""
     return {f"{index:05d}.jpg": path for index, path in enumerate(paths)}
-
-
-def _content(path: Path) -> str:
-    """Return a digest of a file's content, the same for copies; empty if it may not be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return ""
 
 
 def _listed(lost: dict[str, list[str]], limit: int) -> str:
@@ -172,9 +156,7 @@ def _small_copies(
     progress("preparing photographs", 1.0)
     count = len(files) - len(broken)
     if count < MIN_PHOTOS:
-        raise InputError(
-            f"only {count} photographs can be read; at least {MIN_PHOTOS} are needed: {shortened(broken)}"
-        )
+        raise InputError(f"only {count} photographs can be read, of {MIN_PHOTOS} needed: {shortened(broken)}")
     if broken and side == SMALL:
         share = f"{len(broken)} of {len(files)} photographs"
         report_loss("%s cannot be read and are left out: %s", share, shortened(broken))

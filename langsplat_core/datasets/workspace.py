@@ -85,6 +85,7 @@ def disk_full(folder: Path) -> OSError:
 
 FEWEST_MATCHES = 15  # that COLMAP's mapper works with
 FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
+SHARING = "each sharing at least two thirds of its view with the next"  # what matches well
 UNREADABLE = "cannot be read"  # why a photograph has no camera
 
 
@@ -122,9 +123,8 @@ class Matches:
     def captures(self) -> list[list[int]]:
         """Rows in groups that may be captures of their own: the first of `groups`, and others unlike it.
 
-        These are groups of three and more that share no matches with the first, or else all other
-        photographs, where they were taken at another time or by another camera; one group where all may
-        belong together.
+        These are groups of three and more that share no matches with the first, or else all others, where
+        they were taken at another time or by another camera; one group where all may belong together.
         """
         first, *others = self.groups or [[]]
         joins = (pair for pair, count in self.shared.items() if count >= FEWEST_MATCHES)
@@ -186,7 +186,7 @@ class Matches:
 
     def advice(self) -> str:
         """Return advice in words: where to take more photographs, or to train captures apart."""
-        more = "take more photographs, each sharing at least two thirds of its view with the next"
+        more = f"take more photographs, {SHARING}"
         if self.gap:
             ends, count = " and ".join(map(self._name, self.gap)), self.shared.get(self.gap) or "no"
             more = f"take more photographs between {ends} ({count} matches)"

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import FormatError, InputError, report_loss, shortened
 from langsplat_core.io.cameras import SUFFIX as CAMERAS
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.pipeline.report import PREVIEW, REPORT, stated_figures, work_folder
@@ -106,11 +106,8 @@ def find_evidence(
         progress("comparing photographs", view / len(scene.cameras))
         seen = features[view]
         if seen.labels.shape[1:] != (camera.height, camera.width) or seen.vectors.shape[1] != size:
-            raise FormatError(
-                f"the masks of {camera.name!r} are of another scene: {seen.labels.shape[2]}x"
-                f"{seen.labels.shape[1]} pixels and {seen.vectors.shape[1]} numbers, not {camera.width}x"
-                f"{camera.height} and {size}; name this scene's own folder with --work"
-            )
+            what = f"{camera.width}x{camera.height} pixels and vectors of {size} numbers"
+            raise FormatError(f"the masks of {camera.name!r} are of another scene, not of {what}; see --work")
         shown = _shown(scene, view, found[1])
         if shown.sum() >= SHOWN:
             mask, overlap = _nearest(seen, shown)
@@ -167,10 +164,8 @@ def kept_features(path: Path, scene: Scene, work: Path | None = None) -> Sequenc
     missing = [camera.name for camera in scene.cameras if not exists(store.path(camera.name))]
     if missing or not scene.cameras:
         what = f"no masks of {missing[0]!r}" if scene.cameras and exists(store.folder) else "no such folder"
-        raise InputError(
-            f"{store.folder}: {what}; evidence needs the masks that `langsplat train` keeps beside a scene, "
-            "which bundled and imported ones come without: train it, or name its folder with --work"
-        )
+        need = "evidence needs the masks that `langsplat train` keeps: train it, or name their folder: --work"
+        raise InputError(f"{store.folder}: {what}; {need}")
     trained = store.folder.with_name(PREVIEW).with_suffix(CAMERAS)
     if exists(trained) and not _alike(scene.cameras, read_cameras(trained)):
         raise InputError(f"{trained}: cameras of another scene; name this one's own folder with --work")
@@ -202,25 +197,34 @@ def kept_photographs(
 ) -> dict[str, Array]:
     """Return photographs by the name of their camera, (H, W, 3) uint8 as training saw them.
 
-    From `dataset`, or from where the report of the training says. Raises InputError where some are missing.
+    From `dataset`, or from where the report of the training says; InputError where some are not those.
     """
     from langsplat_core.datasets import load_photographs
 
     if not scene.cameras:
         raise InputError(f"{path}: has no cameras, which photographs belong to; keep .cameras.json beside it")
     work = work or work_folder(path)
-    place = dataset or stated_figures(work / REPORT).get("dataset")
+    stated = stated_figures(work / REPORT)
+    place, known = dataset or stated.get("dataset"), stated.get("contents")
     if not isinstance(place, str | Path) or not str(place) or not (dataset or exists(place)):
         where = f"not in {place}" if isinstance(place, str) and place else f"not named in {work / REPORT}"
         raise InputError(f"{path}: its photographs are {where}; name their folder with --photographs")
-    dataset = Path(place)
     most = max(max(camera.width, camera.height) for camera in scene.cameras)
-    capture = load_photographs(dataset, DatasetConfig(max_side=most, allow_few_cameras=True), work, progress)
+    config = DatasetConfig(max_side=most, allow_few_cameras=True)
+    capture = load_photographs(Path(place), config, work, progress)
     found = {camera.name: image for camera, image in zip(capture.cameras, capture.images, strict=True)}
+    if isinstance(known, dict):
+        now = capture.contents().items()
+        other = shortened(name for name, content in now if known.get(name, content) != content)
+        said = f"{place}: not the files that were trained on, so that masks may be of something else: {other}"
+        if other and not dataset:  # others may be copies, of other sizes for example
+            raise InputError(f"{said}; train again, or name a folder of the earlier ones with --photographs")
+        if other:
+            report_loss("%s", said)
     photographs = {}
     for camera in scene.cameras:
         if camera.name not in found:
-            raise InputError(f"{dataset}: has no photograph {camera.name!r}; name another with --photographs")
+            raise InputError(f"{place}: has no photograph {camera.name!r}; name another with --photographs")
         image = found[camera.name]
         if image.shape[:2] != (camera.height, camera.width):  # rounded otherwise
             image = np.asarray(Image.fromarray(image).resize((camera.width, camera.height)))

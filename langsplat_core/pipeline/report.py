@@ -9,8 +9,8 @@ import html
 import io
 import json
 from base64 import b64encode
-from collections.abc import Container, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -54,6 +54,7 @@ class TrainReport:
     relevancy_error_p99: float = 0.0
     observed: float = 0.0  # fraction of Gaussians with language features at the whole level
     dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
+    contents: Mapping[str, str] = field(default_factory=dict)  # of the photographs, see `Capture.contents`
     held_out_views: tuple[ViewScore, ...] = ()  # one by one
     psnr_small: float | None = None  # as `psnr`, of images shrunk to 320 px, by which presets compare
     psnr_trained: float | None = None  # mean over the views that were trained on, 48 of them at most
@@ -74,7 +75,7 @@ def read_report(work: Path) -> TrainReport:
 def stated_figures(path: Path) -> dict[str, Any]:
     """Return the content of a report, which is not trusted; {} where there is none or it cannot be read."""
     try:
-        stated = read_json_file(path, limit=1_000_000)
+        stated = read_json_file(path, limit=8_000_000)
     except (InputError, FormatError):
         return {}
     return stated if isinstance(stated, dict) else {}

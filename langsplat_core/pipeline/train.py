@@ -9,7 +9,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -101,13 +101,19 @@ class _Run:
 
     @property
     def seconds_file(self) -> Path:
-        """The file of `seconds`, one for each dataset and settings."""
-        return self.work / f"{stage_key('seconds', 1, os.path.realpath(self.dataset), self.config)}.json"
+        """The file of `kept`, one for each dataset and settings."""
+        return self.work / f"{stage_key('seconds', 2, os.path.realpath(self.dataset), self.config)}.json"
 
     @cached_property
-    def seconds(self) -> dict[str, float]:
-        """Seconds that each stage took, in this process and in earlier, interrupted ones."""
-        return reports.stated_figures(self.seconds_file)
+    def kept(self) -> dict[str, Any]:
+        """The "seconds" of each stage, in interrupted runs too, and the "contents" of the photographs."""
+        return {"seconds": {}, "contents": {}} | reports.stated_figures(self.seconds_file)
+
+    def photographs_are(self, contents: Mapping[str, str]) -> None:
+        """Forget the seconds of other photographs than those that are trained on now."""
+        if self.kept["contents"] not in ({}, contents):
+            self.kept["seconds"].clear()
+        self.kept["contents"] = contents
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -117,11 +123,12 @@ class _Run:
             yield
         finally:
             took = time.perf_counter() - began
-            self.seconds[stage] = round(self.seconds.get(stage, 0.0) + took, 1)
+            seconds = self.kept["seconds"]
+            seconds[stage] = round(seconds.get(stage, 0.0) + took, 1)
             log.debug("%s: %.1f s", stage, took)
             with suppress(OSError):
                 if set(os.listdir(self.work)) - {LOCK}:  # else the folder goes with what was refused
-                    write_json(self.seconds_file, self.seconds)
+                    write_json(self.seconds_file, self.kept)
 
 
 def _train(
@@ -136,6 +143,8 @@ def _train(
             named_source = None if masks_of else load_mask_source(config.masks, config.clip.device)
         # One process solves for cameras, the others find them in the work folder.
         capture = processes.once(lambda: _photographs(run))
+        contents = capture.contents()
+        run.photographs_are(contents)
         train, held_out = split_views(capture, config.dataset)
         cameras = tuple(capture.cameras[i] for i in train)
         if processes.is_main:  # for whoever looks at the Gaussians before their scene is written
@@ -185,8 +194,9 @@ def _train(
             psnr=_mean(score.psnr for score in scores),
             psnr_small=_mean(score.psnr_small for score in scores),
             warnings=reports.quality_warnings(capture, train, scores, trained),
-            seconds=run.seconds,
+            seconds=run.kept["seconds"],
             dataset=os.path.realpath(run.dataset),
+            contents=contents,
             taken=capture.taken,
             held_out_views=tuple(scores),
             psnr_trained=_mean(score.psnr for score in trained),

@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +25,7 @@ from langsplat_core.io import apart
 from langsplat_core.io.files import write_json
 from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.pipeline.evidence import kept_photographs
 from langsplat_core.pipeline.report import read_report
 from langsplat_core.pipeline.stages import sole_use
 from langsplat_core.pipeline.train import tasks_for, train_captures, train_scene
@@ -194,16 +195,37 @@ def test_every_lifting_mode_trains(room, tmp_path, mode):
     assert field.tree.votes.any() == (mode == "mean")  # averaging latents needs no mask weights
 
 
+def spend_an_hour(work: Path) -> None:
+    """Write into a work folder that Gaussians took an hour so far."""
+    (seconds,) = work.glob("seconds-*.json")
+    stated = json.loads(seconds.read_bytes())
+    write_json(seconds, stated | {"seconds": {"radiance": 3_600.0}})
+
+
 def test_a_run_interrupted_in_every_stage_ends_with_the_same_bytes(room, whole, tmp_path):
     stages = "reading", "masks", "training", "lifting", "merging", "describing", "codebook", "averaging"
     for stage in (*stages, "building"):
         with pytest.raises(WorkCancelledError):
             train_scene(room, tmp_path / "scene.ply", tiny_settings(room), progress=stop_at(stage, 0.1))
         assert scene_in(tmp_path) == {}
-    (seconds,) = tmp_path.glob("scene.work/seconds-*.json")
-    write_json(seconds, json.loads(seconds.read_bytes()) | {"radiance": 1_000.0})
-    assert train_scene(room, tmp_path / "scene.ply", tiny_settings(room)).seconds["radiance"] >= 1_000
+    spend_an_hour(tmp_path / "scene.work")
+    assert train_scene(room, tmp_path / "scene.ply", tiny_settings(room)).seconds["radiance"] >= 3_600
     assert scene_in(tmp_path) == scene_in(whole)
+
+
+def test_photographs_changed_in_place_are_refused_and_timed_anew(tmp_path, caplog):
+    room, out = tiny_room(tmp_path / "room"), tmp_path / "scene.ply"
+    train_scene(room, out, tiny_settings(room), until="gaussians")
+    for changed in (False, True):
+        with pytest.raises(InputError, match="photo_1; train again") if changed else nullcontext():
+            kept_photographs(out, load_scene(out))
+        caplog.clear()
+        kept_photographs(out, load_scene(out), dataset=room)
+        assert ("something else: photo_1" in caplog.text) == changed
+        spend_an_hour(tmp_path / "scene.work")
+        seconds = train_scene(room, out, tiny_settings(room), until="gaussians").seconds
+        assert (seconds["radiance"] < 3_600) == changed
+        Image.new("RGB", (64, 48)).save(room / "images" / "photo_1.png")
 
 
 def test_unusable_arguments_are_refused_before_work(room, tmp_path):
