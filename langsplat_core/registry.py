@@ -31,6 +31,15 @@ CLASSES: References = MappingProxyType({
     "formats": "SceneFormat", "importers": "Importer", "exporters": "Exporter", "encoders": "Family",
     "panels": "Panel",
 })  # fmt: skip
+# Names that are the core's own; a part of an extension that has one is left out.
+OWN: References = MappingProxyType({
+    "commands": "train query describe select teach scale transform crop export convert inspect doctor demo",
+    "formats": ".ply .spz .splat .sog .glb .gltf", "exporters": "scene", "encoders": "clip",
+    "segmenters": "sam sam2 sam2_video", "text_segmenters": "sam3 sam3_video sam3_lite_text",
+    "mask_sources": "auto sam graph",
+    "panels": "Search Display Camera Outline Selection Transform Record Bookmarks Notes Scene Train Timeline "
+    "Messages",
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -55,7 +64,7 @@ def extensions() -> Mapping[str, Extension]:
     """Return the extensions that are installed, by the names of their entry points, sorted.
 
     Those that the environment variable `LANGSPLAT_WITHOUT` names are left out, and so are, with a warning,
-    those that cannot be imported, and of two extensions or parts of one name the second.
+    those that cannot be imported, parts named as one of the core, and of two of one name the second.
     """
     hidden = {name.strip() for name in os.environ.get(HIDDEN, "").split(",")}
     points: dict[str, EntryPoint] = {}
@@ -72,7 +81,9 @@ def extensions() -> Mapping[str, Extension]:
     owners: dict[tuple[str, str], str] = {}
     for name, kind in product(found, (kind.name for kind in fields(Extension))):
         for one in getattr(found[name], kind):
-            if (owner := owners.setdefault((kind, one), name)) != name:
+            if _is_own(kind, one):
+                _warn(f"{one!r} of extension {name}", f"the core has it among its {kind}")
+            elif (owner := owners.setdefault((kind, one), name)) != name:
                 has = f"extension {owner} has it among its {kind}, too"
                 _warn(f"{one!r} of extension {name}", f"{has}; {HIDDEN}={owner} hides that")
     return found
@@ -83,7 +94,12 @@ def references(kind: Kind) -> References:
     found: dict[str, str] = {}
     for extension in extensions().values():
         found = {**getattr(extension, kind), **found}
-    return found
+    return {name: where for name, where in found.items() if not _is_own(kind, name)}
+
+
+def _is_own(kind: str, name: str) -> bool:
+    first = name.split(" ")[0] if kind in ("commands", "groups") else name  # no group has a command's name
+    return first in OWN.get(kind.replace("groups", "commands"), "").split()
 
 
 def part(kind: Kind, name: str) -> Any:

@@ -20,14 +20,16 @@ import pytest
 
 from langsplat_core import compiled, config, errors, registry
 from langsplat_core.arrays import psnr, quaternions, rotation_matrices, unit
-from langsplat_core.cli.app import command_names, parse
+from langsplat_core.cli.app import CORE, command_names, parse
 from langsplat_core.cli.train import Train
 from langsplat_core.compiled import Workers, is_compiled
 from langsplat_core.config import PAPER, annotations, check_settings, range_of
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
-from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.io.scenes import CORE_FORMATS, Exporter, Importer, SceneFormat, load_scene, save_scene
 from langsplat_core.progress import Progress, Report, TerminalProgress, TimeLeft
 from langsplat_core.scene import Scene
+from langsplat_core.semantics import encoders, sam
+from langsplat_viewer.panels.layout import CORE_PANELS
 from tests.support.fakes import numeric_settings
 from tests.support.processes import files_of_at_most, python, refusal
 from tests.support.scenes import random_gaussians
@@ -354,8 +356,9 @@ def test_broken_part_is_refused_when_it_is_asked_for(monkeypatch: pytest.MonkeyP
 
 
 def test_names_taken_and_misfits_are_said(monkeypatch: pytest.MonkeyPatch, caplog) -> None:
-    """Two extensions of one name, two parts of one, no Exporter; a group may do without a sentence."""
-    part = registry.Extension(commands={"hail": "json:load", "greet one": "json:load"})
+    """Two extensions of one name, parts of one, some the core's, no Exporter; a group without a sentence."""
+    names = "hail", "greet one", "query", "doctor who"
+    part = registry.Extension(commands=dict.fromkeys(names, "json:load"))
     exporters = {"odd": "json:load", "own": "two:C"}
     other = registry.Extension(commands={"hail": "json:dump"}, exporters=exporters)
     own = type("Own", (type("Exporter", (), {}),), {})()
@@ -366,6 +369,8 @@ def test_names_taken_and_misfits_are_said(monkeypatch: pytest.MonkeyPatch, caplo
     assert [*registry.extensions()] == ["a", "b"]
     assert [line.partition(" is left out: ")[::2] for line in caplog.messages] == [
         ("extension a (two:B)", "two:A has its name"),
+        ("'query' of extension a", "the core has it among its commands"),
+        ("'doctor who' of extension a", "the core has it among its commands"),
         (
             "'hail' of extension b",
             "extension a has it among its commands, too; LANGSPLAT_WITHOUT=a hides that",
@@ -378,6 +383,33 @@ def test_names_taken_and_misfits_are_said(monkeypatch: pytest.MonkeyPatch, caplo
     assert caplog.messages[-1].endswith("json:load is no Exporter; see docs/extensions.md")
     with pytest.raises(InputError, match="no command 'greet two'; there are one"):
         parse(["greet", "two"])
+    assert not registry.references("commands").keys() & {"query", "doctor who"}
+
+
+def test_names_of_the_core_are_listed() -> None:
+    own = {"commands": CORE, "encoders": encoders.FAMILIES, "formats": [row.suffix for row in CORE_FORMATS]}
+    own |= {"segmenters": sam.FAMILIES, "text_segmenters": sam.TEXT_FAMILIES}
+    own |= {"panels": [panel.title for panel in CORE_PANELS]}
+    for kind, names in own.items():
+        assert sorted(registry.OWN[kind].split()) == sorted(names)
+
+
+def test_failing_part_is_one_line_that_names_its_extension(tmp_path, monkeypatch, capsys) -> None:
+    def fails(*words: object) -> None:
+        raise KeyError("gone")
+
+    def nothing(*words: object) -> None: ...
+
+    monkeypatch.chdir(tmp_path)
+    parts = SceneFormat(".odd", nothing, fails), Importer((".many",), nothing), Exporter(nothing)
+    monkeypatch.setitem(sys.modules, "odd", SimpleNamespace(**dict(zip("fie", parts, strict=True))))
+    named = {"formats": {".odd": "odd:f"}, "importers": {"many": "odd:i"}, "exporters": {"files": "odd:e"}}
+    monkeypatch.setattr(registry, "extensions", lambda: {"oddity": registry.Extension(**named)})
+    save_scene("a.ply", Scene(random_gaussians(3)))
+    for name in ("a.odd", "a.many"):
+        Path(name).touch()
+    for words in ("a.odd b.ply", "a.many b.ply", "a.ply b.odd", "a.ply b --to files"):
+        assert "its extension's odd:" in refusal(capsys, "convert", *words.split())
 
 
 @pytest.mark.parametrize("hidden", OWN)
@@ -477,6 +509,17 @@ def test_the_command_line_names_the_option_as_typed(line, named, tmp_path, capsy
     error = refusal(capsys, "train", tmp_path, "--out", tmp_path / "s.ply", *line.split())
     assert error.lower().startswith(f"langsplat: {named}")
     assert list(tmp_path.iterdir()) == []  # nothing was begun
+
+
+def test_settings_without_effect_are_said(tmp_path, capsys, caplog):
+    words = "--dataset.frames 9 --lift.steps 5 --masks.sam x --masks.source graph --masks.nms-iou 0.5"
+    refusal(capsys, "train", tmp_path, "--out", "s.ply", *words.split())
+    assert caplog.messages[:3] == [
+        "--dataset.frames: of no effect with photographs",
+        "--masks.sam, --masks.nms-iou: of no effect with --masks.source graph",
+        "--lift.steps: of no effect with --lift.mode median",
+    ]
+    assert "it is a folder" in refusal(capsys, "train", tmp_path, "--on", "local:1", "--out", "s.ply")
 
 
 # How the options of `langsplat train` come together.

@@ -13,37 +13,16 @@ from langsplat_core import registry
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, WrittenScene
 from langsplat_core.config import CodecConfig, Level, Positive, Range
 from langsplat_core.errors import InputError
+from langsplat_core.io import scenes
 from langsplat_core.io.files import check_output_file, check_output_folder, write_whole
 from langsplat_core.io.ply import write_metres
-from langsplat_core.io.scenes import (
-    ORIGIN_SUFFIX,
-    Exporter,
-    Importer,
-    ImportRequest,
-    check_writable,
-    load_scene,
-    load_without_language,
-    report_left_out,
-    save_scene,
-)
 from langsplat_core.io.sidecar import rematch_language
 from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.pipeline.webpage import make_page
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.selection import in_box
-from langsplat_core.scene import Scene
-from langsplat_core.scene.transform import (
-    AXES,
-    IDENTITY,
-    Similarity,
-    moving,
-    place_scene,
-    rotating,
-    scaling,
-    similarity,
-    turning,
-)
+from langsplat_core.scene import Scene, transform
 from langsplat_core.semantics.encoders import load_text_encoder
 
 
@@ -66,7 +45,7 @@ class Export:
         check_output_file(self.out)
         with TerminalProgress() as progress:
             progress("reading the scene", 0.0)
-            scene = load_scene(self.scene)
+            scene = scenes.load_scene(self.scene)
             engine = None
             if scene.language is not None:
                 engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
@@ -130,7 +109,8 @@ class Convert:
             self._export()
             return
         rematched = () if self.rematch is None else (self.rematch,)
-        row = check_writable(self.out, *self.sources, *rematched)  # before minutes are spent on reading
+        # Before minutes are spent on reading.
+        row = scenes.check_writable(self.out, *self.sources, *rematched)
         of_spz = (self.source.suffix.lower(), row.suffix).count(".spz")
         if len(self.axes) > of_spz or (self.spz_version != 3 and row.suffix != ".spz"):
             raise InputError("--axes, a word for each, and --spz-version are of an .spz; leave them out")
@@ -140,7 +120,7 @@ class Convert:
         if row.suffix == ".spz":
             write = partial(write_spz, version=self.spz_version, axes=axes)
             described += f"; version {self.spz_version}, axes {axes.upper()}, recorded"
-        save_scene(self.out, replace(scene, path=self.out), write=write)
+        scenes.save_scene(self.out, replace(scene, path=self.out), write=write)
         if row.rounds:
             print(f"{self.out}: rounds {row.rounds}")
         if self.out.name.lower().endswith(".compressed.ply"):
@@ -151,27 +131,26 @@ class Convert:
         if (importer := self._importer()) is not None and self.rematch is not None:
             raise InputError("--rematch is for one scene; import the checkpoints, then rematch those")
         if importer is not None:
-            request = ImportRequest(self.sources, self.encoder, self.levels, self.phrases, self.codec)
-            with TerminalProgress() as progress:
-                scene, lines = importer.read(request, progress)
+            name, reader = importer
+            request = scenes.ImportRequest(self.sources, self.encoder, self.levels, self.phrases, self.codec)
+            with TerminalProgress() as progress, scenes.failures("importers", name):
+                scene, lines = reader.read(request, progress)
             print(*lines, sep="\n")
             return scene
         if self.levels or self.phrases or self.codec != CodecConfig():
-            raise InputError(
-                "--levels, --phrases and --codec are for checkpoints; leave them out for a scene"
-            )
+            raise InputError("--levels, --phrases, --codec are for checkpoints; leave them out for a scene")
         spz = partial(read_spz_scene, axes=(self.axes or ("",))[0], note=print)
         read = spz if self.source.suffix.lower() == ".spz" else None
         if self.rematch is None:
-            return load_scene(self.source, read)
-        scene = load_without_language(self.source, read)
+            return scenes.load_scene(self.source, read)
+        scene = scenes.load_without_language(self.source, read)
         return replace(scene, language=rematch_language(self.rematch, scene.in_world(scene.gaussians.means)))
 
-    def _importer(self) -> Importer | None:
-        """Return what reads the sources where they are no scene of a known format."""
-        importers: list[Importer] = list(registry.parts("importers").values())
+    def _importer(self) -> tuple[str, scenes.Importer] | None:
+        """Return what reads the sources where they are no scene of a known format, with its name."""
+        importers: list[tuple[str, scenes.Importer]] = list(registry.parts("importers").items())
         suffix = self.source.suffix.lower()
-        named = [one for one in importers if suffix in one.suffixes]
+        named = [(name, one) for name, one in importers if suffix in one.suffixes]
         if named or not (len(self.sources) > 1 or self.encoder is not None):
             return named[0] if named else None
         if not importers:
@@ -182,13 +161,14 @@ class Convert:
         exporters = registry.references("exporters")
         if self.to not in exporters:
             raise InputError(f"--to {self.to}: choose one of {', '.join(('scene', *exporters))}")
-        exporter: Exporter = registry.part("exporters", self.to)
+        exporter: scenes.Exporter = registry.part("exporters", self.to)
         check_output_folder(self.out)
         scene = replace(self._read(), path=self.source)
-        report_left_out(self.out, scene, f"files of --to {self.to}", exporter.loses, f"*{ORIGIN_SUFFIX}")
-        with TerminalProgress() as progress:
-            lines = exporter.write(scene, self.out, progress)
-        print(*lines, sep="\n")
+        kind, keeper = f"files of --to {self.to}", f"*{scenes.ORIGIN_SUFFIX}"
+        scenes.report_left_out(self.out, scene, kind, exporter.loses, keeper)
+        with TerminalProgress() as progress, scenes.failures("exporters", self.to):
+            lines = "\n".join(exporter.write(scene, self.out, progress))
+        print(lines)
 
 
 # Scenes edited by numbers; what belongs to them goes along.
@@ -223,22 +203,22 @@ class Transform:
     """World units."""
 
     def run(self) -> None:
-        check_writable(self.out, self.scene)
+        scenes.check_writable(self.out, self.scene)
         if self == Transform(self.scene, self.out):
             raise InputError("no step given; say one, such as --up z (`langsplat convert` makes a copy)")
-        scene = load_scene(self.scene)
+        scene = scenes.load_scene(self.scene)
         to = self._similarity(scene)
-        save_scene(self.out, replace(place_scene(scene, to), path=self.out))
+        scenes.save_scene(self.out, replace(transform.place_scene(scene, to), path=self.out))
         rows = "  ".join(" ".join(f"{number:.15g}" for number in row) for row in to.matrix)
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {len(scene.cameras)} cameras; --matrix {rows}")
 
-    def _similarity(self, scene: Scene) -> Similarity:
-        to = IDENTITY if self.matrix is None else similarity(np.array(self.matrix))
+    def _similarity(self, scene: Scene) -> transform.Similarity:
+        to = transform.IDENTITY if self.matrix is None else transform.similarity(np.array(self.matrix))
         if self.up is not None:
-            to = to.then(turning(to.rotation @ scene.up(), AXES[self.up]))
+            to = to.then(transform.turning(to.rotation @ scene.up(), transform.AXES[self.up]))
         for axis, degrees in self.rotate:
-            to = to.then(rotating(AXES[axis], degrees))
-        return to.then(scaling(self.scale)).then(moving(np.array(self.move)))
+            to = to.then(transform.rotating(transform.AXES[axis], degrees))
+        return to.then(transform.scaling(self.scale)).then(transform.moving(np.array(self.move)))
 
 
 @dataclass(frozen=True)
@@ -251,13 +231,13 @@ class Crop:
     """Two opposite corners, world units."""
 
     def run(self) -> None:
-        check_writable(self.out, self.scene)
-        scene, corners = load_scene(self.scene), np.array(self.box).reshape(2, 3)
+        scenes.check_writable(self.out, self.scene)
+        scene, corners = scenes.load_scene(self.scene), np.array(self.box).reshape(2, 3)
         keep = in_box(scene.gaussians.means, corners.min(0) - scene.origin, corners.max(0) - scene.origin)
         if not keep.any():
             where = f"`langsplat inspect {self.scene}` says where they lie"
             raise InputError(f"the crop holds none of the {len(keep)} Gaussians; {where}")
-        save_scene(self.out, replace(scene.take(keep), path=self.out))
+        scenes.save_scene(self.out, replace(scene.take(keep), path=self.out))
         print(f"{self.out}: {keep.sum()} of {len(keep)} Gaussians")
 
 
@@ -290,5 +270,5 @@ class SetScale:
             factor = self.metres / units
         if factor is not None:
             write_metres(self.scene, factor)
-        stored = load_without_language(self.scene).metres_per_unit
+        stored = scenes.load_without_language(self.scene).metres_per_unit
         print(f"{self.scene}: {'no scale' if stored is None else f'{stored:.6g} m per unit'}")

@@ -2,6 +2,8 @@
 
 import contextlib
 import io
+import logging
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
@@ -20,11 +22,14 @@ from langsplat_core.config import (
     TrainProfile,
     Until,
     check_settings,
+    named_values,
     with_preset,
 )
 from langsplat_core.errors import InputError, printable_line, shortened
-from langsplat_core.io.hostile import read_text
+from langsplat_core.io.hostile import is_video, read_text
 from langsplat_core.progress import TerminalProgress, silent
+
+log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,7 @@ class Train:
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:
+        self._say_unused()
         if self.on or len(self.dataset) != 1:
             self._train_several()
             return
@@ -86,11 +92,9 @@ class Train:
             return
         names = shortened(view.name for view in report.held_out_views)
         small = "" if report.psnr_small is None else f", {report.psnr_small:.2f} dB at 320 px"
-        psnr = (
-            "none held out, so that nothing was measured"
-            if report.psnr is None
-            else f"held-out PSNR {report.psnr:.2f} dB{small} ({report.held_out_rule}: {names})"
-        )
+        psnr = "none held out, so that nothing was measured"
+        if report.psnr is not None:
+            psnr = f"held-out PSNR {report.psnr:.2f} dB{small} ({report.held_out_rule}: {names})"
         described = (
             f"{report.mask_count} masks by {report.masks}, encoder {report.encoder}; "
             f"{report.codec} of {report.codec_size}, relevancy error {report.relevancy_error:.4f} "
@@ -104,11 +108,28 @@ class Train:
             print(f"warning: {warning}")
         print(f"photographs beside what the scene shows: {(self.work or work_folder(self.out)) / PAGE}")
 
+    def _say_unused(self) -> None:
+        """Say which settings have no effect beside the others; a file for many captures may hold some."""
+        config, usual = self.config, PAPER if self.profile == "paper" else TrainConfig()
+        pairs = zip(named_values(config), named_values(usual), strict=True)
+        given = [name for (name, value, _), (_, other, _) in pairs if value != other]
+        masks, mode = config.masks, config.lift.mode
+        graph = masks.source == "graph" or (masks.source == "auto" and not masks.sam)
+        for pattern, unused, by in (
+            (r"--dataset\.frames", not any(map(is_video, self.dataset)), "photographs"),
+            (r"--masks\.(?!source)", graph, "--masks.source graph"),
+            (r"--lift\.(steps|lr|start|seed)", mode != "gradient", f"--lift.mode {mode}"),
+        ):
+            if names := [name for name in given if unused and re.match(pattern, name)]:
+                log.warning("%s: of no effect with %s", ", ".join(names), by)
+
     def _train_several(self) -> None:
         from langsplat_core.pipeline.train import Trained, tasks_for, train_captures
 
         if not self.dataset or self.work or self.gaussians:
             raise InputError("give a DATASET; --work and --gaussians are of one alone")
+        if self.out.suffix.lower() == ".ply":
+            raise InputError(f"--out {self.out}: of --on and of several datasets it is a folder; name one")
         tasks, rows = tasks_for(self.dataset, self.out, self.config, self.until), list[Trained]()
         try:
             with (

@@ -9,8 +9,8 @@ sidecar belongs to the rounded positions of that file and not to those of a `sce
 
 import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -22,7 +22,7 @@ from msgspec import Meta, Struct
 from langsplat_core import registry
 from langsplat_core.arrays import Array
 from langsplat_core.config import CodecConfig
-from langsplat_core.errors import STRICTNESS, InputError, expect, report_loss
+from langsplat_core.errors import STRICTNESS, InputError, LangSplatError, expect, report_loss
 from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import sidecar as language_files
 from langsplat_core.io.files import atomic_path, check_output_file, locked, shown, write_json
@@ -32,7 +32,7 @@ from langsplat_core.io.ply import read_ply_scene, write_ply
 from langsplat_core.io.quantised import read_splat_scene, write_splat
 from langsplat_core.io.sog import META_NAME, read_sog_scene, write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
-from langsplat_core.progress import Progress
+from langsplat_core.progress import Progress, WorkCancelledError
 from langsplat_core.scene import LEVELS, Gaussians, LanguageField, Scene, about_origin
 
 log = logging.getLogger("langsplat")
@@ -133,9 +133,8 @@ def load_scene(path: Path | str, read: Reader | None = None) -> Scene:
     if not os.path.exists(sidecar):
         return scene
     try:
-        return replace(
-            scene, language=language_files.read_language(sidecar, scene.gaussians.means, scene.origin)
-        )
+        language = language_files.read_language(sidecar, scene.gaussians.means, scene.origin)
+        return replace(scene, language=language)
     except InputError as error:
         if STRICTNESS.on:
             raise
@@ -167,8 +166,11 @@ def _read(path: Path, read: Reader | None = None) -> Scene:
     if row is None:
         kinds = ", ".join(row.suffix for row in formats())
         raise InputError(f"{path}: not a scene of a known kind; supported: {kinds}, {META_NAME}")
-    read = read or row.read
-    scene = _about_origin(path, read(path))
+    with failures("formats", row.suffix):
+        found = (read or row.read)(path)
+        if not isinstance(found, Scene):
+            raise TypeError(f"it returns a {type(found).__name__}, no Scene")
+    scene = _about_origin(path, found)
     log.debug("%s: %d Gaussians", path, len(scene.gaussians))
     warn_of_undrawable(path, scene.gaussians)
     return scene
@@ -285,7 +287,8 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer 
         if new is None and os.path.exists(file):
             report_loss("%s: removes %s of the scene that was there", shown(path), shown(Path(file.name)))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as lock, ExitStack() as renames:  # renames happen in the reverse order of these lines
+    with ExitStack() as lock, ExitStack() as renames, failures("formats", row.suffix):
+        # Renames happen in the reverse order of these lines.
         if scene.cameras:
             in_world = tuple(camera.moved(scene.origin) for camera in scene.cameras)
             camera_files.write_cameras(renames.enter_context(atomic_path(cameras)), in_world)
@@ -383,6 +386,20 @@ class Exporter:
 
     write: Callable[[Scene, Path, Progress], tuple[str, ...]]  # into a folder; returns lines to print
     loses: tuple[str, ...] = ()  # as in `SceneFormat`
+
+
+@contextmanager
+def failures(kind: registry.Kind, name: str) -> Iterator[None]:
+    """Turn whatever a reader or writer of an extension raises into one line that names the extension."""
+    try:
+        yield
+    except (LangSplatError, WorkCancelledError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        if (where := registry.references(kind).get(name)) is None:
+            raise
+        what = f"extension's {where} fails ({type(error).__name__}: {error})"
+        raise InputError(f"{name}: its {what}; mend or remove that") from error
 
 
 # Figures of a scene.
