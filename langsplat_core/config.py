@@ -1,8 +1,7 @@
 """Every setting a user can change, as frozen dataclasses from which the command line is derived.
 
 A number's range is part of its field's type, ``steps: Annotated[int, Range(1, 1_000_000)] = 100``, and bounds
-each number of a field with several. `check_settings` refuses what lies outside, in a configuration and in all
-that it holds.
+each number of a field with several. `check_settings` refuses what lies outside, in all that one holds.
 """
 
 import dataclasses

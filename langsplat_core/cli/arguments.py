@@ -46,9 +46,8 @@ TrainedScene = Annotated[tyro.conf.Positional[Path], _trained]
 WrittenScene = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Scene to write: .ply, .spz ...")]
 EncoderOption = Annotated[str, _encoder]
 JsonOption = Annotated[bool, tyro.conf.arg(help="Print JSON, lengths in world units.")]
-ScaleOption = Annotated[
-    config.Positive | None, tyro.conf.arg(help="Metres per world unit, in place of what the scene says.")
-]
+_scale = tyro.conf.arg(help="Metres per world unit, in place of what the scene says.")
+ScaleOption = Annotated[config.Positive | None, _scale]
 WordsOption = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help=_taught)]
 
 

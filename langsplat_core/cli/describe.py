@@ -1,7 +1,6 @@
 """`langsplat describe` and `langsplat teach`.
 
-Words for what is in a scene, as a list or as a tree; and a name for something that is pointed at, by which
-it is then found.
+Words for what is in a scene, as a list or a tree; and names by which what is pointed at is found then.
 """
 
 import re

@@ -33,18 +33,8 @@ from langsplat_core.io import hostile
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.quantised import mirrored
 from langsplat_core.io.spz import decode_spz
-from langsplat_core.scene import SH_COUNTS, Gaussians, Scene, about_origin
+from langsplat_core.scene import SH_COUNTS, Gaussians, Scene, about_origin, transform
 from langsplat_core.scene.gaussians import join_gaussians
-from langsplat_core.scene.transform import (
-    AXES,
-    C0,
-    moving,
-    scaling,
-    similarity,
-    transform_gaussians,
-    turned_origin,
-    turning,
-)
 
 EXTENSION = "KHR_gaussian_splatting"
 PACKED = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
@@ -185,8 +175,8 @@ def placed_scene(path: Path, parts: Iterable[tuple[Array, Gaussians]]) -> Scene:
         if middle is None:  # positions are relative to the first: world positions may exceed float32
             middle = matrix[:3, 3].copy()
         try:
-            place = similarity(matrix).then(moving(-middle))
-            placed.append(gaussians if place.is_identity else transform_gaussians(gaussians, place))
+            place = transform.similarity(matrix).then(transform.moving(-middle))
+            placed.append(gaussians if place.is_identity else transform.transform_gaussians(gaussians, place))
         except InputError as error:
             raise malformed(path, str(error)) from None
     gaussians = mirrored(join_gaussians(placed), SIGNS)
@@ -209,9 +199,8 @@ def _parts(file: "_File") -> Iterator[tuple[Array, Gaussians]]:
             raise malformed(file.path, f"colours are not {SRGB} but {quoted(splatting.color_space)}")
         how = splatting.kernel, splatting.sorting_method, splatting.projection
         file.others.update(quoted(name) for name in {*how} - {*HOW} | splatting.extensions.keys() - {*PACKED})
-        packed = next(
-            (found.buffer_view for name, found in splatting.extensions.items() if name in PACKED), None
-        )
+        views = (own.buffer_view for name, own in splatting.extensions.items() if name in PACKED)
+        packed = next(views, None)
         if packed is not None:
             data = bytes(file.view(packed)[0])
             file.room.take(1 << 16)  # bounds the number of small ones, too
@@ -403,9 +392,9 @@ def node_of(scene: Scene) -> dict[str, Any]:
 
     Its matrix turns the scene's up to y, and scales to metres if the scale is known; its extras say how.
     """
-    turn = turning(SIGNS * scene.up(), AXES["y"])
-    there = turn.then(moving(turned_origin(turn.rotation * SIGNS, scene.origin)))
-    there = there.then(scaling(scene.metres_per_unit or 1.0))
+    turn = transform.turning(SIGNS * scene.up(), transform.AXES["y"])
+    there = turn.then(transform.moving(transform.turned_origin(turn.rotation * SIGNS, scene.origin)))
+    there = there.then(transform.scaling(scene.metres_per_unit or 1.0))
     matrix = None if there.is_identity else there.matrix.T.reshape(-1).tolist()
     kept = Kept(matrix, tuple(scene.origin.tolist()), scene.metres_per_unit, scene.antialiased)
     said = {"matrix": matrix} if matrix else {}
@@ -483,7 +472,7 @@ def attributes_of(gaussians: Gaussians) -> dict[str, Array]:
     quats = unit(np.where(keep, turned.quats_wxyz, [1, 0, 0, 0]).astype(np.float64), 1e-30)
     opacity = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
     sh = np.where(keep[..., None], turned.sh, 0)
-    light = linear_light(np.clip(0.5 + C0 * sh[:, 0], 0, 1))
+    light = linear_light(np.clip(0.5 + transform.C0 * sh[:, 0], 0, 1))
     base = np.concatenate([light, opacity[:, None]], axis=1)
     columns = {
         "POSITION": np.where(keep, turned.means, 0).astype("<f4"),

@@ -25,16 +25,8 @@ from safetensors.numpy import save
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import LevelChoice, PictureConfig
+from langsplat_core.display import displays
 from langsplat_core.display.composing import compose
-from langsplat_core.display.displays import (
-    COLOUR_MAPS,
-    DISPLAYS,
-    HEAT_BASE,
-    QUERY_COLOURS,
-    STRENGTH,
-    Channels,
-    shader_defines,
-)
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.quantised import to_bytes
 from langsplat_core.progress import Progress, silent
@@ -113,6 +105,7 @@ def make_page(
     centre, radius = scene.bounds()
     progress("packing the Gaussians", 0.1)
     tensors, quad = pack_gaussians(gaussians.take(rows), centre), shader("fullscreen.vert", WEB)
+    defines = displays.shader_defines()
     meta: dict[str, Any] = {
         "title": title,
         "address": urlencode({"phrase": phrase, "show": "relevancy"}) if phrase else "",
@@ -134,19 +127,19 @@ def make_page(
         "notes": [{"text": text, "at": (np.array(at) - centre).tolist()} for text, at in notes],
         "picture": {
             **asdict(PictureConfig()),
-            "displays": {name: row.drawing for name, row in DISPLAYS.items()},
-            "strength": dict(STRENGTH),
-            "heat_base": HEAT_BASE,
-            "maps": list(COLOUR_MAPS),
+            "displays": {name: row.drawing for name, row in displays.DISPLAYS.items()},
+            "strength": dict(displays.STRENGTH),
+            "heat_base": displays.HEAT_BASE,
+            "maps": list(displays.COLOUR_MAPS),
         },
-        "query_colours": QUERY_COLOURS.tolist(),
+        "query_colours": displays.QUERY_COLOURS.tolist(),
         "shaders": {  # vertex and fragment shader of each pass
             "project": [quad, shader("project.frag", WEB)],
             "splat": splat_shaders(2, False, WEB),
-            "compose": [quad, shader("compose.frag", WEB, "langsplat_core.display", **shader_defines())],
+            "compose": [quad, shader("compose.frag", WEB, "langsplat_core.display", **defines)],
         },
     }
-    tensors["colour_maps"] = np.stack(list(COLOUR_MAPS.values()))
+    tensors["colour_maps"] = np.stack(list(displays.COLOUR_MAPS.values()))
     why_not = unsearchable(engine) if engine else no_field(scene).partition(": ")[2]
     language: dict[str, Any] = {}
     if engine is not None and not why_not:
@@ -157,7 +150,7 @@ def make_page(
     plain = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     packed = zlib.compress(save(plain, {"page": json.dumps(meta, allow_nan=False)}))
     image, still = render(scene, seen_from[0].within(STILL)), BytesIO()  # is seen until the scene is drawn
-    pixels = compose(Channels(image.colours, image.alpha, None), PictureConfig())
+    pixels = compose(displays.Channels(image.colours, image.alpha, None), PictureConfig())
     Image.fromarray(pixels).save(still, "JPEG", quality=85)
     text = page_text(title, packed, still.getvalue())
     free = "encoder" in language
@@ -350,9 +343,8 @@ def page_text(title: str, data: bytes, still: bytes) -> str:
     """Return the HTML file, whose policy lets only its own script run, and nothing be fetched."""
     folder = files("langsplat_core") / "web"
     modules = [folder.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES]
-    script = "\n".join(
-        re.sub("^export ", "", module.split(BEGIN)[1], flags=re.MULTILINE) for module in modules
-    )
+    bodies = (module.split(BEGIN)[1] for module in modules)
+    script = "\n".join(re.sub("^export ", "", body, flags=re.MULTILINE) for body in bodies)
     style = folder.joinpath("page.css").read_text(encoding="utf-8")
     script_hash, style_hash = (
         base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (script, style)

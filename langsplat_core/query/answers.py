@@ -203,9 +203,8 @@ class Regions:
         if region < 0:
             return None, None
         if (level, region) not in self._places:
-            self._places[level, region] = place_of(
-                means[self.counts[self.everywhere[level, self.counts] == region]]
-            )
+            members = self.counts[self.everywhere[level, self.counts] == region]
+            self._places[level, region] = place_of(means[members])
         return self._places[level, region]
 
 
@@ -227,9 +226,8 @@ def build_regions(tree: Tree, weights: Array) -> Regions:
     subparts, parts, wholes = map(len, nodes)
     above = everywhere[1][members[0]] + subparts, everywhere[2][members[1]] + subparts + parts
     parents = np.concatenate([*above, np.full(wholes, -1)])
-    table = RegionTable(
-        np.array([[subparts, parts, wholes]]), parents, np.concatenate(sizes) >= RULE.smallest
-    )
+    solid = np.concatenate(sizes) >= RULE.smallest
+    table = RegionTable(np.array([[subparts, parts, wholes]]), parents, solid)
     return Regions(tuple(nodes), np.stack(everywhere), weights, tuple(sizes), tuple(totals), table)
 
 

@@ -299,15 +299,11 @@ class Scene:
             if values.shape != (len(self.gaussians),):
                 raise ValueError(f"extras[{name!r}] of shape {values.shape}, not ({len(self.gaussians)},)")
         if self.language is not None and len(self.language) != len(self.gaussians):
-            raise ValueError(
-                f"language field of {len(self.language)} Gaussians on a scene of {len(self.gaussians)}"
-            )
+            raise ValueError(f"a field of {len(self.language)} Gaussians on a scene of {len(self.gaussians)}")
 
     def __repr__(self) -> str:
-        what = "with" if self.language else "without"
-        return (
-            f"<Scene of {len(self.gaussians):,} Gaussians {what} a language field: {self.path or 'no file'}>"
-        )
+        what = f"{'with' if self.language else 'without'} a language field"
+        return f"<Scene of {len(self.gaussians):,} Gaussians {what}: {self.path or 'no file'}>"
 
     # `show` belongs to a higher layer, which is imported when its public name is used.
     def show(self, phrase: str = "", **options: Any) -> Any:

@@ -86,10 +86,7 @@ def weights_path(model: str, option: str) -> Path:
             )
         return path
     if not re.fullmatch(r"[^./~][^/]*/[^/]+(?<!\.safetensors)(?<!\.bin)(?<!\.pt)(?<!\.pth)", model):
-        raise EncoderError(
-            f"{said}: no such file, no such folder; pass `{option} FOLDER`, a file or a hub id such as "
-            "owner/name"
-        )
+        raise EncoderError(f"{said}: no such file or folder; `{option}` takes these, or a hub id owner/name")
     return _from_hub(model, option)
 
 
@@ -230,9 +227,7 @@ def load_model(kind: Any, weights: Weights, config: Any) -> Any:
         layer = re.compile(r"(?:layers|blocks)\.\d+\.")
         wrong = sorted(name for name in more if weights.converted or layer.search(name))
     if wrong:
-        raise EncoderError(
-            f"{weights.id}: not weights of {kind.__name__}: {len(wrong)} do not fit, such as {wrong[0]}"
-        )
+        raise EncoderError(f"{weights.id}: {len(wrong)} weights do not fit {kind.__name__}, as {wrong[0]}")
     return model.eval().to(weights.device)
 
 

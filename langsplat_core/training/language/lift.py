@@ -101,8 +101,7 @@ class MaskWeights:
     def sums(self, sets: Array, size: int) -> "tuple[scipy.sparse.csr_matrix, Array]":
         """Return the (size, masks of all views) float32 pixels that each set of Gaussians paints.
 
-        Also returns the int32 number 3 view + level of each mask. sets: (N,) set of each Gaussian, -1 for
-        none.
+        Also returns the int32 number 3 view + level of each mask. sets: (N,) of each Gaussian, or -1.
         """
         views, labelling = [scipy.sparse.csr_matrix((size, 0))], [np.zeros(0, np.int32)]
         for view, (pairs, count) in enumerate(zip(self.pairs, self.mask_counts, strict=True)):

@@ -283,9 +283,8 @@ class _Run:
         loss.backward()
         training.add_opacity_decay(state, config.opacity_decay)
         if step < schedule.densify_until:
-            training.accumulate(
-                state, rendered.means_px_grad(), rendered.visible, (camera.width, camera.height)
-            )
+            size = camera.width, camera.height
+            training.accumulate(state, rendered.means_px_grad(), rendered.visible, size)
         training.adam_step(state, schedule.learning_rates(step))
         if schedule.densifies(step):
             training.densify(state, config, self.extent, prune_large=0 < schedule.reset_every < step)
