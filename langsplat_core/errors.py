@@ -4,7 +4,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from types import MappingProxyType, SimpleNamespace
+from types import MappingProxyType, SimpleNamespace, UnionType
 
 LINE_LIMIT = 1000  # characters of a message: room for two long paths, not for a file's content
 
@@ -88,10 +88,11 @@ def unread(what: str, names: Iterable[object]) -> str:
     return listed and f"{what} {listed} not read".lstrip()
 
 
-def expect(value: object, kind: type, hint: str) -> None:
+def expect(value: object, kind: type | UnionType, hint: str) -> None:
     """Raise InputError unless a value that a caller gave is of a kind."""
     if not isinstance(value, kind):
-        raise InputError(f"expected a {kind.__name__}, got {type(value).__name__}; {hint}")
+        name = kind.__name__ if isinstance(kind, type) else kind
+        raise InputError(f"expected a {name}, got {type(value).__name__}; {hint}")
 
 
 class BackendError(LangSplatError):

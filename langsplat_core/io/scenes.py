@@ -143,6 +143,7 @@ def load_scene(path: Path | str, read: Reader | None = None) -> Scene:
 
 def load_without_language(path: Path | str, read: Reader | None = None) -> Scene:
     """Return a scene as `load_scene` does, without reading its language field."""
+    expect(path, str | os.PathLike, "name the file of a scene")
     path = Path(path)
     scene, cameras = replace(_read(path, read), path=path), _cameras_path(path)
     if not os.path.exists(cameras):
@@ -273,8 +274,9 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer 
     scene with companions that could not be read, which would be removed. tell: report what the format loses,
     see `report_left_out`. write: in place of the format's writer.
     """
-    path = Path(path)
+    expect(path, str | os.PathLike, "say save_scene(path, scene)")
     expect(scene, Scene, "Scene(gaussians) makes one")
+    path = Path(path)
     if scene.unread:
         raise InputError(f"not written without what lies beside it; mend or remove that: {scene.unread[0]}")
     row = check_writable(path)

@@ -77,6 +77,7 @@ def draw(
 ) -> Image.Image:
     """Return an image of a scene; an `answer` as heat, from the nearest camera that has it in its image."""
     expect(scene, Scene, "load_scene(path) returns one")
+    expect(size, tuple | list, "say draw(scene, (width, height))")
     fitted = [camera.fitted(*size) for camera in scene.cameras]
     camera = fitted[0] if fitted else scene.framing_camera(size)
     answer = answer.answer if isinstance(answer, ComposedResult) else answer

@@ -15,25 +15,9 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError, expect
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query import grammar
 from langsplat_core.query.answers import QueryResult, locate, place_of
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.grammar import (
-    ADJECTIVES,
-    Atom,
-    Both,
-    Counted,
-    Inside,
-    Phrase,
-    Relation,
-    Superlative,
-    Union,
-    Without,
-    atoms,
-    children,
-    named,
-    parse,
-    unparse,
-)
 from langsplat_core.query.relations import Body, body, ranked, separate, stands, upright, viewpoint
 from langsplat_core.query.rule import RULE, Verdict, combined
 from langsplat_core.scene import LEVELS, Camera
@@ -51,12 +35,12 @@ class ComposedResult:
     """The answer to a phrase, and its parsed tree."""
 
     answer: QueryResult
-    tree: Phrase
+    tree: grammar.Phrase
 
     @property
     def reading(self) -> str:
         """The tree as text, such as "handle  inside  red mug"."""
-        return unparse(self.tree)
+        return grammar.unparse(self.tree)
 
 
 def run_phrase(
@@ -74,8 +58,9 @@ def run_phrase(
     without an anchor. Raises as `parse` and `QueryEngine.run`, and InputError for a missing viewpoint.
     """
     expect(engine, QueryEngine, "QueryEngine(scene, encoder) makes one")
-    tree = parse(text, engine.taught)
-    if isinstance(tree, Atom):
+    expect(viewpoint, Camera | None, "scene.cameras has those of a scene")
+    tree = grammar.parse(text, engine.taught)
+    if isinstance(tree, grammar.Atom):
         return ComposedResult(engine.run(tree.text, level, progress), tree)
     _check_viewpoint(tree, viewpoint)
     try:
@@ -83,7 +68,7 @@ def run_phrase(
     except EncoderError:
         if phrase_key(text) not in engine.field.phrasebook:
             raise
-        return ComposedResult(engine.run(text, level, progress), Atom(tidy(text)))
+        return ComposedResult(engine.run(text, level, progress), grammar.Atom(tidy(text)))
     # The position is that of the connected members with the highest relevancy.
     values = np.where(found.members, found.relevancy[found.level], 0).astype(np.float32)
     smoothed = engine.surface.smooth(values)
@@ -91,16 +76,16 @@ def run_phrase(
     return ComposedResult(replace(found, phrase=tidy(text), place=place, box=box), tree)
 
 
-def encoded_texts(engine: QueryEngine, tree: Phrase) -> list[str]:
+def encoded_texts(engine: QueryEngine, tree: grammar.Phrase) -> list[str]:
     """Return the atoms of a phrase that the encoder reads: all but taught words."""
-    return [atom.text for atom in atoms(tree) if not engine.is_taught(atom.text)]
+    return [atom.text for atom in grammar.atoms(tree) if not engine.is_taught(atom.text)]
 
 
 def check_phrase(
     engine: QueryEngine, text: str, viewpoint: Camera | None = None, progress: Progress = silent
 ) -> None:
     """Raise what `run_phrase` would, without searching; the encoded vectors are kept."""
-    tree = parse(text, engine.taught)
+    tree = grammar.parse(text, engine.taught)
     _check_viewpoint(tree, viewpoint)
     try:
         engine.text_vectors(encoded_texts(engine, tree), progress)
@@ -114,18 +99,22 @@ def encode_phrases(engine: QueryEngine, texts: Sequence[str]) -> None:
     wanted: list[str] = []
     for text in texts:
         with suppress(InputError):
-            wanted += encoded_texts(engine, parse(text, engine.taught))
+            wanted += encoded_texts(engine, grammar.parse(text, engine.taught))
     with suppress(EncoderError, InputError):
         engine.known_vectors(wanted)
 
 
-def _check_viewpoint(tree: Phrase, viewpoint: Camera | None) -> None:
+def _check_viewpoint(tree: grammar.Phrase, viewpoint: Camera | None) -> None:
     """Raise InputError for the first relation in the tree that needs a viewpoint, if there is none."""
-    if viewpoint is None and isinstance(tree, Relation | Superlative):
-        free = isinstance(tree, Superlative) and tree.kind in ("nearest", "farthest") and tree.anchor is None
+    if viewpoint is None and isinstance(tree, grammar.Relation | grammar.Superlative):
+        free = (
+            isinstance(tree, grammar.Superlative)
+            and tree.kind in ("nearest", "farthest")
+            and tree.anchor is None
+        )
         if free or tree.kind in NEED_VIEWPOINT:
             raise InputError(f"'{tree.kind}' depends on where one stands; give a camera, or say it otherwise")
-    for child in children(tree):
+    for child in grammar.children(tree):
         _check_viewpoint(child, viewpoint)
 
 
@@ -138,27 +127,27 @@ class _Evaluator:
         self._frame = upright(engine.scene.up())
         self._viewpoint = None if camera is None else viewpoint(camera, self._frame)
 
-    def answer(self, tree: Phrase, level: LevelChoice = "auto", count: int = 1) -> QueryResult:
+    def answer(self, tree: grammar.Phrase, level: LevelChoice = "auto", count: int = 1) -> QueryResult:
         """Return the answer to a tree, without a position; count: how many a superlative selects."""
         match tree:
-            case Atom(text):
+            case grammar.Atom(text):
                 return self._atom(text, level)
-            case Both(items) | Union(items):
-                return joined([self.answer(item, level) for item in items], isinstance(tree, Both))
-            case Without(what, unwanted):
+            case grammar.Both(items) | grammar.Union(items):
+                return joined([self.answer(item, level) for item in items], isinstance(tree, grammar.Both))
+            case grammar.Without(what, unwanted):
                 excluded, wanted = self.answer(unwanted), self.answer(what, level)
                 members = excluded.members
-                if isinstance(unwanted, Atom):
+                if isinstance(unwanted, grammar.Atom):
                     # "red mug" may also find a green mug, if nothing fits better; "not red mug" keeps it.
                     members = members & within_reach(self.engine, excluded, HALF)
                 return restricted(wanted, ~members, wanted) if excluded.found else wanted
-            case Inside(part, whole):
+            case grammar.Inside(part, whole):
                 return self._inside(part, whole, level)
-            case Counted(count, what):
+            case grammar.Counted(count, what):
                 every = self.answer(what, level, count)
                 enough = every.found and count_instances(self.engine, every).most >= count
                 return replace(every, judgement=replace(every.judgement, found=enough))
-            case Relation() | Superlative():
+            case grammar.Relation() | grammar.Superlative():
                 return self._chosen(tree, level, count)
 
     def _run(self, text: str, level: LevelChoice) -> QueryResult:
@@ -169,30 +158,32 @@ class _Evaluator:
 
     def _atom(self, text: str, level: LevelChoice) -> QueryResult:
         """Return the answer to a phrase; a thing is searched among wholes, unless it fits none."""
-        if level != "auto" or named(text) != "thing" or self.engine.is_taught(text):
+        if level != "auto" or grammar.named(text) != "thing" or self.engine.is_taught(text):
             return self._run(text, level)
         whole = self._run(text, "whole")
         return whole if whole.peak >= FLOOR else self._run(text, "auto")
 
-    def _inside(self, part: Phrase, whole: Phrase, level: LevelChoice) -> QueryResult:
+    def _inside(self, part: grammar.Phrase, whole: grammar.Phrase, level: LevelChoice) -> QueryResult:
         thing, engine = self.answer(whole), self.engine
-        if not isinstance(part, Atom) or engine.is_taught(part.text) or engine.bars is None:
+        if not isinstance(part, grammar.Atom) or engine.is_taught(part.text) or engine.bars is None:
             found = self.answer(part, level)
             return restricted(found, thing.members, thing)
         names, on = [part.text], thing.members
-        if isinstance(whole, Atom) and not engine.is_taught(whole.text):
+        if isinstance(whole, grammar.Atom) and not engine.is_taught(whole.text):
             names += filter(engine.is_known, [f"{whole.text} {part.text}"])
-            if ADJECTIVES.isdisjoint(whole.text.lower().split()):  # an adjective picks one of several
+            if grammar.ADJECTIVES.isdisjoint(whole.text.lower().split()):  # an adjective picks one of several
                 on = within_reach(engine, thing, RULE.around)
         calibration = engine.calibration if thing.probability is not None else None
         found = engine.run_inside(names, on, level, calibration)
         return restricted(found, found.members, thing)
 
-    def _chosen(self, tree: Relation | Superlative, level: LevelChoice, count: int) -> QueryResult:
+    def _chosen(
+        self, tree: grammar.Relation | grammar.Superlative, level: LevelChoice, count: int
+    ) -> QueryResult:
         what = self.answer(tree.what, level)
         anchor = None if tree.anchor is None else self.answer(tree.anchor)
         things, anchors = self._bodies(what), [] if anchor is None else self._bodies(anchor)
-        if isinstance(tree, Superlative):
+        if isinstance(tree, grammar.Superlative):
             every, others = [thing for _, thing in things], [other for _, other in anchors]
             right = {*ranked(tree.kind, every, others, self._viewpoint)[:count]}
         else:

@@ -91,8 +91,11 @@ def render(
     that cannot load here, ValueError for values of another shape.
     """
     expect(scene, Scene, "load_scene(path) returns one")
+    expect(profile, RasterSettings | None, "config.INRIA is one")
     if values is not None:
         check_array("values", np.asarray(values), ("N", "C"), {"N": len(scene.gaussians.means)})
+        if not np.isfinite(values).all():
+            raise InputError("values: some are not finite, and would spoil all that they blend with")
     rasterizer = _cpu() if backend == "cpu" else load_rasterizer(backend)
     view = view_of(scene, camera, rasterizer, scene.raster_settings(profile))
     return splat_colours(view, scene.gaussians, values)

@@ -156,12 +156,16 @@ def look_at(
 
     `size` is (width, height) in pixels. An `up` parallel to the view is replaced by a world axis.
     """
-    eye = np.asarray(eye, dtype=np.float64)
-    forward = np.asarray(target, dtype=np.float64) - eye
+    given = [np.asarray(vector, dtype=np.float64) for vector in (eye, target, up)]
+    if any(vector.shape != (3,) or not np.isfinite(vector).all() for vector in given):
+        raise ValueError(f"eye {eye}, target {target}, up {up}: expected three finite numbers each")
+    if not 0 < fov_y_degrees < 180:
+        raise ValueError(f"a field of view of {fov_y_degrees} degrees: expected above 0 and below 180")
+    eye, forward = given[0], given[1] - given[0]
     if not (away := float(np.linalg.norm(forward))) > 0:
         raise ValueError(f"a camera at {eye} that looks at itself; give another eye or target")
     forward = forward / away
-    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    right = np.cross(forward, given[2])
     if np.linalg.norm(right) < 1e-9:
         right = across(forward)
     right = right / np.linalg.norm(right)
@@ -287,6 +291,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         expect(self.gaussians, Gaussians, "load_scene(path) makes a scene of a file")
+        expect(self.language, LanguageField | None, "a scene's own is scene.language")
         object.__setattr__(self, "cameras", tuple(self.cameras))
         for camera in self.cameras:
             expect(camera, Camera, "look_at makes one")

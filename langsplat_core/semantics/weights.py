@@ -11,10 +11,11 @@ from copy import deepcopy
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, get_args
 
 from langsplat_core import registry
-from langsplat_core.errors import EncoderError
+from langsplat_core.config import Device
+from langsplat_core.errors import EncoderError, expect
 from langsplat_core.io.files import shown
 from langsplat_core.io.hostile import FromFile
 
@@ -74,6 +75,7 @@ def weights_path(model: str, option: str) -> Path:
     as "--clip.model". Existing paths are never looked up on the hub; with HF_HUB_OFFLINE set, or if the name
     comes from a file and not from the user, nothing is. Raises EncoderError that says what to pass or run.
     """
+    expect(model, str | os.PathLike, "a folder, a file, a hub id, or demo")
     path, said = local_path(model), shown(model)
     if os.path.isfile(path):
         plain = any(path.match(pattern) for pattern in SAFE + PICKLED)
@@ -281,6 +283,8 @@ def torch_device(device: str) -> str:
     """Return the torch device of "auto", "cpu" or "cuda"; "auto" is the current CUDA device, if any."""
     if device == "cpu":
         return device  # without importing torch, which a small text encoder does not need
+    if device not in get_args(Device):
+        raise EncoderError(f"device {device}: choose one of {', '.join(get_args(Device))}")
     import torch
 
     if torch.cuda.is_available():

@@ -17,7 +17,7 @@ import pytest
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
-from langsplat_core.io.scenes import save_scene
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.notebook import draw
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.query.compose import check_phrase, run_phrase
@@ -43,7 +43,7 @@ from langsplat_core.scene import (
     Scene,
 )
 from langsplat_core.semantics import relevancy as relevancies
-from langsplat_core.semantics.encoders import DEMO, OPEN_MODEL, keep_calibration
+from langsplat_core.semantics.encoders import DEMO, OPEN_MODEL, keep_calibration, load_text_encoder
 from langsplat_core.semantics.relevancy import FEWEST, Scale, latent_relevancy, relevancy_of
 from tests.support.fakes import (
     DIM,
@@ -148,18 +148,29 @@ def test_answers_reach_other_processes_and_say_where_in_the_world():
 
 def test_wrong_kinds_are_named_and_arrays_are_not_printed():
     scene = blob_scene()
+    engine = QueryEngine(scene, FakeEncoder())
     for wrong, said in (
         (lambda: render(scene, 0), "expected a Camera, got int; scene.cameras has those of a scene"),
         (lambda: render("a.ply", scene.cameras[0]), "expected a Scene, got str; load_scene"),
         (lambda: save_scene("a.ply", scene.gaussians), "expected a Scene, got Gaussians; Scene\\(gaussians"),
         (lambda: Scene("a.ply"), "expected a Gaussians, got str; load_scene"),
+        (lambda: Scene(scene.gaussians, scene.gaussians), "LanguageField.*, got Gaussians; a scene"),
+        (lambda: load_scene(3), "got int; name the file"),
+        (lambda: save_scene(scene, "a.ply"), "got Scene; say save_scene\\(path, scene"),
+        (lambda: load_text_encoder(3), "got int; a folder, a file, a hub id"),
+        (lambda: render(scene, scene.cameras[0], np.full((len(scene.gaussians), 1), np.nan)), "not finite"),
+        (lambda: render(scene, scene.cameras[0], profile="inria"), "got str; config.INRIA"),
+        (lambda: draw(scene, scene.cameras[0]), "got Camera; say draw\\(scene, \\(width"),
         (lambda: draw(scene, answer="mug"), "expected a QueryResult, got str; run_phrase"),
+        (lambda: run_phrase(engine, "mug left of book", viewpoint=0), "Camera.*, got int"),
         (lambda: train_scene("p", "a.ply", {}), "expected settings such as TrainConfig.*, got dict"),
         (lambda: train_scene("p", "a.ply", {}, until="masks"), "until 'masks': no stage .*'language"),
     ):
         with pytest.raises(InputError, match=said):
             wrong()
-    found = run_phrase(QueryEngine(scene, FakeEncoder()), "mug")
+    with pytest.raises(EncoderError, match="device gpu: choose one of auto, cpu, cuda"):
+        load_text_encoder("demo", "gpu")
+    found = run_phrase(engine, "mug")
     drawn = [np.asarray(draw(scene, (64, 48), answer)) for answer in (found, found.answer)]
     np.testing.assert_array_equal(*drawn)
     shown = repr((scene.gaussians, scene.language, render(scene, scene.cameras[0])))

@@ -97,8 +97,14 @@ def test_cameras_are_rigid_and_of_whole_pixels():
             replace(camera, world_to_camera=wrong)
     with pytest.raises(ValueError, match="must be whole"):
         replace(camera, width=60.5)
-    with pytest.raises(ValueError, match="looks at itself"):
-        look_at(np.ones(3), np.ones(3), np.array([0, 0, 1.0]), (60, 40))
+    for eye, degrees, said in (
+        ([1, 1, 1], 50, "looks at itself"),
+        ([0, np.nan, 0], 50, "three finite numbers"),
+        ([0, 0], 50, "three finite numbers"),
+        ([0, 0, 0], 180, "of 180 degrees"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            look_at(eye, np.ones(3), np.array([0, 0, 1.0]), (60, 40), degrees)
     sized = replace(camera, width=np.uint8(60), height=40.0)
     assert (type(sized.width), sized.width, type(sized.height), sized.height) == (int, 60, int, 40)
     assert camera not in (replace(camera), sized)
