@@ -111,6 +111,10 @@ class Capture:
         rows = zip(self.cameras, self.photos, strict=False)  # there are no files of images made otherwise
         return {camera.name: content(photo.path)[:16] for camera, photo in rows}
 
+    def take(self, indices: Sequence[int]) -> "Capture":
+        """Return the photographs at `indices`, detached from the files, with the points of all."""
+        return self._of([(self.cameras[i], self.images[i], self.mask(i)) for i in indices])
+
     def shrunk(self, indices: Sequence[int], longer_side: int) -> "Capture":
         """Return the photographs at `indices`, at most `longer_side` pixels long, with the points of all."""
         views: list[View] = []
@@ -200,7 +204,6 @@ def report_lost_points(good: Array, source: str) -> None:
 
 
 def _is_cut_out(alpha: Array) -> bool:
-    """Return True where most of a photograph, or of its edge, is transparent."""
     empty = alpha < SOLID
     edge = np.concatenate([empty[0], empty[-1], empty[:, 0], empty[:, -1]])
     return bool(empty.mean() > 0.5 or edge.mean() > 0.5)

@@ -309,7 +309,6 @@ def find_model(folder: Path) -> Path | None:
 
 
 def _photographs_of(model_folder: Path) -> int:
-    """Return the number of photographs with a camera in a model; 0 if it is damaged."""
     try:
         images = _content(model_folder / f"images{model_suffix(model_folder)}", quiet=True)
         return len({image.name for image in images})

@@ -151,7 +151,6 @@ def _photo_file(find: Callable[[str], Path], label: str) -> Path:
 
 
 def _mask_file(find: Callable[[str], Path], frame: Json) -> Path | None:
-    """Return the file of a frame's "mask_path"; ValueError where there is none."""
     if (label := frame.get("mask_path")) is None:
         return None
     if not isinstance(label, str) or not os.path.isfile(find(label)):
@@ -160,7 +159,6 @@ def _mask_file(find: Callable[[str], Path], frame: Json) -> Path | None:
 
 
 def _number(values: Json, key: str, default: float | None = None) -> float:
-    """Return a finite number; the ValueError names its key."""
     value = values.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e15:
         raise ValueError(f'"{key}" must be a finite number, got {reprlib.repr(value)}')

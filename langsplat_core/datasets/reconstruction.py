@@ -255,7 +255,6 @@ def best_model(best: Model | None, models: Iterable[Model]) -> Model | None:
 
 
 def _worth(model: Model) -> tuple[int, float]:
-    """Return the number of located photographs, and the mean reprojection error, px."""
     return len(located_names(model)), float(model.compute_mean_reprojection_error())
 
 

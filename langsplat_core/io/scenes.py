@@ -346,7 +346,6 @@ def scene_files(path: Path | str) -> tuple[Path, ...]:
 
 
 def _companions(path: Path) -> tuple[Path, Path, Path]:
-    """Return the paths of sidecar, cameras and origin of a scene."""
     suffixes = (language_files.SUFFIX, camera_files.SUFFIX, ORIGIN_SUFFIX)
     sidecar, cameras, origin = (companion_path(path, suffix) for suffix in suffixes)
     return sidecar, cameras, origin

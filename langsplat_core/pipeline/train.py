@@ -136,99 +136,64 @@ def _train(
 ) -> reports.TrainReport:
     """Train in a work folder that is this run's own; `given`: the scene whose Gaussians are taken."""
     config, processes = run.config, run.processes
-    encoder, named_source = None, None
+    encoder, source = None, None
     with run.timed("photographs"):
         if run.until != "gaussians":  # first: absent weights should not cost an hour
             encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
-            named_source = None if masks_of else load_mask_source(config.masks, config.clip.device)
+            source = None if masks_of else load_mask_source(config.masks, config.clip.device)
         # One process solves for cameras, the others find them in the work folder.
         capture = processes.once(lambda: _photographs(run))
-        contents = capture.contents()
-        run.photographs_are(contents)
+        run.photographs_are(capture.contents())
         train, held_out = split_views(capture, config.dataset)
-        cameras = tuple(capture.cameras[i] for i in train)
+        seen = capture.take(train)
         if processes.is_main:  # for whoever looks at the Gaussians before their scene is written
-            write_cameras((run.work / reports.PREVIEW).with_suffix(CAMERAS), cameras)
+            write_cameras((run.work / reports.PREVIEW).with_suffix(CAMERAS), seen.cameras)
 
     if encoder is not None:
-        mask_source = named_source or masks_of(capture)  # type: ignore[misc]  # one of them is there
+        source = source or masks_of(capture)  # type: ignore[misc]  # one of them is there
         with run.timed("masks and vectors"):
-            features = _features(run, capture, train, mask_source, encoder)
+            features = _features(run, seen, source, encoder)
             language_field.check_masks(features)  # before the Gaussians, which may cost hours
 
     with run.timed("radiance"):
         if given is None:
-            settings = trainer.supported(config.radiance, len(train))
-            if settings.steps < config.radiance.steps:
-                log.info(
-                    "training takes %d times %d steps, not %d: with %d photographs more does not pay; "
-                    "--radiance.capped-views 0 spends all",
-                    *(settings.ensemble, settings.steps, config.radiance.steps, len(train)),
-                )
-            made = capture, train, settings, run.work, run.progress, held_out
+            made = capture, train, config.radiance, run.work, run.progress, held_out
             gaussians = processes.once(lambda: trained_gaussians(*made))
         else:
             gaussians = place_scene(given, origin=capture.origin).gaussians
 
     language, figures = None, dict[str, Any]()
-    if encoder is not None:
-        language, figures = _language(run, capture, train, gaussians, features, mask_source, encoder)
+    if encoder is not None and source is not None:
+        language, figures = _language(run, seen, gaussians, features, source, encoder)
 
     if processes.is_main:
-        with run.timed("saving and held-out views"):
-            said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
-            metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
-            scene = Scene(gaussians, language, cameras, metres_per_unit=metres, origin=capture.origin)
-            save_scene(run.out, scene)
-            small = capture.read_at(held_out, QUICK_SIDE) if held_out else None
-            near = config.radiance.near or scene.near  # as whoever opens the scene has it
-            told: dict[str, Any] = {"near": near, "progress": run.progress}
-            scores = evaluate_views(gaussians, capture, held_out, small=small, **told)
-            trained = evaluate_views(gaussians, capture, reports.shown_views(train), **told)
-        rule = f"one in {config.dataset.test_every}, "
-        rule += "by name" if config.dataset.hold_out == "every" else "amid others"
-        report = reports.TrainReport(
-            views=len(cameras),
-            held_out=len(scores),
-            gaussians=len(gaussians),
-            psnr=_mean(score.psnr for score in scores),
-            psnr_small=_mean(score.psnr_small for score in scores),
-            warnings=reports.quality_warnings(capture, train, scores, trained),
-            seconds=run.kept["seconds"],
-            dataset=os.path.realpath(run.dataset),
-            contents=contents,
-            taken=capture.taken,
-            held_out_views=tuple(scores),
-            psnr_trained=_mean(score.psnr for score in trained),
-            held_out_rule="as the dataset says" if any(photo.held_out for photo in capture.photos) else rule,
-            **figures,
-        )
-        reports.write_reports(run.work, report, capture, gaussians, trained)
+        said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
+        metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
+        scene = Scene(gaussians, language, seen.cameras, metres_per_unit=metres, origin=capture.origin)
+        _finish(run, capture, scene, train, held_out, figures)
     processes.barrier()
     return reports.read_report(run.work)
 
 
 def _language(
     run: _Run,
-    capture: Capture,
-    train: list[int],
+    seen: Capture,
     gaussians: Gaussians,
     features: Sequence[ImageFeatures],
     source: MaskSource,
     encoder: Encoder,
 ) -> tuple[LanguageField, dict[str, Any]]:
     """Return the language field of the Gaussians, and the report's figures of it."""
-    cameras = tuple(capture.cameras[i] for i in train)
-    views, shared = language_field.views_of(cameras, features), (run.work, run.progress, run.processes)
+    views, shared = language_field.views_of(seen.cameras, features), (run.work, run.progress, run.processes)
     stages = language_field.Stages(gaussians, views, encoder, run.config, *shared)
     if not source.agrees:
         with run.timed("masks that agree"):
-            photographs = [(capture.images[i], capture.mask(i)) for i in train]
+            photographs = [(image, seen.mask(row)) for row, image in enumerate(seen.images)]
             features = language_field.agreed_features(stages, photographs)
-            stages = replace(stages, views=language_field.views_of(cameras, features))
+            stages = replace(stages, views=language_field.views_of(seen.cameras, features))
     with run.timed("language field"):
         language, codec = language_field.language_field(stages)
-        if not capture.drawn:
+        if not seen.drawn:
             language = replace(language, calibration=None)  # which holds in drawn rooms alone
     return language, {
         "masks": source.name,
@@ -241,6 +206,38 @@ def _language(
         "relevancy_error_p99": codec.error_p99,
         "observed": float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
     }
+
+
+def _finish(
+    run: _Run, capture: Capture, scene: Scene, train: list[int], held_out: list[int], figures: dict[str, Any]
+) -> None:
+    """Write a scene, measure its views against their photographs, and report the training."""
+    with run.timed("saving and held-out views"):
+        save_scene(run.out, scene)
+        small = capture.read_at(held_out, QUICK_SIDE) if held_out else None
+        near = run.config.radiance.near or scene.near  # as whoever opens the scene has it
+        told: dict[str, Any] = {"near": near, "progress": run.progress}
+        scores = evaluate_views(scene.gaussians, capture, held_out, small=small, **told)
+        trained = evaluate_views(scene.gaussians, capture, reports.shown_views(train), **told)
+    rule = f"one in {run.config.dataset.test_every}, "
+    rule += "by name" if run.config.dataset.hold_out == "every" else "amid others"
+    report = reports.TrainReport(
+        views=len(train),
+        held_out=len(scores),
+        gaussians=len(scene.gaussians),
+        psnr=_mean(score.psnr for score in scores),
+        psnr_small=_mean(score.psnr_small for score in scores),
+        warnings=reports.quality_warnings(capture, train, scores, trained),
+        seconds=run.kept["seconds"],
+        dataset=os.path.realpath(run.dataset),
+        contents=run.kept["contents"],
+        taken=capture.taken,
+        held_out_views=tuple(scores),
+        psnr_trained=_mean(score.psnr for score in trained),
+        held_out_rule="as the dataset says" if any(photo.held_out for photo in capture.photos) else rule,
+        **figures,
+    )
+    reports.write_reports(run.work, report, capture, scene.gaussians, trained)
 
 
 def _mean(scores: Iterable[float | None]) -> float | None:
@@ -266,24 +263,21 @@ def _photographs(run: _Run) -> Capture:
     return capture
 
 
-def _features(
-    run: _Run, capture: Capture, train: list[int], source: MaskSource, encoder: Encoder
-) -> OnDemand[ImageFeatures]:
-    """Find the masks of the photographs at `train`, and their vectors where masks agree between photographs.
+def _features(run: _Run, seen: Capture, source: MaskSource, encoder: Encoder) -> OnDemand[ImageFeatures]:
+    """Find the masks of the photographs, and their vectors where masks agree between photographs.
 
     Other masks are encoded once they agree. Results are kept by mask settings, encoder and image.
     """
     log.info("masks: %s, encoder: %s", source.name, encoder.id)
-    if encoder.id == DEMO and not capture.drawn:
+    if encoder.id == DEMO and not seen.drawn:
         log.warning("%s", DEMO_ELSEWHERE)
     store = FeatureStore(run.work / ("features" if source.agrees else "masks"))
-    mine = run.processes.share(train)
-    names = [capture.cameras[i].name for i in mine]
-    images, counted = [capture.images[i] for i in mine], [capture.mask(i) for i in mine]
-    seen_by = encoder if source.agrees else None
-    describe_capture(images, names, source, seen_by, store, run.progress, counted)
+    mine = seen.take(run.processes.share(range(len(seen))))
+    names = [camera.name for camera in mine.cameras]
+    seen_by, counted = encoder if source.agrees else None, [mine.mask(row) for row in range(len(mine))]
+    describe_capture(mine.images, names, source, seen_by, store, run.progress, counted)
     run.processes.barrier()
-    return store.of([capture.cameras[i].name for i in train])
+    return store.of([camera.name for camera in seen.cameras])
 
 
 def trained_gaussians(
@@ -294,7 +288,17 @@ def trained_gaussians(
     progress: Progress,
     held_out: Sequence[int] = (),
 ) -> Gaussians:
-    """Return the Gaussians of the photographs at `train`, from `work` where they were trained before."""
+    """Return the Gaussians of the photographs at `train`, from `work` where they were trained before.
+
+    Few photographs are trained on by what they support, see `trainer.supported`.
+    """
+    config, asked = trainer.supported(config, len(train)), config.steps
+    if config.steps < asked:
+        log.info(
+            "training takes %d times %d steps, not %d: with %d photographs more does not pay; "
+            "--radiance.capped-views 0 spends all",
+            *(config.ensemble, config.steps, asked, len(train)),
+        )
     # Backend and checkpoints do not change the result, so that a run may move between machines.
     settings = replace(config, backend="auto", checkpoint_every=RadianceConfig.checkpoint_every)
     done = work / f"{stage_key('radiance', VERSION, settings, capture.digest(train))}.ply"

@@ -58,7 +58,6 @@ from langsplat_core.semantics.features import FeatureStore, ImageFeatures, descr
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.training.language.codec_fit import CodecReport
-from langsplat_core.training.radiance.trainer import supported
 from tests.benchmarks.oracles import (
     TruthEncoder,
     moved_to_images,
@@ -215,7 +214,7 @@ class Room:
         """Gaussians that were trained without the held-out views."""
         train, _ = self.capture.split(HOLD_OUT)
         with self._timed("radiance"):
-            settings = supported(self.settings.radiance, len(train))
+            settings = self.settings.radiance
             return trained_gaussians(self.capture, train, settings, self.folder, self.progress)
 
     @cached_property

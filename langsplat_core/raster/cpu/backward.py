@@ -301,7 +301,6 @@ def _axes_gradient(matrices: Any, scales: cp.Point, by_covariance: cp.Point) -> 
 
 @helper
 def _put(array: Array, rows: Array, values: Any) -> None:
-    """Write eight lanes for each column into eight rows."""
     for column in range(len(values)):
         ln.scatter(array, rows, 0, column, values[column])
 

@@ -196,7 +196,6 @@ def exp(x: Lanes) -> Lanes:
 
 @helper
 def _three(array: Array, which: Array) -> Point:
-    """Return the first three columns of eight rows."""
     return gathered(array, which, 0, 0), gathered(array, which, 0, 1), gathered(array, which, 0, 2)
 
 

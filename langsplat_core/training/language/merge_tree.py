@@ -262,7 +262,6 @@ class _Merger:
         return float(between * (area / self._plain) ** SMALL)
 
     def _standing(self, small: int, large: int) -> float:
-        """Return the term `standing` of the cost, in [0, 1)."""
         (middle, own, _), (base, extents, outwards) = self._planes[small], self._planes[large]
         height, share = float((middle - base) @ outwards), np.linalg.norm(own) / max(2 * extents[1], 1e-30)
         return float(height / (height + extents[0]) * (1 - share)) if height > 0 and share < 1 else 0.0
