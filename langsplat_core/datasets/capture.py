@@ -20,12 +20,11 @@ from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.photos import (
     SOLID,
     WORKERS,
-    Layers,
+    Developed,
+    Developer,
     Photo,
     View,
     content,
-    counted,
-    developer,
     exif_facts,
     stray_masks,
     unique_names,
@@ -132,14 +131,14 @@ class Capture:
         """
         if not self.photos or longer_side >= max(max(self.images[index].shape) for index in indices):
             return self.shrunk(indices, longer_side)
-        layers_of = developer(longer_side)
+        developed = Developer(longer_side)
 
         def view(index: int) -> View:
             try:
-                lens, image, mask, alpha = layers_of(self.photos[index])
+                lens, image, mask = developed(self.photos[index]).view(self.cut_out)
             except PictureError as error:
                 raise InputError(f"{error}; it was there when this run began") from None
-            camera, mask = self.cameras[index], counted(mask, alpha, self.cut_out)
+            camera = self.cameras[index]
             return replace(lens, world_to_camera=camera.world_to_camera, name=camera.name), image, mask
 
         with ThreadPoolExecutor(WORKERS) as pool:
@@ -237,43 +236,42 @@ def develop(
     order = sorted(range(len(photos)), key=names.__getitem__)
     told: list[tuple[str, str]] = []  # what was guessed, and of which photograph
 
-    developed = developer(config.max_side)
+    developer = Developer(config.max_side)
 
-    def view(index: int) -> Layers | str:
-        photo = photos[index]
+    def developed(photo: Photo) -> Developed | str:
         try:
-            camera, image, mask, alpha = developed(photo, lambda what: told.append((what, photo.label)))
+            made = developer(photo, lambda what: told.append((what, photo.label)))
         except PictureError as error:
             return f"{photo.label} ({error.reason})"
-        if (shown := counted(mask, alpha, True)) is not None and not shown.any():
-            return f"{photo.label} (its mask leaves nothing of it)"
-        return replace(camera, name=names[index]), image, mask, alpha
+        _, _, counted = made.view(cut_out=True)
+        return made if counted is None or counted.any() else f"{photo.label} (its mask leaves nothing of it)"
 
     room = IN_MEMORY
-    done: list[tuple[Camera, Array, Photo, Array | None, Array | None]] = []
+    done: dict[int, Developed] = {}  # by the number of the photograph
     broken: list[str] = []
     with ThreadPoolExecutor(WORKERS) as pool:
-        for count, (index, found) in enumerate(zip(order, pool.map(view, order), strict=True), 1):
+        each = pool.map(developed, (photos[index] for index in order))
+        for count, (index, found) in enumerate(zip(order, each, strict=True), 1):
             if isinstance(found, str):
                 broken.append(found)
             else:
-                camera, image, mask, alpha = found
-                room -= image.nbytes
-                kept = image if room >= 0 else in_file(image)
-                done.append((camera, kept, photos[index], mask, alpha))
+                room -= found.image.nbytes
+                image = found.image if room >= 0 else in_file(found.image)
+                done[index] = found._replace(camera=replace(found.camera, name=names[index]), image=image)
             progress("reading photographs", count / len(order))
     if not done:
         raise InputError(f"no photograph can be read: {shortened(broken)}")
     if broken:
         report_loss("%d photographs cannot be used and are left out: %s", len(broken), shortened(broken))
-    cameras, images, files, masks, alphas = zip(*done, strict=True)
+    _, _, masks, alphas = zip(*done.values(), strict=True)
     _report(told, masks)
     if stray := stray_masks(photos):
         remedy = "a mask is called masks/NAME.jpg.png or masks/NAME.png after its photograph"
         report_loss("%d masks are of no photograph: %s; %s", len(stray), shortened(stray), remedy)
     cut_out = _cut_out(masks, alphas, config)
-    masks = tuple(counted(mask, alpha, cut_out) for mask, alpha in zip(masks, alphas, strict=True))
+    cameras, images, masks = zip(*(made.view(cut_out) for made in done.values()), strict=True)
     masks = masks if any(mask is not None for mask in masks) else ()
+    files = tuple(photos[index] for index in done)
     return Capture(cameras, images, points, colours, photos=files, masks=masks, cut_out=cut_out)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cache, lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 from unicodedata import normalize
 
 import numpy as np
@@ -334,35 +334,38 @@ View = tuple[Camera, Array, Array | None]
 OPAQUE, SOLID = 250, 5  # alpha, of 255, from which a pixel is opaque, and from which it shows anything
 
 
-def counted(mask: Array | None, alpha: Array | None, cut_out: bool) -> Array | None:
-    """Return the (H, W) bool pixels that count by a mask and by transparency; None: all.
+class Developed(NamedTuple):
+    """A photograph resampled to a pinhole."""
 
-    cut_out: pixels count that are at least partly opaque; else only opaque ones.
-    """
-    if alpha is None:
-        return mask
-    solid = np.asarray(alpha >= (SOLID if cut_out else OPAQUE))
-    return solid if mask is None else mask & solid
+    camera: Camera
+    image: Array  # (H, W, 3) uint8
+    mask: Array | None  # (H, W) bool pixels that count by its mask; None: all
+    alpha: Array | None  # (H, W) uint8; None: opaque
+
+    def view(self, cut_out: bool) -> View:
+        """Return its view, whose pixels count where they are opaque, with `cut_out` where partly so, too."""
+        if self.alpha is None:
+            return self.camera, self.image, self.mask
+        solid = np.asarray(self.alpha >= (SOLID if cut_out else OPAQUE))
+        return self.camera, self.image, solid if self.mask is None else self.mask & solid
 
 
-Layers = tuple[Camera, Array, Array | None, Array | None]  # a view, and its (H, W) uint8 alpha
+class Developer:
+    """Reads photographs, and resamples them to pinholes of at most `max_side` px."""
 
+    def __init__(self, max_side: int) -> None:
+        # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
+        @lru_cache(maxsize=4)
+        def plan(intrinsics: PhotoIntrinsics) -> tuple[Camera, Array | None]:
+            camera = pinhole_for(intrinsics, max_side)
+            return camera, None if intrinsics.distortion is None else source_positions(intrinsics, camera)
 
-def developer(max_side: int) -> Callable[..., Layers]:
-    """Return a function from a photograph to its layers, at most `max_side` px long; it raises PictureError.
+        self._plan = plan
 
-    Its second argument, a `Tell`, is told what was guessed.
-    """
-
-    # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
-    @lru_cache(maxsize=4)
-    def plan(intrinsics: PhotoIntrinsics) -> tuple[Camera, Array | None]:
-        camera = pinhole_for(intrinsics, max_side)
-        return camera, None if intrinsics.distortion is None else source_positions(intrinsics, camera)
-
-    def developed(photo: Photo, tell: Tell = lambda _: None) -> Layers:
+    def __call__(self, photo: Photo, tell: Tell = lambda _: None) -> Developed:
+        """Develop a photograph; tell: is told what was guessed. Raises PictureError."""
         image, intrinsics = _read_for(photo, tell)
-        camera, positions = plan(intrinsics)
+        camera, positions = self._plan(intrinsics)
         camera = replace(camera, world_to_camera=photo.world_to_camera)
 
         def shown(source: Image.Image) -> Array:
@@ -370,6 +373,4 @@ def developer(max_side: int) -> Callable[..., Layers]:
 
         alpha = shown(image.getchannel("A").convert("RGB"))[..., 0] if image.mode == "RGBA" else None
         mask = None if photo.mask is None else shown(_read_mask(photo.mask, image.size))[..., 0] >= 128
-        return camera, shown(over_black(image)), mask, alpha
-
-    return developed
+        return Developed(camera, shown(over_black(image)), mask, alpha)

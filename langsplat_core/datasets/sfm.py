@@ -261,14 +261,13 @@ def _write_images(
     folder: Path, names: Sequence[str], capture: Capture, views: Sequence[int], progress: Progress
 ) -> tuple[Camera, ...]:
     """Write images to seek features in and return their cameras: from the files, larger than for training."""
-    enlarge = photos.developer(SIDE)
+    enlarge = photos.Developer(SIDE)
     cameras = []
     for count, (name, index) in enumerate(zip(names, views, strict=True)):
         progress("preparing photographs", count / len(views))
         camera, image, mask = capture.cameras[index], capture.images[index], capture.mask(index)
         if capture.photos:
-            camera, image, mask, alpha = enlarge(capture.photos[index])
-            mask = photos.counted(mask, alpha, capture.cut_out)
+            camera, image, mask = enlarge(capture.photos[index]).view(capture.cut_out)
         Image.fromarray(image).save(folder / name, compress_level=1)
         if capture.masks:
             counted = np.ones(image.shape[:2], bool) if mask is None else mask
