@@ -236,8 +236,8 @@ class Stages:
             elif self.lift.mode == "one-pass":
                 latents, confidence = lift.lift_latents(self.rasterizer(), *scene, *shared)
             else:
-                places = self.rasterizer(), *scene
-                latents, confidence = lift.lift_by_gradient(*places, self.config.lift, *shared)
+                settings = self.config.lift
+                latents, confidence = lift.lift_by_gradient(self.rasterizer(), *scene, settings, *shared)
             return {"latents": latents, "confidence": confidence}
 
         made = self.processes.once(lambda: kept(done, make))

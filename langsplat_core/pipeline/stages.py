@@ -158,8 +158,8 @@ def _locked(folder: Path) -> io.FileIO:
             file.seek(0)
             holder = file.read(80).decode(errors="replace").strip() or "a process that gives no name"
             file.close()
-            what = "trains in this folder; wait for it, or name another one with --work"
-            raise InputError(f"{folder}: {holder} {what}") from None
+            instead = "wait for it, or name another one with --work"
+            raise InputError(f"{folder}: {holder} trains in this folder; {instead}") from None
         except OSError:  # a file system that knows no locks
             return file
         with contextlib.suppress(FileNotFoundError):

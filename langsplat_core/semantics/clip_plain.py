@@ -67,7 +67,7 @@ def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int])
     InputError for a phrase that is too long, EncoderError for one that would end early.
     """
     if len(ids) > room:
-        raise InputError(f"'{text[:40]} ...' is too long: {len(ids)} tokens of {room}; use fewer words")
+        raise InputError(f"'{text[:40]} ...' is too long: {len(ids)} tokens, not {room}; use fewer words")
     if not set(ends).isdisjoint(ids):
         raise EncoderError(f"{text[:80]!r} holds marks that this encoder cannot read; use plain words")
 

@@ -130,7 +130,10 @@ class SceneTextures:
         self.columns = max(min(COLUMNS, len(kept)), 1)
         self.size = (self.columns, max(math.ceil(len(kept) / self.columns), 1))
         if self.size[1] > ctx.info["GL_MAX_TEXTURE_SIZE"]:
-            raise BackendError(f"{len(kept)} Gaussians exceed this driver's textures; use --backend cpu")
+            raise BackendError(
+                f"rasterizer 'opengl': {len(kept)} Gaussians exceed this driver's texture size; "
+                "use --backend cpu"
+            )
         self.geometry = self._layers(self._geometry(kept), "f4")
         sh = kept.sh.reshape(len(kept), 3 * kept.sh.shape[1])
         self.sh = self._layers(np.clip(sh, -HALF_MAX, HALF_MAX) if half else sh, "f2" if half else "f4")

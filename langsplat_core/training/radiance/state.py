@@ -313,7 +313,7 @@ def load_checkpoint(path: Path, made_from: str, device: torch.device) -> Trainin
             raise ValueError(f"kind {metadata.get('kind')!r}")
         header = json.loads(metadata["state"])
         if header["fingerprint"] != made_from:
-            raise InputError(f"{path}: made by other photographs or settings; delete it or give these")
+            raise InputError(f"{path}: made with other photographs or settings; delete it, or pass those")
         rng = np.random.default_rng()
         rng.bit_generator.state = header["rng"]
         rows: Any = {part: {name: tensors[f"{part}.{name}"] for name in PARAMETERS} for part in ROWS}
