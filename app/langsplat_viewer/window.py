@@ -439,3 +439,4 @@ class Window:
         self.viewer.worker.close()
         if self.viewer.training is not None:
             self.viewer.training.end()
+            self.viewer.state.say("training stopped; the same entries in Train continue it")

@@ -373,11 +373,18 @@ def use_the_mouse_alone(s: Any) -> None:
     assert 0.01 < s.state.edit_form.move[0] / s.state.extent.radius < 0.1
     stops, out, done = Event(), s.folder / "trained.ply", {f"stage {n}": 1.0 for n in range(200)}
     said, by = SimpleNamespace(stages=done, left="", curves={}, said=[]), stops.set
-    s.viewer.training = SimpleNamespace(progress=said, out=out, exit_code=None, interrupt=by, end=by)
+    training = SimpleNamespace(
+        progress=said, out=out, exit_code=None, interrupt=by, end=by, interrupted=False
+    )
+    s.viewer.training = training
     s.open_panel("Train", frames=3)
     assert s.ctx.item_info("//**/Stop").rect_full.max.y < 620  # however much is done
     s.click("//**/Stop")
     assert stops.is_set()
+    training.interrupted = True
+    stops.clear()
+    s.click("//**/Stop", frames=2)
+    assert not stops.is_set()  # it is on its way
     s.viewer.training = None
     (s.folder / "within").mkdir()
     s.menu("File", "Open a scene ...")

@@ -1,6 +1,7 @@
 """Selecting, hiding, deleting, transforming and cropping; and what is asked before edits are lost."""
 
 import sys
+import threading
 import time
 from dataclasses import replace
 from functools import partial
@@ -366,6 +367,16 @@ def test_edited_scene_is_exported(pruned, tmp_path, title, name, what):
     assert said.file == tmp_path / name
     assert f"saved {tmp_path / name}" in said.text
     assert what in said.text
+
+
+def test_waiting_export_does_not_replace_an_earlier_one(pruned, tmp_path):
+    gate = threading.Event()
+    pruned.recorder.submit("before", lambda progress: gate.wait(60), lambda done: None, pruned.say_error)
+    for _ in range(2):
+        saving.run_export(pruned, tmp_path / "a.html", form_of(pruned, "web page"))
+    gate.set()
+    recorded(pruned)
+    assert ["by an earlier export" in text for text in errors(pruned)] == [True]
 
 
 SLOW = "import sys, time; print(sys.argv, flush=True); time.sleep(60)"

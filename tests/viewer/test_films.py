@@ -359,14 +359,20 @@ def test_impossible_recordings_are_refused_in_a_line(viewer, opened, tmp_path, f
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_film_is_made_beside_the_window(opened, tmp_path, frames):
+def test_films_are_made_beside_the_window(opened, tmp_path, frames, monkeypatch):
     record_three(opened)
     settings.put(opened.state.record, size=(32, 24))
     opened.state.record.fps = 1.0
     request = opened.state.request((32, 24))
     saving.save_film(opened, tmp_path)
     queries.ask(opened, "mug")  # the other worker answers meanwhile, and changes what is shown
+    saving.save_film(opened, tmp_path)  # waits for the first, and takes another name
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    opened.state.record.film_file = "~/typed"
+    saving.save_film(opened, tmp_path)
     recorded(opened)
+    assert [len(list((tmp_path / name).glob("*.png"))) for name in ("blobs-film-002", "typed")] == [5, 5]
     assert "blobs-film-001/: 32x24, 5 pictures" in " ".join(m.text for m in opened.state.messages)
     seen = sorted((tmp_path / "blobs-film-001").glob("*.png"))
     assert len(seen) == 5
@@ -400,6 +406,8 @@ def test_a_saved_view_can_be_read_again(opened, tmp_path):
     for save in (saving.save_picture, saving.save_view):
         assert save(opened, tmp_path / "file") is None
     assert ["not saved" in text for text in errors(opened)] == [True, True]
+    opened.state.path = tmp_path / "blobs.ply"
+    assert saving.save_view(opened, tmp_path / "gone").parent == tmp_path  # beside the scene
 
 
 SIZE = (32, 24)

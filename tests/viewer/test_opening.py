@@ -81,6 +81,8 @@ def test_dropping_opens_the_scene_and_names_other_files(viewer, names, opened_na
     assert viewer.state.path.name == opened_name
     assert [path.name for path in viewer.state.scenes] == [opened_name]
     assert errors(viewer) == ([said] if said else [])
+    act(opening.open_dropped, viewer, [Path("notes.txt")])
+    assert [path.name for path in viewer.state.scenes] == [opened_name]
 
 
 # Several scenes to switch between, without a window.

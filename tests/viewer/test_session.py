@@ -303,6 +303,7 @@ def test_project_restores_the_whole_session(opened, saved, again):
     act(opening.open_file, again, saved)
     assert len(after.session.queries) == 4
     assert saving.save_project(again, Path("/nowhere")) == saved  # where it came from
+    assert list(saved.parent.glob("*.langsplat")) == [saved]
 
 
 def test_two_windows_save_one_project_and_lose_nothing(saved, opened, again):
@@ -377,6 +378,9 @@ def test_project_of_a_changed_scene_restores_only_queries(saved, viewer, monkeyp
     assert len(viewer.state.session.queries) == 4
     assert not viewer.state.marks.selected.any()
     assert any("has changed" in text for text in errors(viewer))
+    before = saved.read_bytes()
+    saving.save_project(viewer)  # what was left out is not lost
+    assert saved.with_name("blobs-001-other-001.langsplat").read_bytes() == before
 
 
 SAVED = Path(__file__).parent / "saved"  # files as version 1 wrote them

@@ -72,7 +72,7 @@ def test_training_opens_its_scene(viewer, folder, begin):
     form = viewer.state.training_form
     assert (form.dataset, form.out) == (str(folder), str(folder.with_suffix(".ply")))
     assert settings.take(viewer.state, "wanted_panel") == "Train"
-    begin(GOOD, "blobs.ply")
+    begin(GOOD + "; print('a'); print('b'); print('c')", "blobs.ply")
     progress = viewer.training.progress
     finish(viewer)
     assert progress.stages == {"reading photographs": 1.0}
@@ -203,6 +203,10 @@ def test_checkpoints_are_shown_and_followed(viewer, folder, begin):
     assert viewer.state.view is view
     assert errors(viewer) == []
     assert viewer.state.scenes == ()  # what is on its way is not kept in the list
+    write_preview(checkpoint(folder.parent, whole.take(np.arange(9))))
+    viewer.watch.look()
+    viewer.watch.look()
+    assert not viewer.watch.changed  # it is followed, not asked about
     viewer.training.end()
 
 

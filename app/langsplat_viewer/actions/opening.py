@@ -125,7 +125,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.view, state.opening, state.leaving = viewpoint.opening_view(viewer), None, None
     state.tools, state.show_start = replace(state.tools, stroke=None), False
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
-    viewer.watch.begin(opened.read)
+    viewer.watch.begin(() if disk.is_preview(path) else opened.read)  # which is followed
     viewer.history = History()
     if not disk.is_preview(path):
         add_scenes(viewer, [path])
@@ -284,8 +284,8 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
         viewer.say_error(f"not opened: {others[0]}{more}")
-    add_scenes(viewer, known)
     if len(known) > 1:
+        add_scenes(viewer, known)
         viewer.state.say(f"{len(known)} scenes: the panel Scene lists them")
         open_panel(viewer, "Scene")
     if known:
@@ -309,14 +309,13 @@ def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = la
         return
 
     def restore(viewer: Viewer) -> None:
-        _restore(viewer, project, path.absolute())
-        viewer.state.project_digest = digest
+        _restore(viewer, project, path.absolute(), digest)
         then(viewer)
 
     open_scene(viewer, Path(project.scene), restore)
 
 
-def _restore(viewer: Viewer, project: Project, path: Path) -> None:
+def _restore(viewer: Viewer, project: Project, path: Path, digest: str) -> None:
     state, now, session = viewer.state, viewer.state.session, project.session
     assert state.extent is not None
     offset = np.array(project.origin) - state.origin
@@ -325,20 +324,21 @@ def _restore(viewer: Viewer, project: Project, path: Path) -> None:
         session = replace(session, split=now.split, splats=now.splats, overlays=now.overlays)
     for reason in project.left_out:
         viewer.say_error(reason)
+    kept = session
     if state.count != project.gaussians:
-        unedited = replace(session, marks=Marked(), moves=(), things=Things())
-        if unedited != session:
-            what = "what was selected, hidden, moved and named is left out"
+        kept = replace(session, marks=Marked(), moves=(), things=Things())
+        if kept != session:
+            what = "what was selected, hidden, deleted, moved and named is left out"
             viewer.say_error(f"the scene has changed since: {what}")
-        session = unedited
     try:
-        take_session(viewer, session)
+        take_session(viewer, kept)
     except LangSplatError as error:
         viewer.say_error(f"{path}: its transforms are left out: {one_line(error)}")
-        take_session(viewer, replace(session, moves=()))
+        take_session(viewer, replace(kept, moves=()))
     view = viewpoint.bookmarked_view(project.view.moved(offset), state.extent)
     state.view = view if project.intrinsics is None else replace(view, intrinsics=project.intrinsics)
-    state.saved, state.project = state.session, path
+    whole = state.session == session and not project.left_out  # else saving keeps the file as it was, too
+    state.saved, state.project, state.project_digest = state.session, path, digest if whole else ""
     state.preferences = state.preferences.with_recent(path)
     if project.panels:
         state.preferences = replace(state.preferences, panels=project.panels)
@@ -435,7 +435,7 @@ def watch_training(viewer: Viewer) -> None:
     viewer.training = None
     if training.exit_code == 0:
         told = [line for line in training.progress.said if not line.startswith(WARNING)]
-        for line in told[-3:]:  # quality warnings come with the scene, from its report
+        for line in told:  # quality warnings come with the scene, from its report
             state.say(line)
         open_scene(viewer, training.out)
     elif training.interrupted:

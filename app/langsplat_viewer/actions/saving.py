@@ -39,9 +39,11 @@ from langsplat_viewer.state import ExportForm, FileChoice, Leaving, SceneState, 
 from langsplat_viewer.viewer import CommandProcess, Viewer, program
 
 
-def _new_file(state: SceneState, folder: Path, suffix: str, more: str = "") -> Path:
-    """Return a free name in `folder`, after the scene's."""
-    return output.free_name(folder, f"{'scene' if state.path is None else state.path.stem}{more}", suffix)
+def _new_file(scene: Path | None, folder: Path, suffix: str, more: str = "") -> Path:
+    """Return a free name after the scene's in `folder`, beside the scene or at home, where one can write."""
+    places = (folder, folder if scene is None else scene.parent, Path(os.path.expanduser("~")))
+    place = next((place for place in places if os.access(place, os.W_OK)), folder)
+    return output.free_name(place, f"{'scene' if scene is None else scene.stem}{more}", suffix)
 
 
 # Pictures, views and paths.
@@ -52,7 +54,7 @@ def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
     state = viewer.state
     if not viewer.has_scene("save a picture of it") or viewer.surface is None or state.view is None:
         return None
-    path = _new_file(viewer.state, folder, ".png")
+    path = _new_file(viewer.state.path, folder, ".png")
     beside, transparent = viewer.beside, state.session.picture.transparent
     shown = [viewer] if beside is None or beside.state.scene is None else [viewer, beside]
 
@@ -88,7 +90,7 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
     request = state.request((width, height), state.session.picture.transparent)
 
     def work(progress: Progress) -> tuple[Path, str]:
-        path = _new_file(viewer.state, folder, ".png", f"-{width}x{height}")
+        path = _new_file(viewer.state.path, folder, ".png", f"-{width}x{height}")
         progress("drawing", 0.0, path.name)
         with output.in_one_line(path, f"{width}x{height}"), open_renderer("cpu") as renderer:
             output.save_png(path, output.draw_something(request, renderer))
@@ -102,7 +104,7 @@ def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
     state = viewer.state
     if not viewer.has_scene("save a view of it") or state.view is None:
         return None
-    path = _new_file(viewer.state, folder, ".json", "-view")
+    path = _new_file(viewer.state.path, folder, ".json", "-view")
     camera = replace(state.view, orthographic=False).camera(*state.size).moved(state.origin)
     span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
     more = f"; show it again with --camera {path.name}{span}"
@@ -115,7 +117,7 @@ def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
     if not keyframes:
         viewer.say_error("a path to save needs a keyframe: add one at the current view")
         return None
-    path = _new_file(viewer.state, folder, PATHS)
+    path = _new_file(viewer.state.path, folder, PATHS)
     more, flight = "; langsplat-viewer --headless --path makes a film of it", flight_of(keyframes)
     return viewer.save(path, lambda: write_flight(path, flight.moved(viewer.state.origin)), more)
 
@@ -130,11 +132,14 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
         viewer.say_error("a film needs a path: add two keyframes, or press Turntable")
         return
     typed, fps, request = record.film_file.strip(), record.fps, state.request(record.size)
+    scene, suffix = state.path, output.VIDEO if output.has_video() else ""
+
+    def named() -> Path:
+        new = folder.absolute() / os.path.expanduser(typed)
+        return output.check_film(new if typed else _new_file(scene, folder, suffix, "-film"), record.size)
+
     try:
-        new = folder.absolute() / typed
-        if not typed:
-            new = _new_file(viewer.state, folder, output.VIDEO if output.has_video() else "", "-film")
-        out = output.check_film(new, record.size)
+        named()
         seen_by = output.cameras_of(flight_of(path), state.extent, fps, record.size)
     except (InputError, OSError) as error:
         viewer.say_error(f"no film: {error}")
@@ -142,9 +147,10 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
 
     def work(progress: Progress) -> tuple[Path, str]:
         say_compiling(progress)
+        out = named()  # a free name may have been taken by an earlier film meanwhile
         return out, "; ".join(output.make_film(request, seen_by, fps, out, "cpu", progress))
 
-    _record(viewer, f"film {out.name}", work)
+    _record(viewer, "film", work)
 
 
 # The scene as it was edited.
@@ -291,7 +297,7 @@ def choose_export(viewer: Viewer) -> None:
     if form is None:
         return
     then = partial(run_export, form=form)
-    new = _new_file(viewer.state, folder_of(viewer), form.suffix, f"-{form.title.split()[0]}")
+    new = _new_file(viewer.state.path, folder_of(viewer), form.suffix, f"-{form.title.split()[0]}")
     ask_for(viewer, FileChoice(f"Export: {form.title}", then, "save", (form.suffix,), new))
 
 
@@ -305,10 +311,13 @@ def run_export(viewer: Viewer, out: Path, form: ExportForm) -> None:
     is_own = mask.all() and not (state.session.moves or taught or viewer.watch.changed) and path.exists()
     rows, write_page_of, chosen = np.flatnonzero(mask), _page(viewer), viewer.services.encoder_id
     encoder = f"--encoder={chosen}" if chosen else ""  # of the window
+    is_new = not out.exists()
     words = [flag if value is True else f"{flag}={value:g}" for flag, value in form.values.items() if value]
 
     def work(progress: Progress) -> tuple[Path, str]:
         check_keeps(out, path)
+        if is_new and out.exists():
+            raise InputError(f"{out}: was written by an earlier export; choose another name")
         if form.title == PAGE:
             return out, write_page_of(out, scene.take(rows), progress)
         with TemporaryDirectory(prefix="langsplat-") as folder:
@@ -379,7 +388,7 @@ def save(viewer: Viewer) -> None:
 def save_as(viewer: Viewer) -> None:
     """Have a dialog ask for the file that the project is saved to from now on."""
     if viewer.has_scene("save the project"):
-        new = _new_file(viewer.state, folder_of(viewer), PROJECTS)
+        new = _new_file(viewer.state.path, folder_of(viewer), PROJECTS)
         ask_for(viewer, FileChoice("Save the project", save_project, "save", (PROJECTS,), new))
 
 
@@ -391,7 +400,7 @@ def save_project(viewer: Viewer, to: Path = Path(), of: SceneState | None = None
     state = of or viewer.state
     if not viewer.has_scene("save the project") or not (state.path and state.view):
         return None
-    path = to if to.name.endswith(PROJECTS) else state.project or _new_file(state, to, PROJECTS)
+    path = to if to.name.endswith(PROJECTS) else state.project or _new_file(state.path, to, PROJECTS)
     known = state.project_digest if path == state.project else ""
     project = Project(
         scene=os.path.abspath(state.path),

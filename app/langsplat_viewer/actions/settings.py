@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
-from langsplat_core.query.engine import no_field
 from langsplat_viewer.projects import BUNDLED
 from langsplat_viewer.rendering.request import AT_RANGE, Clip, SplitMode
 from langsplat_viewer.session import (
@@ -100,11 +99,7 @@ def move_line(viewer: Viewer, at: float) -> None:
 
 def _can_show(viewer: Viewer, needs_field: bool) -> bool:
     """Return whether the scene has a language field or needs none; report a missing one."""
-    scene = viewer.state.scene
-    if needs_field and scene is not None and scene.language is None:
-        viewer.say_error(no_field(scene))
-        return False
-    return True
+    return not needs_field or viewer.state.scene is None or viewer.searchable() is not None
 
 
 # Overlays, the ruler, and notes that are pinned to places.
@@ -169,9 +164,7 @@ def take_off(viewer: Viewer, name: Literal["notes", "bookmarks"], gone: Note | B
 
 def prefer(viewer: Viewer, **values: Any) -> None:
     """Change fields of the preferences."""
-    preferences = replace(viewer.state.preferences, **values)
-    if preferences != viewer.state.preferences:
-        viewer.state.preferences = preferences
+    viewer.state.preferences = replace(viewer.state.preferences, **values)
 
 
 def keep_preferences(viewer: Viewer) -> None:

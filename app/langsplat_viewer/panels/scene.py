@@ -190,18 +190,18 @@ def draw_training(viewer: Viewer) -> None:
         opening.start_training(viewer)
     if ui.next_button("Photographs ...", "Choose their folder"):
         opening.ask_for_dataset(viewer)
-    ui.small_wrapped("An interrupted training continues where it stopped.")
+    ui.small_wrapped("The same entries continue an interrupted training.")
 
 
 def _running(viewer: Viewer, process: Training) -> None:
     progress = process.progress
     imgui.text_unformatted(process.out.name)
-    if imgui.button("Stop"):  # above what grows
+    if ui.button("Stop", enabled=not process.interrupted):  # above what grows
         process.interrupt()
     if ui.next_button("Look at it so far"):
         opening.look_at_training(viewer)
-    if not progress.stages:
-        ui.coloured("starting")
+    if process.interrupted or not progress.stages:
+        ui.coloured("stopping soon" if process.interrupted else "starting")
     stages = dict(progress.stages)
     if done := [label for label, fraction in stages.items() if fraction >= 1]:
         ui.small_wrapped(f"done: {', '.join(done)}")
@@ -215,7 +215,7 @@ def _running(viewer: Viewer, process: Training) -> None:
             imgui.plot_lines(f"##{name}", np.array(curve, np.float32), graph_size=size)
             ui.coloured(text.format(curve[-1]))
     imgui.separator()
-    for line in progress.said[-3:]:
+    for line in progress.said:
         ui.small_wrapped(line)
 
 

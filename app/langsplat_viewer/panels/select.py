@@ -22,10 +22,7 @@ from langsplat_viewer.session import Point, point_of
 from langsplat_viewer.state import Gizmo
 from langsplat_viewer.viewer import Viewer
 
-OF_SELECTED = (
-    *("None", "Grow", "Shrink", "More like it", "Hide", "Isolate", "Delete"),
-    "Export selection ...",
-)
+OF_SELECTED = ("None", "Grow", "Shrink", "More like it", "Hide", "Isolate", "Delete", "Export selection ...")
 
 
 def draw(viewer: Viewer) -> None:

@@ -183,7 +183,7 @@ def draw_record(viewer: Viewer) -> None:
     settings.put(record, fps=ui.choice(rates, record.fps))
     imgui.set_next_item_width(-1)
     _, typed = imgui.input_text_with_hint("##film", "film.mp4 or a folder", record.film_file)
-    ui.tip("Where the film goes; empty: a new name beside the scene")
+    ui.tip("Where the film goes; empty: a new name where the program was started")
     settings.put(record, film_file=typed)
     ui.verbs(viewer, "Save film", "Picture of this size")
 
