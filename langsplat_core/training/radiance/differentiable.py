@@ -6,7 +6,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,17 +31,6 @@ def parameters_of(gaussians: Gaussians, device: torch.device) -> dict[str, Tenso
     """Return the raw `PARAMETERS` of Gaussians as tensors; sh is split in degree 0 and the rest."""
     arrays = [*(getattr(gaussians, name) for name in gsplat.RAW), gaussians.sh[:, :1], gaussians.sh[:, 1:]]
     return {name: torch.tensor(array, device=device) for name, array in zip(PARAMETERS, arrays, strict=True)}
-
-
-class DifferentiableRenderer(Protocol):
-    """A backend of radiance training."""
-
-    device: torch.device  # where parameters and images live
-
-    def render(
-        self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int, focal: float | None = None
-    ) -> gsplat.DifferentiableImage:
-        """Draw the raw `parameters` with harmonics up to `sh_degree`; focal: as of `RasterSettings`."""
 
 
 def _coefficients(parameters: dict[str, Tensor], sh_degree: int) -> Tensor:
@@ -84,7 +73,7 @@ class _CpuImage(torch.autograd.Function):
 
 
 class CpuRenderer:
-    """`DifferentiableRenderer` on the compiled CPU kernels; deterministic."""
+    """The backend on the compiled CPU kernels; deterministic."""
 
     def __init__(self, settings: RasterSettings = INRIA) -> None:
         self.device = torch.device("cpu")
@@ -106,7 +95,7 @@ class CpuRenderer:
 
 
 class CudaRenderer:
-    """`DifferentiableRenderer` on gsplat; `raster.gsplat` says how it differs from the CPU kernels."""
+    """The backend on gsplat; `raster.gsplat` says how it differs from the CPU kernels."""
 
     def __init__(self, settings: RasterSettings = INRIA) -> None:
         self.device, self._settings = torch.device(gsplat.DEVICE), settings
@@ -117,6 +106,11 @@ class CudaRenderer:
     ) -> gsplat.DifferentiableImage:
         values = _coefficients(parameters, sh_degree)
         return gsplat.draw(parameters, values, camera, replace(self._settings, focal=focal), sh_degree)
+
+
+# A backend of radiance training. Parameters and images are on its `device`; `render` draws raw `PARAMETERS`
+# with harmonics up to a degree; focal: as of `RasterSettings`.
+DifferentiableRenderer = CpuRenderer | CudaRenderer
 
 
 def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor], camera: Camera) -> Array:
