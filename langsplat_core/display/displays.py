@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from importlib.resources import files
 from types import MappingProxyType
-from typing import Literal, Protocol, TypeVar, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap, Display, HeatOf
 from langsplat_core.io.hostile import opened
 from langsplat_core.scene import NO_NODE, LanguageField
+
+if TYPE_CHECKING:  # its module imports numba, which a program that only lists displays need not wait for
+    from langsplat_core.query.answers import QueryResult
 
 NODES = 256  # of a colour map; looked up with linear interpolation between them
 
@@ -76,27 +79,7 @@ NO_HEAT = (0.5, 1.0)  # range of a slot without heat, whose values are 0
 HEAT_BASE = 0.3  # value of the coldest Gaussian of an answer, see `heats`
 
 
-class Answer(Protocol):
-    """The part of `query.answers.QueryResult` that displays show."""
-
-    @property
-    def verdict(self) -> Literal["found", "weak match", "not here"]: ...
-    @property
-    def level(self) -> int: ...
-    @property
-    def relevancy(self) -> Array: ...  # (3, N)
-    @property
-    def smooth(self) -> Array: ...  # (N,) that of the level, smoothed along the surface of the answer
-    @property
-    def even(self) -> Array: ...  # (N,) that of the level, the same all over a node
-    @property
-    def members(self) -> Array: ...  # (N,) bool
-    @property
-    def heat_range(self) -> tuple[float, float]: ...
-
-
-Answers = Sequence[Answer | None]  # by colour slot; None: the slot has no answer
-A = TypeVar("A", bound=Answer)
+Answers = Sequence["QueryResult | None"]  # by colour slot; None: the slot has no answer
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +93,7 @@ class Subject:
     heat: HeatOf = "smooth"
 
 
-def painted(answers: Sequence[A | None]) -> dict[int, A]:
+def painted(answers: Answers) -> "dict[int, QueryResult]":
     """Return the answers that are drawn, those other than "not here", by their slots."""
     given = {slot: answer for slot, answer in enumerate(answers) if answer is not None}
     return {slot: answer for slot, answer in given.items() if STRENGTH[answer.verdict]}
@@ -124,7 +107,7 @@ def heats(subject: Subject) -> Array | None:
     level, it is minus the relevancy of every Gaussian: negative values are not outlined.
     """
 
-    def heat(one: Answer) -> Array:
+    def heat(one: "QueryResult") -> Array:
         values = one.relevancy[one.level if subject.level is None else subject.level]
         if subject.heat == "everywhere" or subject.level is not None:
             return -values
@@ -144,7 +127,7 @@ def members(subject: Subject) -> Array | None:
     return _by_slot(subject, lambda one: one.members)
 
 
-def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | None:
+def _by_slot(subject: Subject, values_of: Callable[["QueryResult"], Array]) -> Array | None:
     drawn = painted(subject.answers)
     if not drawn:
         return None
@@ -154,7 +137,9 @@ def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | 
     return values
 
 
-def _heat_ends(answer: Answer, scale: tuple[float, float] | None, everywhere: bool) -> tuple[float, float]:
+def _heat_ends(
+    answer: "QueryResult", scale: tuple[float, float] | None, everywhere: bool
+) -> tuple[float, float]:
     """Return the values of `heats` at the ends of `scale`, in relevancies, or of the answer's own range."""
     low, high = answer.heat_range
     coldest, hottest = scale or answer.heat_range
