@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from langsplat_core.cli.arguments import EncoderOption, Needs, OutFile
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks.labels import Benchmark, read_3d_ovs, read_gr_lerf, read_lerf_ovs
 from langsplat_core.extensions.benchmarks.profiles import (
     GR_PROFILES,
     LERF_PROFILES,
@@ -17,10 +18,9 @@ from langsplat_core.extensions.benchmarks.profiles import (
     OvsProtocol,
     Profile,
 )
+from langsplat_core.extensions.benchmarks.report import Evaluated, run_benchmark, save_json, table
 from langsplat_core.progress import TerminalProgress
-
-if TYPE_CHECKING:
-    from langsplat_core.extensions.benchmarks.labels import Benchmark
+from langsplat_core.semantics.encoders import load_text_encoder
 
 
 @dataclass(frozen=True)
@@ -39,19 +39,13 @@ class _Eval:
         """True if a scene is scored, False for maps of another system."""
         return self.maps is None
 
-    def evaluate(self, read: "Callable[[Path], Benchmark]", profile: Profile) -> None:
+    def evaluate(self, read: Callable[[Path], Benchmark], profile: Profile) -> None:
         """Score the scene or maps, print the tables and write the JSON file."""
-        from langsplat_core.extensions.benchmarks.report import Evaluated, run_benchmark, save_json, table
-        from langsplat_core.semantics.encoders import load_text_encoder
-
-        if len(self.paths) != (1 if self.maps else 2):
-            raise InputError(
-                "give the benchmark's folder alone with --maps"
-                if self.maps
-                else "give a scene and the benchmark's folder, or the folder alone and --maps FOLDER"
-            )
-        scene = None if self.maps else self.paths[0]
-        subject = Evaluated(scene, self.maps, self.encoder)
+        if self.maps is not None and len(self.paths) != 1:
+            raise InputError("give the benchmark's folder alone with --maps")
+        if self.maps is None and len(self.paths) != 2:
+            raise InputError("give a scene and the benchmark's folder, or the folder alone and --maps FOLDER")
+        subject = Evaluated(self.paths[0] if self.is_ours else None, self.maps, self.encoder)
         benchmark = read(self.paths[-1])
         with TerminalProgress() as progress:
             report = run_benchmark(benchmark, profile, subject, load_text_encoder, progress)
@@ -72,8 +66,6 @@ class EvalLerfOvs(_Eval):
     """Constants of the evaluation: filters, cut and choice of level; docs/evaluating.md lists them."""
 
     def run(self) -> None:
-        from langsplat_core.extensions.benchmarks.labels import read_lerf_ovs
-
         self.evaluate(read_lerf_ovs, LERF_PROFILES[self.protocol])
 
 
@@ -88,8 +80,6 @@ class EvalGrLerf(_Eval):
     """Constants of the evaluation, as for lerf-ovs; those of LangSplat never give an empty answer."""
 
     def run(self) -> None:
-        from langsplat_core.extensions.benchmarks.labels import read_gr_lerf
-
         self.evaluate(read_gr_lerf, GR_PROFILES[self.protocol])
 
 
@@ -104,6 +94,4 @@ class EvalOvs3d(_Eval):
     """Constants of the evaluation: cut and choice of level; docs/evaluating.md lists them."""
 
     def run(self) -> None:
-        from langsplat_core.extensions.benchmarks.labels import read_3d_ovs
-
         self.evaluate(read_3d_ovs, OVS_PROFILES[self.protocol])

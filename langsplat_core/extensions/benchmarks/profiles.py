@@ -246,10 +246,6 @@ class SceneSource:
     trained: frozenset[str] | None  # names of the training views; None: unknown in the dataset's names
     profile: Profile
 
-    def trained_on(self, frame: str) -> bool | None:
-        """Return True for a training view, False for another, None if that is unknown."""
-        return None if self.trained is None else frame in self.trained
-
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
         """Return the answer to each phrase in the view `frame`, rendered at `size`, or why there is none."""
         if frame not in self.cameras:
@@ -298,9 +294,7 @@ class MapSource:
 
     folder: Path  # <view>/<phrase>...
     rule: MapRule | SilhouetteRule
-
-    def trained_on(self, frame: str) -> bool | None:
-        return None
+    trained: frozenset[str] | None = None
 
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
         """Return the answer to each phrase by its map in the view `frame`, or why there is none."""

@@ -3,7 +3,7 @@
 import json
 import logging
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,13 @@ from langsplat_core.extensions.benchmarks.profiles import (
     MapRule,
     MapSource,
     OwnRule,
+    Prediction,
     Profile,
     SceneSource,
     SilhouetteRule,
     Source,
 )
-from langsplat_core.io.files import atomic_path, write_json
+from langsplat_core.io.files import write_json, write_whole
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import AnswerRule
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, searchable
@@ -39,10 +40,8 @@ from langsplat_core.scene import LEVELS, Camera
 
 def write_report(out: Path, name: str, text: str, figures: Any) -> None:
     """Write `name`.md and .json into the folder `out`, atomically."""
-    with atomic_path(out / f"{name}.md") as path:
-        path.write_text(text, encoding="utf-8")
-    with atomic_path(out / f"{name}.json") as path:
-        path.write_text(json.dumps(figures, indent=1, default=str), encoding="utf-8")
+    write_whole(out / f"{name}.md", text)
+    write_whole(out / f"{name}.json", json.dumps(figures, indent=1, default=str))
 
 
 def markdown(head: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
@@ -69,12 +68,12 @@ class QueryScore:
     phrase: str
     iou: float
     hit: bool | None  # True if the position is in a box of the label; None: not scored
-    level: str = ""  # of the map that was cut
-    unanswered: str = ""  # why there is no answer
-    trained_on: bool | None = None  # True for a training view; None: unknown
-    grid: Size = (0, 0)  # width and height that were scored
-    targets: int | None = None  # number of the phrase's instances in the frame, if that may be 0
-    is_empty: bool = True  # True for an empty mask
+    level: str  # of the map that was cut; "": none was
+    unanswered: str  # why there is no answer; "" with one
+    trained_on: bool | None  # True for a training view; None: unknown
+    grid: Size  # width and height that were scored
+    targets: int | None  # number of the phrase's instances in the frame, if that may be 0
+    is_empty: bool  # True for an empty mask
 
 
 def score_scene(
@@ -88,35 +87,32 @@ def score_scene(
     scores: list[QueryScore] = []
     left_out = list(labelled.left_out)
     for done, frame in enumerate(labelled.frames):
-        answers = source.answers(
-            frame.name, scored_size(frame.size, profile.max_rows), [label.phrase for label in frame.labels]
-        )
+        phrases = [label.phrase for label in frame.labels]
+        answers = source.answers(frame.name, scored_size(frame.size, profile.max_rows), phrases)
         for label in frame.labels:
-            answer, size = answers[label.phrase], frame.size
-            if not isinstance(answer, str):
-                size = answer.mask.shape[1], answer.mask.shape[0]
-                check_same_image(frame.name, size, frame.size)
+            answer, unanswered = answers[label.phrase], ""
+            if isinstance(answer, str):  # counts as an empty answer that is wrong
+                answer, unanswered = Prediction(np.zeros(frame.size[::-1], bool)), answer
+            size = answer.mask.shape[1], answer.mask.shape[0]
+            check_same_image(frame.name, size, frame.size)
             truth = label.truth(size)
             if label.targets != 0 and not truth.any():
                 left_out.append(f"{frame.name}: {label.phrase} (empty mask)")
                 continue
             placed = label.boxes is not None and not isinstance(profile.rule, SilhouetteRule)
             score = QueryScore(
-                *(labelled.name, frame.name, label.phrase, 0.0, False if placed else None),
-                trained_on=source.trained_on(frame.name),
+                scene=labelled.name,
+                frame=frame.name,
+                phrase=label.phrase,
+                iou=0.0 if unanswered else intersection_over_union(answer.mask, truth),
+                hit=inside_any_box(answer.peaks, label.boxes, frame.size, size) if placed else None,
+                level="" if answer.level is None else LEVELS[answer.level],
+                unanswered=unanswered,
+                trained_on=None if source.trained is None else frame.name in source.trained,
                 grid=size,
                 targets=label.targets,
+                is_empty=not answer.mask.any(),
             )
-            if isinstance(answer, str):
-                score = replace(score, unanswered=answer)
-            else:
-                score = replace(
-                    score,
-                    iou=intersection_over_union(answer.mask, truth),
-                    hit=inside_any_box(answer.peaks, label.boxes, frame.size, size) if placed else None,
-                    level="" if answer.level is None else LEVELS[answer.level],
-                    is_empty=not answer.mask.any(),
-                )
             scores.append(score)
         progress("asking phrases", (done + 1) / len(labelled.frames), labelled.name)
     return scores, left_out

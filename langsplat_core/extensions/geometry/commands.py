@@ -7,12 +7,14 @@ from typing import Annotated
 import numpy as np
 import tyro
 from PIL import Image
+from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, Needs, OutFile, OutFolder
 from langsplat_core.cli.query import Unit, found_answer
 from langsplat_core.config import Count, LevelChoice, Positive
 from langsplat_core.errors import EncoderError, InputError, malformed, optional_imports, printable_line
+from langsplat_core.extensions.geometry.mesh import check_suffix, close_holes, fuse, write_mesh
 from langsplat_core.extensions.geometry.occupancy import (
     FloorMap,
     Occupancy,
@@ -23,8 +25,9 @@ from langsplat_core.extensions.geometry.occupancy import (
     map_axes,
     reachable,
 )
+from langsplat_core.extensions.geometry.planes import find_room
 from langsplat_core.extensions.geometry.registration import NEAR, TRUSTED, Registration, merge, once, register
-from langsplat_core.io.files import atomic_path, write_json
+from langsplat_core.io.files import atomic_path, write_json, write_whole
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.progress import Progress, TerminalProgress
@@ -73,8 +76,6 @@ class WriteMesh:
 
     @optional_imports()
     def run(self) -> None:
-        from langsplat_core.extensions.geometry.mesh import check_suffix, close_holes, fuse, write_mesh
-
         check_suffix(self.out)
         check_keeps(self.out, self.scene)
         scene = searchable(self.scene) if self.phrase else load_scene(self.scene)
@@ -239,8 +240,6 @@ class Map:
 
     @optional_imports()
     def run(self) -> None:
-        from langsplat_core.extensions.geometry.planes import find_room
-
         scene = searchable(self.scene) if self.goal else load_scene(self.scene)
         metres = self.metres_per_unit or scene.metres_per_unit
         if metres is None:
@@ -299,8 +298,7 @@ def write_grid(folder: Path, plan: FloorMap) -> None:
     lines = ["image: map.pgm", "mode: trinary", f"resolution: {plan.resolution}"]
     lines += [f"origin: [{x:.9g}, {y:.9g}, 0.0]", "negate: 0"]
     lines += [f"{name}: {value}" for name, value in THRESHOLDS.items()]
-    with atomic_path(folder / "map.yaml") as path:
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_whole(folder / "map.yaml", "\n".join(lines) + "\n")
 
 
 def write_collider(path: Path, occupancy: Occupancy) -> None:
@@ -337,8 +335,6 @@ def write_voxels(
 
 def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array) -> Array:
     """Return the (V,) whole of the Gaussian nearest to each voxel, NO_NODE far from any."""
-    from scipy.spatial import cKDTree
-
     whole = engine.tree.at(LEVELS.index("whole"))
     rows = np.flatnonzero((surface_weights(scene.gaussians) > 0) & (whole != NO_NODE))
     if len(rows) == 0:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, linear_light, rotation_matrices, unit
 from langsplat_core.errors import InputError
@@ -60,7 +61,7 @@ class Mesh:
 
     def hollows(self) -> int:
         """Return the number of pieces of negative volume, which are cavities of a watertight mesh."""
-        a, b, c = (self.vertices[self.triangles[:, corner]] for corner in range(3))
+        a, b, c = self.vertices[self.triangles.T]
         volumes = np.bincount(self.pieces(), (np.cross(a, b) * c).sum(1))
         return int(np.count_nonzero(volumes < 0))
 
@@ -71,7 +72,7 @@ class Mesh:
 
     def areas(self) -> Array:
         """Return (T,) areas of the triangles, square world units."""
-        a, b, c = (self.vertices[self.triangles[:, corner]] for corner in range(3))
+        a, b, c = self.vertices[self.triangles.T]
         return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
 
@@ -233,7 +234,7 @@ def watertight(points: Array, triangles: Array, near: float) -> tuple[Array, Arr
     triangles = np.concatenate([triangles, np.column_stack([rims[:, ::-1], len(points) + loops])])
     middle = [points[rims[loops == loop, 0]].mean(0) for loop in range(loops.max(initial=-1) + 1)]
     points = np.concatenate([points, np.reshape(middle, (-1, points.shape[1]))])
-    a, b, c = (points[triangles[:, corner], :3] for corner in range(3))
+    a, b, c = points[triangles.T, :3]
     areas, sides = np.linalg.norm(np.cross(b - a, c - a), axis=1), np.linalg.norm([b - a, c - a], axis=2)
     flat = triangles[areas < 1e-2 * near * sides.sum(0), 2]
     points[flat, :3] += near * np.random.default_rng(0).normal(size=(len(flat), 3))
@@ -256,12 +257,10 @@ def watertight(points: Array, triangles: Array, near: float) -> tuple[Array, Arr
 def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
     """Return a watertight surface (Poisson), and its area more than two voxels from any vertex, units^2."""
     import open3d
-    from scipy.spatial import cKDTree
 
-    a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
+    a, b, c = mesh.vertices[mesh.triangles.T]
     normals = np.zeros_like(mesh.vertices)
-    for corner in range(3):
-        np.add.at(normals, mesh.triangles[:, corner], np.cross(b - a, c - a))
+    np.add.at(normals, mesh.triangles.T, np.cross(b - a, c - a))
     points = cloud(mesh.vertices, unit(normals, 1e-30))
     points.colors = open3d.utility.Vector3dVector(mesh.colour)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
