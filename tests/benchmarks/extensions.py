@@ -265,7 +265,7 @@ def _clean_room(room: Room) -> Iterator[Cleaned]:
     for scene, views, basis in runs:
         keep, report = clean(scene, views, config, room.progress)
         of = kinds[: len(keep)]
-        suspected = find_floaters(scene, views.ranking, config.region).suspicion[of == 0] > 0
+        suspected = find_floaters(scene, views.ranking, config.region)[0][of == 0] > 0
         found = tuple(float((~keep[of == kind]).mean()) if (of == kind).any() else 0.0 for kind in (1, 2, 3))
         shares = float((~keep[of == 0]).mean()), float(suspected.mean())
         room_psnr, before, after = (_judged(one, judging) for one in (own, scene, scene.take(keep)))

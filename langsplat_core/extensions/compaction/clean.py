@@ -19,7 +19,7 @@ many as the loss, measured on other views, allows.
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -29,7 +29,7 @@ from scipy.sparse.csgraph import connected_components
 from langsplat_core.arrays import Array, rotation_matrices
 from langsplat_core.cli.arguments import AnyScene, JsonOption, WrittenScene
 from langsplat_core.cli.run import print_json
-from langsplat_core.config import Count, check_settings
+from langsplat_core.config import Count
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.compaction.compact import (
     BudgetConfig,
@@ -51,6 +51,7 @@ from langsplat_core.scene.surface import Surface, build_surface
 # Thresholds from the least suspicious to the most; `python -m tests.benchmarks clean` measures them.
 TOUCH = (1.1, 1.25, 1.5)  # largest gap of a region's Gaussians, in extents
 AHEAD = (0.4, 0.55, 0.7)  # least share of views in which a Gaussian is in free space
+Losses = Callable[[], Array]  # (V,) dB that the measuring views lose without the rows removed so far
 USUAL = 0.45  # median gap to the nearest in trained scenes; TOUCH grows in proportion in sparser ones
 
 
@@ -61,18 +62,14 @@ class CleanConfig(BudgetConfig):
     region: Count = 100  # Gaussians: a larger connected region is no floater
 
 
-@dataclass(frozen=True, eq=False)
-class Floaters:
-    """Suspected floaters among N Gaussians."""
-
-    suspicion: Array  # (N,) int8 from 0, none, to 3
-    region: Array  # (N,) bool: in a small region; the other suspects are in free space
-
-
 def find_floaters(
     scene: Scene, cameras: tuple[Camera, ...], largest: int, progress: Progress = silent
-) -> Floaters:
-    """Return suspected floaters, by `cameras`; regions of at most `largest` Gaussians, except the largest."""
+) -> tuple[Array, Array]:
+    """Return the (N,) int8 suspicion, 0 to 3, that a Gaussian is a floater, by `cameras`, and its kind.
+
+    The kind is (N,) bool: True in a region of at most `largest` Gaussians that is not the largest one, False
+    in free space.
+    """
     gaussians = scene.gaussians
     suspicion = np.zeros(len(gaussians), np.int8)
     share = _free_space(scene, cameras, progress)
@@ -88,7 +85,7 @@ def find_floaters(
         near = gaps <= touch * max(1.0, nearest / USUAL)
         small = rows[_small_regions(surface, near, largest)]
         suspicion[small], region[small] = level, True
-    return Floaters(suspicion, region)
+    return suspicion, region
 
 
 def _gaps(gaussians: Gaussians, surface: Surface) -> Array:
@@ -102,8 +99,7 @@ def _gaps(gaussians: Gaussians, surface: Surface) -> Array:
     scales = np.exp(gaussians.log_scales[surface.rows].astype(np.float64))
     axes = rotation_matrices(quats) * scales[:, None, :]
     ends = (np.linalg.norm(np.einsum("nij,ni->nj", axes[end], along), axis=1) for end in (first, second))
-    gaps: Array = distance / np.maximum(sum(ends), 1e-300)
-    return gaps.reshape(count, width)
+    return np.reshape(distance / np.maximum(sum(ends), 1e-300), (count, width))
 
 
 def _small_regions(surface: Surface, near: Array, largest: int) -> Array:
@@ -136,8 +132,7 @@ def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -
         ahead[rows] += (there > 0) & (z < 0.95 * there)  # nearer to the surface, it is on it
         on[rows] += (there > 0) & (np.abs(z - there) <= 0.05 * there)
         progress("finding floaters", (index + 1) / len(cameras))
-    share: Array = np.where(ahead > 1, ahead / np.maximum(ahead + on, 1), 0.0)
-    return share
+    return np.where(ahead > 1, ahead / np.maximum(ahead + on, 1), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,60 +164,57 @@ def clean(
     if not valid.any():
         raise InputError("the scene holds nothing that can be drawn: there is nothing to clean")
     measured = views.measured(scene)
-    found = find_floaters(scene, views.ranking, config.region, progress)
+    suspicion, region = find_floaters(scene, views.ranking, config.region, progress)
     cost = contributions(scene, views.ranking, progress)
-    suspects = np.flatnonzero(found.suspicion)
+    suspects = np.flatnonzero(suspicion)
     keep = np.ones(len(valid), bool)
 
     def losses() -> Array:
         return psnr_losses(scene.take(keep), measured, config.assumed_psnr)
 
-    trial = _Trial(keep, losses, config.max_psnr_loss, progress)
     if views.photographs[0] is None:
-        _by_change(trial, suspects[np.argsort(cost[suspects], kind="stable")])
+        rising = suspects[np.argsort(cost[suspects], kind="stable")]
+        _by_change(keep, rising, losses, config.max_psnr_loss, progress)
     else:
-        order = suspects[np.lexsort((cost[suspects], -found.suspicion[suspects]))]
-        _by_photographs(trial, order, scene.gaussians.means)
+        order = suspects[np.lexsort((cost[suspects], -suspicion[suspects]))]
+        _by_photographs(keep, order, scene.gaussians.means, losses, config.max_psnr_loss, progress)
     lost = losses()
     keep &= valid
     gone = valid & ~keep
     report = CleanReport.of(
-        *(lost, config, views),
+        lost,
+        config,
+        views,
         gaussians=len(keep),
         invalid=int((~valid).sum()),
-        regions=int((gone & found.region).sum()),
-        free_space=int((gone & ~found.region).sum()),
-        kept=int((found.suspicion[keep] > 0).sum()),
+        regions=int((gone & region).sum()),
+        free_space=int((gone & ~region).sum()),
+        kept=int((suspicion[keep] > 0).sum()),
         psnr_before=mean_psnr(scene, measured),
         psnr_after=mean_psnr(scene.take(keep), measured),
     )
     return keep, report
 
 
-class _Trial(NamedTuple):
-    keep: Array  # (N,) bool, changed in place
-    losses: Callable[[], Array]  # (V,) dB that the measuring views lose without the removed rows
-    budget: float
-    progress: Progress
-
-
-def _by_change(trial: _Trial, rising: Array) -> None:
-    """Remove as many of `rising`, ordered by contribution, as the budget allows, by bisection."""
+def _by_change(keep: Array, rising: Array, losses_now: Losses, budget: float, progress: Progress) -> None:
+    """Remove as many of `rising`, ordered by contribution, from `keep` as the budget allows, by bisection."""
     low, high = 0, len(rising) + 1
     middle = len(rising)  # first all of them
     while middle > low:
-        trial.keep[rising] = np.arange(len(rising)) >= middle
-        if trial.losses().mean() <= trial.budget:
+        keep[rising] = np.arange(len(rising)) >= middle
+        if losses_now().mean() <= budget:
             low = middle
         else:
             high = middle
         middle = (low + high) // 2
-        trial.progress("removing within the budget", 1 - (high - low) / (len(rising) + 2))
-    trial.keep[rising] = np.arange(len(rising)) >= low
+        progress("removing within the budget", 1 - (high - low) / (len(rising) + 2))
+    keep[rising] = np.arange(len(rising)) >= low
 
 
-def _by_photographs(trial: _Trial, order: Array, means: Array) -> None:
-    """Remove suspects that photographs do not need, and as many more as the budget allows.
+def _by_photographs(
+    keep: Array, order: Array, means: Array, losses_now: Losses, budget: float, progress: Progress
+) -> None:
+    """Remove suspects from `keep` that photographs do not need, and as many more as the budget allows.
 
     Groups of `order` are removed one after the other. The cost of a group, its addition to the mean loss plus
     the standard error of that, is taken from the budget. A group that costs more than is left is halved, and
@@ -231,7 +223,6 @@ def _by_photographs(trial: _Trial, order: Array, means: Array) -> None:
     measured again, each alone against all others removed, and the most costly are put back until the rest is
     within the budget.
     """
-    keep, budget = trial.keep, trial.budget
     losses, spent, done = np.zeros(1), 0.0, 0  # nothing is lost in any view
     resolution = 96  # groups are halved down to this fraction of the floaters
     least = max(len(order) // resolution, 1)
@@ -239,7 +230,7 @@ def _by_photographs(trial: _Trial, order: Array, means: Array) -> None:
     while waiting:
         group = waiting.pop()
         keep[group] = False
-        tried = trial.losses()
+        tried = losses_now()
         cost = _cost(tried - losses)
         if spent + cost <= budget:
             losses, spent = tried, spent + cost
@@ -249,16 +240,16 @@ def _by_photographs(trial: _Trial, order: Array, means: Array) -> None:
                 waiting += [group[len(group) // 2 :], group[: len(group) // 2]]
                 continue
         done += len(group)
-        trial.progress("removing within the budget", done / len(order))
+        progress("removing within the budget", done / len(order))
     rows = np.flatnonzero(~keep)
     rows = rows[np.argsort(along_curve(means[rows]))]
     gone = [group for group in np.array_split(rows, resolution) if len(group)]
     costs = np.zeros(len(gone))
     for index, group in enumerate(gone):
         keep[group] = True
-        costs[index] = _cost(losses - trial.losses())
+        costs[index] = _cost(losses - losses_now())
         keep[group] = False
-        trial.progress("measuring again", (index + 1) / len(gone))
+        progress("measuring again", (index + 1) / len(gone))
     rising = np.argsort(costs, kind="stable")
     for index in rising[np.cumsum(costs[rising]) > budget]:
         keep[gone[index]] = True
@@ -267,18 +258,6 @@ def _by_photographs(trial: _Trial, order: Array, means: Array) -> None:
 def _cost(added: Array) -> float:
     """Return the cost of (V,) dB added to the losses of the views: their mean plus its standard error."""
     return max(float(added.mean() + added.std() / np.sqrt(len(added))), 0.0)
-
-
-def clean_scene(
-    source: Path, out: Path, config: CleanConfig, photos: Path | None = None, progress: Progress = silent
-) -> CleanReport:
-    """Write the scene `source` without its floaters to `out`, with its companions; see `clean`."""
-    scene = scene_for(out, source)
-    check_settings(config)
-    views = choose_views(scene, photos, config, progress)
-    keep, report = clean(scene, views, config, progress)
-    save_scene(out, replace(scene.take(keep), path=out), tell=False)
-    return report
 
 
 # `langsplat clean`.
@@ -300,8 +279,11 @@ class Clean:
     config: Annotated[CleanConfig, tyro.conf.arg(name="")] = field(default_factory=CleanConfig)
 
     def run(self) -> None:
+        scene = scene_for(self.out, self.scene)
         with TerminalProgress() as progress:
-            report = clean_scene(self.scene, self.out, self.config, self.photos, progress)
+            views = choose_views(scene, self.photos, self.config, progress)
+            keep, report = clean(scene, views, self.config, progress)
+            save_scene(self.out, replace(scene.take(keep), path=self.out), tell=False)
         if self.json:
             print_json({"out": str(self.out), "removed": report.removed, **asdict(report)})
             return

@@ -281,7 +281,6 @@ def compact_scene(
     InputError, and leaves `out` as it was, if the budget cannot be kept or nothing can be dropped.
     """
     scene = scene_for(out, source)
-    check_settings(config)
     if photos is not None and config.assumed_psnr != type(config)().assumed_psnr:
         raise InputError("--assumed-psnr: the loss is measured on photographs; leave it out, or --photos")
     views = choose_views(scene, photos, config, progress)
