@@ -146,11 +146,6 @@ class Clusters:
     index: Array  # (N,) int64 rows of `vectors`; -1 for Gaussians in no cluster
     vectors: Array  # (K, D) float32, not normalised; zero for a cluster without a vector
 
-    @property
-    def features(self) -> Features:
-        """The vectors of the Gaussians."""
-        return rearranged(whole_vectors(self.vectors, self.path), self.index)
-
 
 @dataclass(frozen=True, eq=False)
 class Autoencoder:
@@ -238,11 +233,12 @@ def _from_torch(content: Any, path: Path) -> Part:
     mapping = plain_mapping(content)
     named = {"": content} if mapping is None else mapping
     if is_autoencoder(named):
-        report_losses(path, [unread("entries", (quoted(name, 40) for name in named if not layer_name(name)))])
+        others = [name for name in named if not layer_name(name)]
+        said = (quoted(name if isinstance(name, str) else type(name), 40) for name in others)
+        report_losses(path, [unread("entries", said)])
         return Autoencoder(path, autoencoder_from(named, path))
-    arrays = {str(name): plain_array(value, path) for name, value in named.items()}
-    found = {name: array for name, array in arrays.items() if array is not None}
-    if any(array.ndim == 4 for array in found.values()):
+    arrays = [plain_array(value, path) for value in named.values()]
+    if any(array is not None and array.ndim == 4 for array in arrays):
         raise FormatError(
             f"{path}: a convolutional decoder, as of Feature-3DGS with its speed-up; it decodes pictures, "
             "not Gaussians, so that such features cannot be imported; train without the speed-up"

@@ -34,6 +34,7 @@ from langsplat_core.extensions.checkpoints.features import (
     partners,
     read_part,
     rearranged,
+    whole_vectors,
 )
 from langsplat_core.io.cameras import SUFFIX as CAMERAS
 from langsplat_core.io.cameras import read_cameras
@@ -166,13 +167,9 @@ def _of_clusters(carrier: Carrier | None, clusters: Clusters) -> ForeignScene:
         )
     if not (clusters.index >= 0).any():
         raise FormatError(f"{clusters.path}: leaf_ind names none of the {len(clusters.vectors)} clusters")
-    return ForeignScene(
-        OPEN_GAUSSIAN,
-        _scene(carrier),
-        (None, None, clusters.features),
-        clusters=clusters,
-        notes=("OpenGaussian knows no levels: whole is filled, subpart and part are empty",),
-    )
+    whole = rearranged(whole_vectors(clusters.vectors, clusters.path), clusters.index)
+    note = "OpenGaussian knows no levels: whole is filled, subpart and part are empty"
+    return ForeignScene(OPEN_GAUSSIAN, _scene(carrier), (None, None, whole), clusters=clusters, notes=(note,))
 
 
 def _of_levels(
@@ -292,8 +289,7 @@ def _samples(foreign: ForeignScene, seed: int) -> tuple[Array, Array]:
 
 
 def _has_feature(vectors: Array) -> Array:
-    known: Array = np.linalg.norm(vectors, axis=1) > SHORTEST
-    return known
+    return np.asarray(np.linalg.norm(vectors, axis=1) > SHORTEST)
 
 
 def _unit_rows(foreign: ForeignScene, level: int, rows: Array) -> tuple[Array, Array]:

@@ -13,15 +13,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, optional_imports, quoted
 from langsplat_core.io.hostile import open_for_reading, opened_archive
 
-DEEPEST = 100  # nested tuples; Python's hash recurses on the machine's stack, which ends at 100 000
+# Tuples in a pickle. They may be nested, and Python's hash of a key recurses on the machine's stack, which ends
+# at 100 000. A tensor takes five.
+MOST_TUPLES = 10_000
 _ARCHIVE = b"PK\x03\x04"  # by which torch recognises an archive
 _PICKLES = 5  # at the start of a file that is no archive: magic number, version, system, content, storages
 _STORAGES = ("Bool", "Byte", "Char", "Short", "Int", "Long", "Half", "BFloat16", "Float", "Double")
-_MARKED = (pickletools.markobject, pickletools.stackslice)
 
 
 class _Ignored:
@@ -95,30 +98,17 @@ def _look_through(path: Path) -> bool:
 
 
 def _check_pickle(stream: IO[bytes]) -> None:
-    """Raise FormatError for a name that is not in `_NAMED`, and for more than DEEPEST nested tuples."""
-    depths: list[int] = []  # nesting of tuples for each entry of the unpickler's stack
-    below: list[list[int]] = []  # the stacks below each mark
-    memo: dict[Any, int] = {}
+    """Raise FormatError for a name that is not in `_NAMED`, and for more than `MOST_TUPLES` tuples."""
+    tuples = 0
     for opcode, argument, _ in pickletools.genops(stream):
-        if opcode.name == "MARK":
-            below.append(depths)
-            depths = []
-            continue
         if opcode.name == "GLOBAL" and (name := str(argument).replace(" ", ".", 1)) not in _NAMED:
             raise FormatError(
                 f"needs {quoted(name)}; only tensors, arrays and numbers are read, as all else could run "
                 "code of whoever made the file; save it again as plain tensors"
             )
-        taken: list[int] = []
-        if pickletools.markobject in opcode.stack_before:
-            taken, depths = depths, below.pop()
-        taken += [depths.pop() for kind in opcode.stack_before if kind not in _MARKED]
-        depth = max(taken, default=0) + opcode.name.startswith("TUPLE")
-        if depth > DEEPEST:
-            raise FormatError(f"damaged: more than {DEEPEST} tuples in one another")
-        depths += [memo[argument] if opcode.name.endswith("GET") else depth] * len(opcode.stack_after)
-        if opcode.name.endswith("PUT"):
-            memo[argument] = depths[-1]
+        tuples += opcode.name.startswith("TUPLE")
+        if tuples > MOST_TUPLES:
+            raise FormatError(f"damaged: more than {MOST_TUPLES} tuples")
 
 
 def plain_array(value: Any, path: Path) -> Array | None:
@@ -134,10 +124,9 @@ def plain_array(value: Any, path: Path) -> Array | None:
         raise FormatError(f"{path}: holds a tensor {tuple(value.shape)}, more numbers than the file has")
     value = value.detach()
     try:
-        array: Array = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
+        return np.asarray((value.float() if value.dtype == torch.bfloat16 else value).numpy())
     except (RuntimeError, ValueError):  # more dimensions than NumPy allows, flags of lazy operations
         raise FormatError(f"{path}: holds a tensor that is no array of numbers") from None
-    return array
 
 
 def plain_mapping(value: Any) -> dict[Any, Any] | None:

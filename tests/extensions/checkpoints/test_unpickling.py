@@ -158,6 +158,7 @@ def hostile_files() -> dict[str, bytes]:
         **{f"with another {name}": saved(Crafted(OrderedDict, state={name: 5})) for name in ("get", "items")},
         "type without a call": by_hand(b"cnumpy.core.multiarray\nscalar\ncnumpy\ndtype\n)\x81U\x00\x86R"),
         "key in many tuples": by_hand(b"})" + tuples + b"K\x00s"),
+        "key in some tuples": by_hand(b"})" + tuples[:9_000] + b"K\x00s"),
         "key in remembered tuples": by_hand(b"})" + b"\x85q\x000h\x00" * 150_000 + b"K\x00s"),
         "storage key in tuples": by_hand(b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\n)" + tuples +
                                          b"X\x03\x00\x00\x00cpuK\x0ctQ"),
