@@ -324,7 +324,9 @@ def _child(path: Path) -> tuple[int, str, bool]:
 
 
 def _all(folder: Path) -> None:
-    import langsplat_core.extensions.checkpoints.importing  # noqa: F401  and torch, once for all children
+    import torch  # noqa: F401  once for all children
+
+    import langsplat_core.extensions.checkpoints.importing  # noqa: F401
 
     gc.freeze()  # or every child copies what its first collection touches
     print(json.dumps({path.stem: _child(path) for path in sorted(folder.glob("*.pth"))}))

@@ -4,8 +4,8 @@ from langsplat_core.registry import Extension
 
 _HERE = "langsplat_core.extensions.checkpoints"
 EXTENSION = Extension(
-    importers={"checkpoints": f"{_HERE}.convert:IMPORTER"},
-    exporters={"langsplat": f"{_HERE}.convert:LANGSPLAT"},
+    importers={"checkpoints": f"{_HERE}.importing:IMPORTER"},
+    exporters={"langsplat": f"{_HERE}.langsplat_files:EXPORTER"},
     encoders={
         name: f"{_HERE}.weight_layouts:{name.upper().replace('_', '')}"
         for name in ("siglip", "metaclip_2", "tipsv2")

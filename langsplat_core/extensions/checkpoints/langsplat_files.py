@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import FormatError, InputError
 from langsplat_core.extensions.checkpoints.unpickling import plain_array
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.ply import REST_COUNTS
-from langsplat_core.io.scenes import ORIGIN_SUFFIX, companion_path, write_origin
-from langsplat_core.scene import NO_ORIGIN, AutoencoderCodec, Gaussians
+from langsplat_core.io.scenes import ORIGIN_SUFFIX, Exporter, companion_path, write_origin
+from langsplat_core.progress import Progress, silent
+from langsplat_core.scene import LEVELS, NO_ORIGIN, AutoencoderCodec, Gaussians, Scene
 from langsplat_core.scene.codec import EPSILON, Layers, folded
 
 # ---- LangSplat's autoencoder, `best_ckpt.pth`: weights by the number of a layer in its network ----
@@ -27,6 +28,7 @@ from langsplat_core.scene.codec import EPSILON, Layers, folded
 # Both outputs are scaled to length 1. Other widths and depths are read too, from the weights of the layers.
 
 _NAME = re.compile(r"(encoder|decoder)\.([0-9]{1,3})\.(\w+)")
+LATENT = 3  # numbers per Gaussian that its rasterizer is compiled for
 Layer = dict[str, Array]
 
 
@@ -192,3 +194,29 @@ def _save(content: Any, path: Path) -> None:
     # Given a path, torch 2.8 does not report a full disk.
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         torch.save(content, file)
+
+
+def export_langsplat(scene: Scene, folder: Path, progress: Progress = silent) -> tuple[str, ...]:
+    """Write `NAME_{1,2,3}/chkpnt30000.pth` with latents and `best_ckpt.pth`; return the paths.
+
+    Raises InputError for a scene whose codec is not an autoencoder of 3 numbers.
+    """
+    language, name = scene.language, scene.path.stem if scene.path else "scene"
+    if language is None:
+        raise InputError(f"{scene.path}: has no language field to write; 'langsplat train' makes one")
+    codec = language.codec
+    if not isinstance(codec, AutoencoderCodec) or codec.latent_dim != LATENT:
+        raise InputError(
+            f"{scene.path}: its codec, {codec.kind} of {codec.size}, is not "
+            "LangSplat's autoencoder of 3 numbers; train with --codec.kind autoencoder"
+        )
+    latents = np.where(language.known[..., None], language.latents, np.float32(0))
+    written = [folder / f"{name}_{level + 1}" / "chkpnt30000.pth" for level in range(len(LEVELS))]
+    for level, path in enumerate(written):
+        write_checkpoint(path, scene.gaussians, latents[level], scene.origin)
+    write_autoencoder(folder / "best_ckpt.pth", codec.encoder, codec.decoder)
+    return (*map(str, written), str(folder / "best_ckpt.pth"))
+
+
+LOSES = ("cameras", "metres per unit", "antialiasing", "extra properties", "taught words", "origin")
+EXPORTER = Exporter(export_langsplat, LOSES)

@@ -19,8 +19,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, optional_imports, quoted
 from langsplat_core.io.hostile import open_for_reading, opened_archive
 
-# Tuples in a pickle. They may be nested, and Python's hash of a key recurses on the machine's stack, which ends
-# at 100 000. A tensor takes five.
+# Of a pickle; a tensor takes five. They may be nested, and Python's hash of a key recurses on the machine's
+# stack, which ends at 100 000.
 MOST_TUPLES = 10_000
 _ARCHIVE = b"PK\x03\x04"  # by which torch recognises an archive
 _PICKLES = 5  # at the start of a file that is no archive: magic number, version, system, content, storages

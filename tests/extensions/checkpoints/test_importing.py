@@ -15,8 +15,8 @@ import torch
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig
 from langsplat_core.errors import STRICTNESS, EncoderError, FormatError, InputError
-from langsplat_core.extensions.checkpoints.convert import IMPORTER, export_langsplat
-from langsplat_core.extensions.checkpoints.importing import ForeignScene, import_scene, read_foreign
+from langsplat_core.extensions.checkpoints.importing import IMPORTER, ForeignScene, import_scene, read_foreign
+from langsplat_core.extensions.checkpoints.langsplat_files import export_langsplat
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import ImportRequest, load_scene, save_scene
 from langsplat_core.progress import silent
