@@ -172,28 +172,30 @@ def converted(
         return _clip(file, tensors) if "visual.class_embedding" in tensors else None
 
 
-def _unpickled(path: Path) -> dict[str, Any]:
-    """Return the tensors of a torch file by name; those of archives are read on access."""
+def _stored(path: Path) -> Any:
+    """Return the content of a file of safetensors or torch; tensors are read on access. No code is run."""
     import torch
+    from safetensors.torch import load_file
 
+    if path.suffix == ".safetensors":
+        return load_file(path)
     mapped = zipfile.is_zipfile(path)  # files from before PyTorch 1.6 are no archives
     return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
 
 
 def _read(id: str, file: Path) -> Tensors:
-    """Return the tensors of a file, taken out of a checkpoint's dictionaries; no code is run."""
+    """Return the tensors of a file, taken out of a checkpoint's dictionaries."""
     import torch
-    from safetensors.torch import load_file
 
-    if file.suffix == ".safetensors":
-        return load_file(file)
     parts = zipfile.ZipFile(file).namelist() if zipfile.is_zipfile(file) else []
     if any(name.endswith("/constants.pkl") for name in parts):
         raise EncoderError(
             f"{id}: a TorchScript archive, whose code would have to be run; pass the same weights in another "
             "layout, such as the hub id openai/clip-vit-base-patch16"
         )
-    found: Any = _unpickled(file)
+    found = _stored(file)
+    if file.suffix == ".safetensors":
+        return found
     found = found.get("state_dict", found.get("model", found)) if isinstance(found, dict) else {}
     if not isinstance(found, dict):
         raise ValueError("it holds no named tensors")
@@ -281,7 +283,6 @@ def _check(model: Settings, config: Settings) -> None:
 
 
 def _renamed(tensors: Tensors, names: Names) -> dict[str, Any]:
-    """Return tensors with names replaced by patterns."""
     renamed = {}
     for old, tensor in tensors.items():
         name = old
@@ -475,17 +476,11 @@ def _siglip_config(weights: Weights) -> Any:
 
 def _logit_scale(weights: Weights) -> float:
     """Return `logit_scale` without reading the other weights; NaN if missing, as in half a model."""
-    from safetensors import safe_open
-
-    name = "logit_scale"
     with loading_errors(weights.id, "readable"):
         for path in weight_files(weights.folder):
-            if path.suffix != ".safetensors" and name in (found := _unpickled(path)):
-                return float(found[name])
-            if path.suffix == ".safetensors":
-                with safe_open(path, framework="pt") as file:
-                    if name in file.keys():  # noqa: SIM118  not a mapping
-                        return float(file.get_tensor(name))
+            tensors = _stored(path)
+            if "logit_scale" in tensors:
+                return float(tensors["logit_scale"])
     return math.nan
 
 

@@ -31,16 +31,7 @@ from langsplat_core.cli.arguments import AnyScene, JsonOption, WrittenScene
 from langsplat_core.cli.run import print_json
 from langsplat_core.config import Count
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.compaction.compact import (
-    BudgetConfig,
-    Loss,
-    Views,
-    choose_views,
-    contributions,
-    mean_psnr,
-    psnr_losses,
-    scene_for,
-)
+from langsplat_core.extensions.compaction import compact
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.raster.render import view_of
@@ -56,7 +47,7 @@ USUAL = 0.45  # median gap to the nearest in trained scenes; TOUCH grows in prop
 
 
 @dataclass(frozen=True)
-class CleanConfig(BudgetConfig):
+class CleanConfig(compact.BudgetConfig):
     """Settings of `langsplat clean`: the error allowed, its views, and the size of floaters."""
 
     region: Count = 100  # Gaussians: a larger connected region is no floater
@@ -136,7 +127,7 @@ def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -
 
 
 @dataclass(frozen=True, kw_only=True)
-class CleanReport(Loss):
+class CleanReport(compact.Loss):
     """Numbers of removed Gaussians, and the loss."""
 
     gaussians: int  # before
@@ -154,7 +145,7 @@ class CleanReport(Loss):
 
 
 def clean(
-    scene: Scene, views: Views, config: CleanConfig, progress: Progress = silent
+    scene: Scene, views: compact.Views, config: CleanConfig, progress: Progress = silent
 ) -> tuple[Array, CleanReport]:
     """Return the (N,) bool rows that stay, and the report.
 
@@ -165,12 +156,12 @@ def clean(
         raise InputError("the scene holds nothing that can be drawn: there is nothing to clean")
     measured = views.measured(scene)
     suspicion, region = find_floaters(scene, views.ranking, config.region, progress)
-    cost = contributions(scene, views.ranking, progress)
+    cost = compact.contributions(scene, views.ranking, progress)
     suspects = np.flatnonzero(suspicion)
     keep = np.ones(len(valid), bool)
 
     def losses() -> Array:
-        return psnr_losses(scene.take(keep), measured, config.assumed_psnr)
+        return compact.psnr_losses(scene.take(keep), measured, config.assumed_psnr)
 
     if views.photographs[0] is None:
         rising = suspects[np.argsort(cost[suspects], kind="stable")]
@@ -190,8 +181,8 @@ def clean(
         regions=int((gone & region).sum()),
         free_space=int((gone & ~region).sum()),
         kept=int((suspicion[keep] > 0).sum()),
-        psnr_before=mean_psnr(scene, measured),
-        psnr_after=mean_psnr(scene.take(keep), measured),
+        psnr_before=compact.mean_psnr(scene, measured),
+        psnr_after=compact.mean_psnr(scene.take(keep), measured),
     )
     return keep, report
 
@@ -279,9 +270,9 @@ class Clean:
     config: Annotated[CleanConfig, tyro.conf.arg(name="")] = field(default_factory=CleanConfig)
 
     def run(self) -> None:
-        scene = scene_for(self.out, self.scene)
+        scene = compact.scene_for(self.out, self.scene)
         with TerminalProgress() as progress:
-            views = choose_views(scene, self.photos, self.config, progress)
+            views = compact.choose_views(scene, self.photos, self.config, progress)
             keep, report = clean(scene, views, self.config, progress)
             save_scene(self.out, replace(scene.take(keep), path=self.out), tell=False)
         if self.json:

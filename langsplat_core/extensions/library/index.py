@@ -37,24 +37,11 @@ from langsplat_core.io.scenes import companion_path, format_of, load_scene, scen
 from langsplat_core.io.sidecar import SUFFIX, read_stored
 from langsplat_core.pipeline.notebook import draw
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query import rule
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.query.grammar import heads, named, parse
-from langsplat_core.query.rule import (
-    Bars,
-    Judged,
-    Outcome,
-    RegionTable,
-    Verdict,
-    best_relevancies,
-    common_fits,
-    judge,
-    region_fits,
-    region_relevancies,
-    scaling_of,
-    triple,
-)
 from langsplat_core.scene import LEVELS, NO_ORIGIN, Calibration, LanguageField, Scene
 from langsplat_core.scene.codec import LinearCodec
 from langsplat_core.scene.gaussians import join_gaussians
@@ -96,7 +83,7 @@ class Indexed:
     codewords: Whole = 0  # number; 0: only the engine can answer, as for other codecs than codebooks
     mixtures: Whole = 0  # number of entries
     regions: tuple[Whole, Whole, Whole] = (0, 0, 0)  # number at each level
-    bars: Bars | None = None  # of the fits of everyday phrases; None without codewords
+    bars: rule.Bars | None = None  # of the fits of everyday phrases; None without codewords
     calibration: Calibration | None = None  # of its encoder
     taught: tuple[str, ...] = ()  # keys of taught words
     phrases: Whole = 0  # in its phrasebook
@@ -131,12 +118,12 @@ class EncoderGroup:
         return np.cumsum([(0, 0, 0), *sizes], axis=0)
 
     @cached_property
-    def table(self) -> RegionTable:
+    def table(self) -> rule.RegionTable:
         """The regions of all scenes, for `query.rule`."""
         counts = np.array([scene.regions for scene in self.scenes], np.int64).reshape(-1, len(LEVELS))
         firsts = np.repeat(self.starts[:-1, 2], counts.sum(1))
         parents = self.columns.parents.astype(np.int64)
-        return RegionTable(counts, np.where(parents < 0, -1, parents + firsts), self.columns.solid > 0)
+        return rule.RegionTable(counts, np.where(parents < 0, -1, parents + firsts), self.columns.solid > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,10 +405,10 @@ def fits_in(group: EncoderGroup, vector: Array) -> tuple[Array, Array]:
         shared_workers().run(_region_means, len(group.scenes), phrase, columns, group.starts, means)
     except ValueError as error:
         raise FormatError(f"the index of scenes does not fit ({error}); search again") from None
-    fits = region_fits(group.table, fit_of(np.nan_to_num(means)))
-    best = fit_of(best_relevancies(group.table, region_relevancies(fits)))
+    fits = rule.region_fits(group.table, fit_of(np.nan_to_num(means)))
+    best = fit_of(rule.best_relevancies(group.table, rule.region_relevancies(fits)))
     indexed = np.array([scene.is_indexed for scene in group.scenes], bool)
-    return np.where(indexed[:, None], best, -np.inf), common_fits(group.table, fits)
+    return np.where(indexed[:, None], best, -np.inf), rule.common_fits(group.table, fits)
 
 
 @partial(helper, fastmath={"reassoc", "contract", "nsz"})
@@ -456,11 +443,11 @@ def _region_means(
 
 
 @dataclass(frozen=True, eq=False)
-class Hit(Judged):
+class Hit(rule.Judged):
     """The answer of one scene to a phrase."""
 
     path: Path
-    judgement: Verdict
+    judgement: rule.Verdict
     answer: QueryResult | None = None  # None: only the index was searched
     metres_per_unit: float | None = None
     origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) of positions in the answer
@@ -481,7 +468,7 @@ class Answers:
     problem: str = ""  # why nothing was searched
     unread: tuple[tuple[str, str], ...] = ()  # scenes that could not be opened, and why
 
-    def count(self, verdict: Outcome) -> int:
+    def count(self, verdict: rule.Outcome) -> int:
         """Return the number of scenes with this verdict."""
         return sum(hit.verdict == verdict for hit in self.hits)
 
@@ -540,15 +527,16 @@ def _ask_group(
     return Answers(phrase, group.encoder_id, tuple(chain(*ordered)), unread=tuple(unread))
 
 
-def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[Verdict]:
+def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[rule.Verdict]:
     """Return the best verdict on every scene, over some phrases, by the index alone."""
-    best = [Verdict(False, "chance", -math.inf)] * len(group.scenes)
+    best = [rule.Verdict(False, "chance", -math.inf)] * len(group.scenes)
     kept = kept_calibration(group.encoder_id, group.canonical)
     for text, vector in vectors.items():
         for row, (scene, fits, common) in enumerate(zip(group.scenes, *fits_in(group, vector), strict=True)):
             if scene.is_indexed:
-                scaling = scaling_of(scene.calibration or kept, named(text), text)
-                verdict = judge(triple(fits), named(text), "auto", scene.bars, scaling, float(common))
+                scaling = rule.scaling_of(scene.calibration or kept, named(text), text)
+                three = rule.triple(fits)
+                verdict = rule.judge(three, named(text), "auto", scene.bars, scaling, float(common))
                 best[row] = max(best[row], verdict, key=lambda found: found.margin)
     return best
 
