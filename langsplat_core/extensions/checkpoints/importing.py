@@ -8,8 +8,8 @@ time, and no (N, 512) array is made here, as it may exceed the memory.
 """
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from os.path import exists
 from pathlib import Path
 from typing import Any, TypeVar
@@ -416,31 +416,26 @@ class ForeignScene:
 
     method: str
     scene: Scene  # without a language field
-    levels: tuple[Features | None, ...] = (None, None, None)  # of subpart, part and whole, each for all N
+    levels: Mapping[int, Features] = field(default_factory=dict)  # those it has, ascending, each for all N
     codec: AutoencoderCodec | None = None  # if the features are its latents; None: they are vectors
     clusters: Clusters | None = None  # if the features are vectors of clusters
     notes: tuple[str, ...] = ()  # assumptions, for the user
-
-    @property
-    def told(self) -> dict[int, Features]:
-        """The features by level, without empty levels."""
-        return {level: features for level, features in enumerate(self.levels) if features is not None}
 
     @property
     def dim(self) -> int:
         """Length D of the vectors; 0 without features."""
         if self.codec is not None:
             return self.codec.vector_dim
-        return next((features.dim for features in self.told.values()), 0)
+        return next((features.dim for features in self.levels.values()), 0)
 
     @property
     def first_path(self) -> Path:
         """The file of the first features, for messages."""
-        return next(features.path for features in self.told.values())
+        return next(features.path for features in self.levels.values())
 
     def rows(self, level: int, indices: Array) -> Array:
         """Return (n, D or d) float32 features at `level`, zero for none; FormatError if infinite or huge."""
-        features = self.told[level]
+        features = self.levels[level]
         with np.errstate(invalid="ignore", over="ignore"):
             rows = features.rows(indices)
         faulty = np.flatnonzero(~(np.abs(rows) <= HUGE).all(1))
@@ -518,7 +513,9 @@ def _of_clusters(carrier: Carrier | None, clusters: Clusters) -> ForeignScene:
         raise FormatError(f"{clusters.path}: leaf_ind names none of the {len(clusters.vectors)} clusters")
     whole = rearranged(whole_vectors(clusters.vectors, clusters.path), clusters.index)
     note = "OpenGaussian knows no levels: whole is filled, subpart and part are empty"
-    return ForeignScene(OPEN_GAUSSIAN, _scene(carrier), (None, None, whole), clusters=clusters, notes=(note,))
+    return ForeignScene(
+        OPEN_GAUSSIAN, _scene(carrier), {LEVELS.index("whole"): whole}, clusters=clusters, notes=(note,)
+    )
 
 
 def _of_levels(
@@ -539,7 +536,7 @@ def _of_levels(
     base = carriers[0]
     if base.method == OCCAM:  # it removes unseen Gaussians, so levels have different ones
         base = replace(base, scene=replace(base.scene, gaussians=all_gaussians(carriers)))
-    levels: list[Features | None] = [None] * len(LEVELS)
+    levels: dict[int, Features] = {}
     pruned = 0
     for number, carrier in zip(numbers, featured, strict=True):
         features = carrier.features
@@ -547,15 +544,16 @@ def _of_levels(
         rows = partners(base.gaussians.means, carrier, method == OCCAM)
         pruned += rows is not None
         levels[number] = features if rows is None else rearranged(features, rows)
-    told = ", ".join(f"{name} from {own.path}" for name, own in zip(LEVELS, levels, strict=True) if own)
+    levels = dict(sorted(levels.items()))
+    told = ", ".join(f"{LEVELS[level]} from {features.path}" for level, features in levels.items())
     notes = [f"levels ({how}): {told}"]
-    empty = [name for name, own in zip(LEVELS, levels, strict=True) if own is None]
+    empty = [name for level, name in enumerate(LEVELS) if level not in levels]
     if empty:
         notes.append(f"without features: {', '.join(empty)}")
     if pruned:
         notes.append(f"{pruned} of the checkpoints lack some Gaussians, which have no features there")
     codec = autoencoder.codec if autoencoder is not None and method == LANGSPLAT else None
-    return ForeignScene(method, _scene(base), tuple(levels), codec, notes=tuple(notes))
+    return ForeignScene(method, _scene(base), levels, codec, notes=tuple(notes))
 
 
 def _scene(carrier: Carrier) -> Scene:
@@ -630,7 +628,7 @@ def _samples(foreign: ForeignScene, seed: int) -> tuple[Array, Array]:
     judges = min(JUDGED, len(order) // 6)
     samples = []
     for rows in (order[judges : judges + FITTED], order[:judges]):
-        parts = [_unit_rows(foreign, level, np.sort(rows)) for level in foreign.told]
+        parts = [_unit_rows(foreign, level, np.sort(rows)) for level in foreign.levels]
         samples.append(np.concatenate([vectors[known] for vectors, known in parts]))
     if len(samples[0]) == 0:
         raise InputError(f"{foreign.first_path}: no Gaussian has a meaning, all features are zero")
@@ -653,21 +651,21 @@ def _latents(foreign: ForeignScene, codec: Codec, progress: Progress) -> tuple[A
     count = len(foreign.scene.gaussians)
     latents = np.zeros((len(LEVELS), count, codec.latent_dim), codec.dtype)
     confidence = np.zeros((len(LEVELS), count), np.float32)
-    for done, level in enumerate(foreign.told):
+    for done, level in enumerate(foreign.levels):
         for start in range(0, count, BLOCK):
             rows = np.arange(start, min(start + BLOCK, count))
             values, known = _unit_rows(foreign, level, rows)
             made = values if foreign.codec is not None else codec.encode(values)
             latents[level, rows[known]] = made[known]
             confidence[level, rows] = known
-            progress("reading features", (done + (start + len(rows)) / count) / len(foreign.told))
+            progress("reading features", (done + (start + len(rows)) / count) / len(foreign.levels))
     return latents, confidence
 
 
 def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[str, ...]]:
     """Return the scene in a method's files, and lines that report what was imported."""
     foreign = read_foreign(request.paths, request.levels)
-    if not foreign.told and (request.encoder is not None or request.phrases or request.levels):
+    if not foreign.levels and (request.encoder is not None or request.phrases or request.levels):
         what = "--encoder, --levels and --phrases are of features, and it has none; leave them out"
         raise InputError(f"{request.paths[0]}: {what}")
     scene, loss = import_scene(foreign, request.encoder, request.phrases, request.codec, progress)
@@ -681,7 +679,7 @@ def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[st
         )
     if foreign.codec is not None:
         every = np.arange(len(scene.gaussians))
-        latents = np.concatenate([foreign.rows(level, every) for level in foreign.told])
+        latents = np.concatenate([foreign.rows(level, every) for level in foreign.levels])
         lengths = np.linalg.norm(latents, axis=1)
         lengths = lengths[lengths > SHORTEST]
         if (np.abs(lengths - 1) > 0.01).any():

@@ -218,7 +218,7 @@ def clusters(folder: Path) -> list[bytes]:
 def imported(path: Path) -> float:
     beside = (path.with_name(name) for name in ("latents_1.pth", "plain.ply"))
     scene = read_foreign([path, *(other for other in beside if other.exists())])
-    for level in (level for level in range(3) if scene.levels[level] is not None):
+    for level in scene.levels:
         scene.rows(level, np.arange(len(scene.scene.gaussians)))
     return drawable_share(scene.scene.gaussians)
 
