@@ -68,7 +68,7 @@ class Serve:
     def run(self) -> None:
         if not self.mcp:
             raise InputError("say how: --mcp is the Model Context Protocol, on standard input and output")
-        tools = SceneTools(scene_files(self.scene), self.encoder)
+        tools = SceneTools(served_scenes(self.scene), self.encoder)
         if len(tools.scenes()) == 1:  # opened at the start, so that errors are reported here
             tools.engine()
         server = build_server(tools)
@@ -76,7 +76,7 @@ class Serve:
             asyncio.run(_serve(server))
 
 
-def scene_files(place: Path) -> dict[str, Path]:
+def served_scenes(place: Path) -> dict[str, Path]:
     """Return searchable scenes by name; those of a folder by their path in it. InputError for none."""
     if not place.is_dir() or format_of(place) is not None:
         return {place.name: place}

@@ -333,8 +333,7 @@ class ReferenceWindow:
 
     def splat(self, values: Array) -> Array:
         """Return the (h, w, C) float64 image of the window from (N, C) values."""
-        image: Array = self.weights @ values[self.rows].astype(np.float64)
-        return image.reshape(*self.band.shape, -1)
+        return np.reshape(self.weights @ values[self.rows].astype(np.float64), (*self.band.shape, -1))
 
     def splat_error(self, image: Array, values: Array) -> Error:
         """Return the error of a backend's (H, W, C) `image` of `values`."""
@@ -386,13 +385,13 @@ def reference_window(
 
 def table(rows: Sequence[Measurement]) -> str:
     """Return the measurements as a Markdown table."""
-    head = ("scene", "Gaussians", "size", "channels", "operation", "backend", "ms", "MiB")
-    return markdown(
-        (*head, "error off cut-offs", "largest error", "flips"),
-        (
-            (r.scene, r.gaussians, f"{r.width}x{r.height}", r.channels, r.operation, r.backend)
-            + (f"{r.milliseconds:.4g}", "-" if r.peak_mib is None else f"{r.peak_mib:.1f}")
-            + (("-",) * 3 if (e := r.error) is None else (f"{e.off_cuts:.1e}", f"{e.largest:.1e}", e.flips))
-            for r in rows
-        ),
-    )
+    head = ["scene", "Gaussians", "size", "channels", "operation", "backend", "ms", "MiB"]
+    lines: list[list[object]] = []
+    for r in rows:
+        case = [r.scene, r.gaussians, f"{r.width}x{r.height}", r.channels, r.operation, r.backend]
+        cost = [f"{r.milliseconds:.4g}", "-" if r.peak_mib is None else f"{r.peak_mib:.1f}"]
+        error: list[object] = ["-", "-", "-"]
+        if r.error is not None:
+            error = [f"{r.error.off_cuts:.1e}", f"{r.error.largest:.1e}", r.error.flips]
+        lines.append([*case, *cost, *error])
+    return markdown([*head, "error off cut-offs", "largest error", "flips"], lines)

@@ -92,7 +92,7 @@ def score_scene(
         for label in frame.labels:
             answer, unanswered = answers[label.phrase], ""
             if isinstance(answer, str):  # counts as an empty answer that is wrong
-                answer, unanswered = Prediction(np.zeros(frame.size[::-1], bool)), answer
+                unanswered, answer = answer, Prediction(np.zeros(frame.size[::-1], bool))
             size = answer.mask.shape[1], answer.mask.shape[0]
             check_same_image(frame.name, size, frame.size)
             truth = label.truth(size)

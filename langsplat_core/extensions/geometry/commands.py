@@ -93,8 +93,7 @@ class WriteMesh:
                 made = f" closed; made up: {area * unit.length**2:.3g} {unit.name}^2 ({share:.0f} %)"
                 if hollows := mesh.hollows():
                     made += f"; {hollows} hollow pieces, which what is solid surrounds, as walls do a room"
-            mesh = replace(mesh, name=self.phrase or self.scene.stem)
-            write_mesh(self.out, mesh, scene)
+            write_mesh(self.out, mesh, scene, self.phrase or self.scene.stem)
         print(
             f"{self.out}: {len(mesh.triangles)} triangles, {len(mesh.vertices)} vertices, voxels of "
             f"{side * unit.length:.3g} {unit.name}; {holes} holes{made}"

@@ -53,7 +53,6 @@ class Mesh:
     vertices: Array  # (V, 3) float64 world units
     triangles: Array  # (T, 3) int64
     colour: Array  # (V, 3) float64 display values in [0, 1]
-    name: str = "scene"
 
     def holes(self) -> int:
         """Return the number of holes: loops of edges with a triangle on one side only."""
@@ -183,7 +182,7 @@ def _cleaned(mesh: Mesh) -> Mesh:
     if len(kept) == 0:
         raise InputError("too few views show the same surface; take fewer --views, or a coarser --resolution")
     used, triangles = np.unique(kept, return_inverse=True)
-    return Mesh(mesh.vertices[used], triangles.reshape(-1, 3), mesh.colour[used], mesh.name)
+    return Mesh(mesh.vertices[used], triangles.reshape(-1, 3), mesh.colour[used])
 
 
 def _pieces(edges: Array, count: int) -> Array:
@@ -304,10 +303,10 @@ def check_suffix(path: Path | str) -> Path:
     return path
 
 
-def write_mesh(path: Path | str, mesh: Mesh, scene: Scene) -> None:
+def write_mesh(path: Path | str, mesh: Mesh, scene: Scene, name: str = "scene") -> None:
     """Write a mesh of a scene, in the world, as .ply or .glb, atomically. InputError for another suffix.
 
-    A .glb has the axes and the node that `write_gltf` writes for the scene's Gaussians.
+    A .glb has the axes and the node that `write_gltf` writes for the scene's Gaussians, and the `name`.
     """
     path = check_suffix(path)
     if path.suffix.lower() == ".ply":
@@ -326,5 +325,5 @@ def write_mesh(path: Path | str, mesh: Mesh, scene: Scene) -> None:
     }
     corners = file.add(mesh.triangles.reshape(-1).astype("<u4"))
     primitive = {"attributes": attributes, "indices": corners, "material": 0}
-    file.add_mesh(primitive, name=mesh.name, **node_of(scene))
+    file.add_mesh(primitive, name=name, **node_of(scene))
     file.write(path, materials=[{"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}])

@@ -310,7 +310,10 @@ def _change(kind: Kind, piece: _Piece, scene: int, describers: tuple[Describer, 
     colours = (colour_term(piece.colour), colour_term(piece.other)) if kind == "recoloured" else None
     pixels = piece.gone + piece.kept
     return Change(
-        *(kind, None if name is None else name.phrase, piece.points.mean(0), piece.box),
+        kind=kind,
+        name=None if name is None else name.phrase,
+        centre=piece.points.mean(0),
+        box=piece.box,
         colours=colours,
         share=(piece.gone + piece.coloured) / max(pixels, 1e-9),
         pixels=pixels,

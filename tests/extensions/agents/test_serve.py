@@ -21,7 +21,7 @@ from PIL import Image
 from langsplat_core import __version__
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.agents.commands import MOST_SIDE, SceneTools, scene_files
+from langsplat_core.extensions.agents.commands import MOST_SIDE, SceneTools, served_scenes
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from tests.support.fakes import PER_BLOB, named_scene
@@ -46,13 +46,13 @@ def middle(blob: int) -> Array:
 
 
 def test_scenes_of_a_folder_are_those_that_can_be_searched(folder, tmp_path):
-    assert SceneTools(scene_files(folder)).scenes() == ["a.ply", os.path.join("blind", "b.ply")]
+    assert SceneTools(served_scenes(folder)).scenes() == ["a.ply", os.path.join("blind", "b.ply")]
     with pytest.raises(InputError, match="no scene with a language field"):
-        scene_files(tmp_path)
+        served_scenes(tmp_path)
 
 
 def test_find_answers_in_metres_and_says_what_is_absent(folder):
-    tools = SceneTools(scene_files(folder))
+    tools = SceneTools(served_scenes(folder))
     answer = tools.find("mug", "a.ply")
     assert (answer["verdict"], answer["unit"]) == ("found", "m")
     np.testing.assert_allclose(answer["place"], 2 * middle(0), atol=0.3)
@@ -68,7 +68,7 @@ def test_find_answers_in_metres_and_says_what_is_absent(folder):
 
 
 def test_images_are_of_what_was_asked_for(folder):
-    tools = SceneTools(scene_files(folder))
+    tools = SceneTools(served_scenes(folder))
     image, said = tools.look(camera=1, scene="a.ply")
     assert image.shape[:2] == (SCENE.cameras[1].height, SCENE.cameras[1].width)
     towards, _ = tools.look("mug", scene=os.path.join("blind", "b.ply"))
