@@ -111,7 +111,7 @@ def _noted(ctx: Any, window: Window) -> None:
 def _beside(ctx: Any, window: Window) -> None:
     """Open the scene beside itself with the paper's autoencoder of three numbers in place of its codebook."""
     viewer, folder = window.viewer, Path(tempfile.mkdtemp())
-    scene, path = viewer.state.scene, folder / "autoencoder.ply"
+    scene, path = viewer.state.open.scene, folder / "autoencoder.ply"
     assert scene is not None
     assert scene.language is not None
     field = scene.language

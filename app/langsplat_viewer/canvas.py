@@ -82,18 +82,18 @@ class Canvas:
         `now` in seconds. Raises what the renderer raises (BackendError, moderngl.Error); the same
         request is then not tried again.
         """
-        if state.scene is None or state.view is None:
+        if state.open is None:
             self._background.drop()
             self.phase = "still"
             return False
-        pose = state.view, state.moving
+        pose = state.open.view, state.moving
         if pose != self._pose:
             if self._pose is not None:  # the first view is no move
                 self._moved = now
             self._pose = pose
         moving = now - self._moved < REST_SECONDS
         request = state.request().without_line()
-        self._resolution.count = max(len(state.scene.gaussians), 1)
+        self._resolution.count = max(state.count, 1)
         if moving:
             self._background.drop()
             self._follow(state, request)

@@ -10,7 +10,6 @@ from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 
-from langsplat_core import registry
 from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
@@ -119,11 +118,6 @@ def _side(side: Side, key: str) -> Command:
     return Command(f"look from {where}", lambda v: viewpoint.look_from(v, side), (key,))
 
 
-PANEL_TITLES = (
-    *("Search", "Display", "Camera", "Outline", "Selection", "Transform", "Record", "Bookmarks"),
-    *("Notes", "Scene", "Train", "Timeline", "Messages"),
-    *registry.references("panels"),
-)
 ICONS = {  # by what a command does
     "show colours": "IMAGE", "show relevancy": "FIRE", "show segmentation": "HIGHLIGHTER",
     "show latent, whole": "PALETTE", "show tree, whole": "SITEMAP", "show depth": "MOUNTAIN",
@@ -138,9 +132,8 @@ ICONS = {  # by what a command does
 }  # fmt: skip
 open_train = partial(settings.open_panel, title="Train")
 OTHER_THEME = {"dark": "light", "light": "dark"}
-MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
-BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list of commands alone
+BY_MENU: dict[str, tuple[Command, ...]] = {
     "File": (
         Command("open a scene ...", opening.ask_for_file, ("Ctrl+O",), "Open a scene ..."),
         Command("start page", settings.toggle_start, is_on=_is("show_start")),
@@ -276,15 +269,14 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("larger text", lambda v: settings.scale_text(v, 0.25), apart=True),
         Command("smaller text", lambda v: settings.scale_text(v, -0.25)),
     ),
-    "Export": tuple(map(_export_as, saving.exports())),  # in the menu File
-    "": tuple(Command(f"panel: {one}", partial(settings.open_panel, title=one)) for one in PANEL_TITLES),
     "Help": (
         Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),
         Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "First steps"),
     ),
 }
+EXPORT_MENU = tuple(map(_export_as, saving.exports()))  # in the menu File
 COMMANDS: tuple[Command, ...] = (
-    *chain(*BY_MENU.values()),
+    *chain(*BY_MENU.values(), EXPORT_MENU),
     Command("close what lies over the scene", settings.escape, ("Esc",)),
 )
 
@@ -361,16 +353,16 @@ SYNONYMS = {
 }
 
 
-def matching(text: str, recent: Sequence[str] = ()) -> list[Command]:
+def matching(text: str, panels: Sequence[str] = (), recent: Sequence[str] = ()) -> list[Command]:
     """Return the commands with every word of `text`, those that find it among synonyms last; all for none.
 
-    `recent` scenes are some.
+    Some open the `panels` of these titles, and `recent` scenes.
     """
-    opened = (
-        Command(f"open {path.parent.name}/{path.name}", partial(opening.open_file, path=path))
-        for path in map(Path, recent)
-    )
-    words, commands = text.lower().split(), (*COMMANDS, *opened)
+    more = [Command(f"panel: {title}", partial(settings.open_panel, title=title)) for title in panels]
+    for path in map(Path, recent):
+        name = f"{path.parent.name}/{path.name}"
+        more.append(Command(f"open {name}", partial(opening.open_file, path=path)))
+    words, commands = text.lower().split(), (*COMMANDS, *more)
 
     def missed(command: Command) -> int:
         """Return how many words are only among its synonyms; one more than there are if one is unknown."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.query import selection
-from langsplat_core.scene import Camera
+from langsplat_core.scene import NO_NODE, Camera, Scene
+from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.overlays import box_edges
 
 # The scene itself is never changed: deleting marks, and what is marked is left out of images and of what is
@@ -62,6 +63,18 @@ COMBINED: dict[Mode, Callable[[Array, Array], Array]] = {
     "remove": np.greater,  # of booleans: the one and not the other
     "intersect": np.logical_and,
 }
+
+
+def middle_of_selected(scene: Scene, marks: Marks) -> Array | None:
+    """Return the (3,) median of what is selected, world units; None where nothing is that can be drawn."""
+    chosen = marks.selected & scene.gaussians.valid()
+    return np.median(scene.gaussians.means[chosen].astype(np.float64), axis=0) if chosen.any() else None
+
+
+def hidden_nodes(tree: Tree, marks: Marks) -> Array:
+    """Return (K,) bool: nodes of which nothing is shown."""
+    shown = tree.leaves[marks.shown & (tree.leaves != NO_NODE)]
+    return tree.totals(np.bincount(shown, minlength=tree.count)) == 0
 
 
 @dataclass(frozen=True)

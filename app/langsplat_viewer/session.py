@@ -9,6 +9,7 @@ that is named with it.
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -81,30 +82,23 @@ class Marked:
     hidden: Bits | None = None
     deleted: Bits | None = None
 
-    def of(self, marks: Marks, now: Marks) -> "Marked":
-        """Return the bits of `marks`; those of this object, which are the bits of `now`, where both agree."""
+    def of(self, marks: Marks) -> "Marked":
+        """Return the bits of `marks`; those of this object where they are the same: histories share them."""
+        pairs = ((getattr(self, name), pack(getattr(marks, name))) for name in MASKS)
+        return Marked(*(old if old == new else new for old, new in pairs))
 
-        def bits(own: Bits | None, new: Array, old: Array) -> Bits | None:
-            return own if new is old or np.array_equal(new, old) else pack(new)
-
-        return Marked(*(bits(*(getattr(part, name) for part in (self, marks, now))) for name in MASKS))
-
-    def masks(self, before: "Marked", marks: Marks) -> Marks:
-        """Unpack these bits into masks, (count,) bool each.
-
-        Those of `marks`, which are the masks of `before`, are used as far as both mark the same: nothing is
-        drawn anew for them.
-        """
-        if self == before:
-            return marks
-
-        def mask(bits: Bits | None, old: Bits | None, there: Array) -> Array:
-            return there if bits == old else np.zeros_like(there) if bits is None else bits.mask
-
-        return Marks(*(mask(*(getattr(part, name) for part in (self, before, marks))) for name in MASKS))
+    def masks(self, count: int) -> Marks:
+        """Unpack these bits into masks, (count,) bool each."""
+        return Marks(*(unpacked(getattr(self, name), count) for name in MASKS))
 
 
 MASKS = ("selected", "hidden", "deleted")
+
+
+@lru_cache(len(MASKS))  # the same mask for the same bits: nothing is drawn anew for it
+def unpacked(bits: Bits | None, count: int) -> Array:
+    """Return (count,) bool, of which none is set for None."""
+    return np.zeros(count, bool) if bits is None else bits.mask
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,23 +6,30 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-import numpy as np
+from typing import Annotated, Any, Literal, TypeVar
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import TrainPreset
 from langsplat_core.query.answers import QueryResult, recut
 from langsplat_core.query.describe import Pointed
+from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.inventory import Outline, Suggestions
 from langsplat_core.scene import NO_ORIGIN, Camera, Scene
 from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, unmarked
+from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, hidden_nodes, middle_of_selected
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes, widget
 from langsplat_viewer.session import OF_PROJECT, Marked, Move, Note, Point, Preferences, Query, Session
+
+T = TypeVar("T")
+
+
+def last(make: Callable[..., T]) -> Callable[..., T]:
+    """Return a function that keeps the last result of `make`, as long as its arguments stay."""
+    return lru_cache(maxsize=1)(make)
+
 
 # Camera path and film: the panel "Record".
 
@@ -40,7 +47,7 @@ class Recording:
     size: tuple[int, int] = (1280, 720)  # of films, and of images that are no screenshots, pixels
     fps: float = 30.0
     film_file: str = ""  # where the film goes; empty: a new name
-    thumbnails: tuple[tuple[Keyframe, ...], Array] = ((), np.zeros((0, 144, 3), np.uint8))  # see viewpoint
+    thumbnails: dict[Keyframe, Array] = field(default_factory=dict)  # (H, W, 3) uint8, see viewpoint
 
 
 @lru_cache(maxsize=2)
@@ -68,16 +75,11 @@ class QueryAnswer:
     pending: bool = False
     has_evidence: bool = False  # training kept its evidence
     like: QueryResult | None = None  # of a name that finds what was given it: all that is like that
-    _cuts: dict[float, QueryResult] = field(default_factory=dict)  # the last one that was wanted
+    with_cut: Callable[[QueryResult, float], QueryResult] = field(default_factory=lambda: last(recut))
 
     def at(self, cut: float | None) -> QueryResult | None:
         """Return the result with another threshold; with its own one for None."""
-        if cut is None or self.result is None:
-            return self.result
-        if cut not in self._cuts:
-            self._cuts.clear()
-            self._cuts[cut] = recut(self.result, cut)
-        return self._cuts[cut]
+        return self.result if cut is None or self.result is None else self.with_cut(self.result, cut)
 
 
 @dataclass(frozen=True)
@@ -118,9 +120,9 @@ class OutlineView:
 
     roots: tuple[Outline, ...] = ()
     tree: Tree | None = None
-    sizes: Array = field(default_factory=lambda: np.zeros(0, np.int64))  # (K,) Gaussians of every node
     problem: str = ""  # why there is none, or none yet
     colours: dict[tuple[str, int, int], Point] = field(default_factory=dict)  # by display, level and node
+    hidden: Callable[[Tree, Marks], Array] = field(default_factory=lambda: last(hidden_nodes))
 
 
 @dataclass(frozen=True)
@@ -209,30 +211,57 @@ class EditForm:
 # The state as one dataclass.
 
 
+@dataclass(frozen=True, eq=False)
+class OpenScene:
+    """The scene that is shown, and the view of it."""
+
+    path: Path
+    scene: Scene  # transformed as the session says
+    in_file: Scene  # as its file has it
+    extent: Extent  # of `scene`
+    view: OrbitCamera
+    opening_camera: Camera | None = None  # what R returns to, where that is not the scene's own choice
+    warnings: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
+
+
+@dataclass(frozen=True, eq=False)
+class Saved:
+    """What files hold of a session."""
+
+    session: Session = field(default_factory=Session)  # as a project or an exported scene last had it
+    project: Path | None = None  # the file that it is saved to again
+    digest: str = ""  # of what that held when it was last read or written here
+
+    def lacks_notes(self, session: Session) -> bool:
+        """Return whether no project has the names, notes, bookmarks and keyframes of `session`."""
+        return any(getattr(session, name) != getattr(self.session, name) for name in OF_PROJECT)
+
+
+@dataclass(eq=False)
+class Visit:
+    """What is kept of a scene that was left: no large arrays."""
+
+    path: Path
+    view: OrbitCamera
+    opening_camera: Camera | None
+    camera_index: int | None
+    count: int  # Gaussians
+    origin: Array  # (3,) of the scene
+    session: Session
+    saved: Saved
+
+
 @dataclass(eq=False)
 class SceneState:
     """The part of the state that begins anew with every scene."""
 
     session: Session = field(default_factory=Session)
-    saved: Session = field(default_factory=Session)  # as a project or an exported scene last had it
-    project: Path | None = None  # the file that it is saved to again
-    project_digest: str = ""  # of what that held when it was last read or written here
-    count: int = 0  # Gaussians
-    origin: Array = field(default_factory=lambda: NO_ORIGIN)  # (3,) of the scene
-
-    scene: Scene | None = None
-    path: Path | None = None
-    extent: Extent | None = None  # there whenever a scene is
-    warnings: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
+    saved: Saved = field(default_factory=Saved)
+    open: OpenScene | None = None
     nothing: str = ""  # why the image shows nothing of the scene, where it does not
-
-    # what follows from the session
-    opened: Scene | None = None  # the scene as its file has it, once something was transformed
     answers: dict[str, QueryAnswer] = field(default_factory=dict)  # by phrase
 
-    view: OrbitCamera | None = None
     glide: Glide | None = None
-    opening_camera: Camera | None = None  # what R returns to, where that is not the scene's own choice
     camera_index: int | None = None  # training camera last jumped to
     moving: tuple[Move, Scene] | None = None  # what a gizmo that is held does, and what is seen of it
     record: Recording = field(default_factory=Recording)
@@ -243,45 +272,61 @@ class SceneState:
     evidence: tuple[str, Array] | None = None  # a phrase, and what its answer stands on: (H, W, 3) uint8
     suggestions: Suggestions = field(default_factory=Suggestions)
     offered: tuple[str, tuple[str, tuple[str, ...]]] = ("", ("", ()))  # what was typed, and its offers
-    suggestions_of: Scene | None = None  # the scene for which they were looked for
-    pivot: tuple[Scene, Array, Array] | None = None  # of what is selected in which scene, a point (3,)
-    out_of_sight: tuple[OutlineView, Marks, Array] | None = None  # nodes with nothing shown, of which
-    _masks: tuple[Marked, Marks] | None = None  # what the session last marked, and its masks
+    suggestions_of: QueryEngine | None = None  # of the scene that they were looked for in
+    middle: Callable[[Scene, Marks], Array | None] = field(default_factory=lambda: last(middle_of_selected))
+    masks_of: Callable[[Marked, int], Marks] = field(default_factory=lambda: last(Marked.masks))
     _edited: EditedScene | None = None  # of the last request
 
-    def visit(self) -> "SceneState":
-        """Return the state that is kept of a scene that is left, without large arrays."""
-        files = ("saved", "project", "project_digest", "count", "origin")
-        names = ("session", *files, "path", "view", "opening_camera", "camera_index")
-        return SceneState(**{name: getattr(self, name) for name in names})
+    def visit(self, seen: OpenScene) -> Visit:
+        """Return what is kept of the open scene."""
+        stand = seen.path, seen.view, seen.opening_camera, self.camera_index
+        return Visit(*stand, self.count, self.origin, self.session, self.saved)
+
+    def look(self, view: OrbitCamera) -> None:
+        """Set the view of the open scene."""
+        if self.open is not None:
+            self.open = replace(self.open, view=view)
+
+    @property
+    def path(self) -> Path | None:
+        """File of the open scene."""
+        return None if self.open is None else self.open.path
+
+    @property
+    def count(self) -> int:
+        """Gaussians of the open scene, 0 without one."""
+        return 0 if self.open is None else len(self.open.scene.gaussians)
+
+    @property
+    def origin(self) -> Array:
+        """(3,) of the open scene."""
+        return NO_ORIGIN if self.open is None else self.open.scene.origin
 
     @property
     def marks(self) -> Marks:
         """What the session marks, as masks: the same objects for the same marks."""
-        before, masks = self._masks or (Marked(), unmarked(self.count))
-        self._masks = self.session.marks, self.session.marks.masks(before, masks)
-        return self._masks[1]
+        return self.masks_of(self.session.marks, self.count)
 
     @property
     def has_field(self) -> bool:
         """True where a scene with a language field is open."""
-        return self.scene is not None and self.scene.language is not None
+        return self.open is not None and self.open.scene.language is not None
+
+    @property
+    def why_no_field(self) -> str:
+        """Why the open scene cannot be searched; "" where it can, and without one."""
+        return "" if self.open is None or self.has_field else no_field(self.open.scene)
 
     @property
     def is_unsaved(self) -> bool:
         """True where something was deleted or transformed since the scene was opened or saved."""
-        deleted, saved = self.session.marks.deleted, self.saved
+        deleted, saved = self.session.marks.deleted, self.saved.session
         return self.session.moves != saved.moves or (deleted is not None and deleted != saved.marks.deleted)
-
-    @property
-    def has_unsaved_notes(self) -> bool:
-        """True where no project has the names, notes, bookmarks and keyframes that there are."""
-        return any(getattr(self.session, name) != getattr(self.saved, name) for name in OF_PROJECT)
 
     @property
     def is_changed(self) -> bool:
         """True where something of the scene would be lost if the window closed."""
-        return self.is_unsaved or self.has_unsaved_notes
+        return self.is_unsaved or self.saved.lacks_notes(self.session)
 
 
 @dataclass(eq=False)
@@ -363,14 +408,13 @@ class ViewerState(SceneState):
 
     def request(self, size: tuple[int, int] | None = None, transparent: bool = False) -> RenderRequest:
         """Return the image that the scene's area shows, or the same of another (width, height) in pixels."""
-        assert self.scene is not None
-        assert self.view is not None
+        assert self.open is not None
         session, size = self.session, size or self.size
-        seen = self.scene if self.moving is None else self.moving[1]
-        self._edited = edited_scene(seen, self.marks, self._edited)
+        scene = self.open.scene if self.moving is None else self.moving[1]
+        self._edited = edited_scene(scene, self.marks, self._edited)
         return RenderRequest(
             self._edited,
-            self.view.camera(*session.split.pane_size(size)),
+            self.open.view.camera(*session.split.pane_size(size)),
             size[0],
             replace(session.picture, transparent=transparent),
             session.latent_level,

@@ -7,14 +7,15 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import wraps
 from pathlib import Path
-from typing import IO, Any, Protocol, TypeVar
+from typing import IO, Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError, printable_line
 from langsplat_core.progress import AS_LINES, Progress, Report, TimeLeft
 from langsplat_core.query.describe import Describer
-from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
+from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import LanguageField, Scene
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_core.semantics.weights import local_path
@@ -22,7 +23,7 @@ from langsplat_viewer.disk import Stamps, Watch
 from langsplat_viewer.jobs import Job, Worker, one_line
 from langsplat_viewer.rendering.request import RenderRequest
 from langsplat_viewer.session import Point, Session, point_of
-from langsplat_viewer.state import SceneState, TrainingForm, ViewerState
+from langsplat_viewer.state import OpenScene, TrainingForm, ViewerState, Visit
 
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
 KEPT = 20  # lines of what it says that are kept
@@ -191,7 +192,7 @@ class Viewer:
     worker: Worker = field(default_factory=Worker)
     recorder: Worker = field(default_factory=Worker)  # films: minutes, while one looks and searches on
     watch: Watch = field(default_factory=Watch)  # over the files of the scene shown
-    visits: dict[Path, SceneState] = field(default_factory=dict)  # of scenes that were left, see `visit`
+    visits: dict[Path, Visit] = field(default_factory=dict)  # of scenes that were left
     folder: Path | None = None  # of the preferences; None: nothing is remembered
     history: History = field(default_factory=History)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
@@ -243,41 +244,35 @@ class Viewer:
         failed: Callable[[str], None] | None = None,
     ) -> None:
         """Have the worker do `work` with the engine; what comes of it is dropped with the scene."""
-        engine, scene = self.engine, self.state.scene
+        engine = self.engine
 
         def here(then: Callable[[Any], None]) -> Callable[[Any], None]:
-            return lambda found: then(found) if self.state.scene is scene else None
+            return lambda found: then(found) if self.engine is engine else None
 
         if engine is not None:
             report = here(failed) if failed else self.say_error
             self.run(label, lambda progress: work(engine, progress), here(done), report)
 
-    def unsaved(self) -> list[SceneState]:
+    def unsaved(self) -> list[Visit]:
         """Return the scenes, the one shown first, with notes that no project holds."""
-        here = None if self.state.path is None else self.state.path.absolute()
-        left = (visit for path, visit in self.visits.items() if path != here)
-        return [state for state in (self.state, *left) if state.has_unsaved_notes]
-
-    def has_scene(self, then: str) -> bool:
-        """Return whether a scene is open; say that it is opened first where none is."""
-        if self.state.scene is None:
-            self.say_error(f"open a scene first, then {then}")
-        return self.state.scene is not None
+        seen = self.state.open
+        shown = {} if seen is None else {seen.path.absolute(): self.state.visit(seen)}
+        scenes = {**shown, **self.visits, **shown}  # first and current
+        return [visit for visit in scenes.values() if visit.saved.lacks_notes(visit.session)]
 
     def searchable(self) -> QueryEngine | None:
         """Return the engine of a scene that can be searched; where there is none say why."""
-        scene = self.state.scene
-        if self.has_scene("search it") and scene is not None and scene.language is None:
-            self.say_error(no_field(scene))
+        reason = self.state.why_no_field if self.state.open else "open a scene first, then search it"
+        if reason:
+            self.say_error(reason)
         return self.engine if self.state.has_field else None
 
     @property
     def language(self) -> LanguageField | None:
         """The language field of the scene shown, with what was taught since."""
-        field = None if self.state.scene is None else self.state.scene.language
-        if field is None or self.engine is None:
-            return field
-        return replace(field, taught=tuple(self.engine.taught.values()))
+        if self.engine is None or self.engine.scene.language is None:
+            return None
+        return replace(self.engine.scene.language, taught=tuple(self.engine.taught.values()))
 
     @property
     def has_percentages(self) -> bool:
@@ -300,7 +295,7 @@ class Viewer:
     @property
     def encoder_id(self) -> str:
         """The text encoder of the scene shown, "" without one."""
-        field = None if self.state.scene is None else self.state.scene.language
+        field = None if self.state.open is None else self.state.open.scene.language
         return "" if field is None else self.services.encoder_id or field.encoder_id
 
     @property
@@ -326,3 +321,28 @@ class Viewer:
 
     def say_error(self, reason: str) -> None:
         self.state.say(reason, is_error=True)
+
+
+P = ParamSpec("P")
+SceneAction = Callable[Concatenate[Viewer, OpenScene, P], T]
+
+
+def needs_scene(then: str = "") -> Callable[[SceneAction[P, T]], Callable[Concatenate[Viewer, P], T | None]]:
+    """Decorate an action that takes the open scene after the viewer: where none is open it is not done.
+
+    then: what is not done, to be said in that case: "save a picture of it".
+    """
+
+    def decorated(act: SceneAction[P, T]) -> Callable[Concatenate[Viewer, P], T | None]:
+        @wraps(act)
+        def do(viewer: Viewer, *arguments: P.args, **options: P.kwargs) -> T | None:
+            seen = viewer.state.open
+            if seen is not None:
+                return act(viewer, seen, *arguments, **options)
+            if then:
+                viewer.say_error(f"open a scene first, then {then}")
+            return None
+
+        return do
+
+    return decorated

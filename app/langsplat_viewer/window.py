@@ -279,9 +279,9 @@ class Window:
     def _first_view(self, viewer: Viewer) -> None:
         """Apply what else the command line sets, such as camera and queries, once its scene is open."""
         state, options = viewer.state, self._options
-        assert state.scene is not None
+        assert state.open is not None
         try:
-            if (camera := chosen_camera(options.camera, state.scene)) is not None:
+            if (camera := chosen_camera(options.camera, state.open.scene)) is not None:
                 viewpoint.open_at(viewer, camera)
         except InputError as error:
             viewer.say_error(str(error))
@@ -340,7 +340,7 @@ class Window:
         viewer, state = self.viewer, self.viewer.state
         idling = hello_imgui.get_runner_params().fps_idling
         news = (viewer.worker.delivered, viewer.recorder.delivered)
-        seen = (state.view, state.nothing, state.hover, state.leaving, state.may_close)
+        seen = (state.open, state.nothing, state.hover, state.leaving, state.may_close)
         now = (news, seen, self.unfinished, viewer.watch.changed)
         heard = len(imgui.get_current_context().input_events_trail) > 0  # in this frame, however slow it is
         self._frames = AWAKE_FRAMES if heard or now != self._last else max(self._frames - 1, 0)
@@ -429,7 +429,7 @@ class Window:
         self.files.close()
         saving.finish_writing(self.viewer)
         self._workspace.update()
-        self._keep_thumbnail((self.viewer.state.path, self.viewer.state.project))
+        self._keep_thumbnail((self.viewer.state.path, self.viewer.state.saved.project))
         self.viewer.watch.close()
         for canvas in self._canvases:
             canvas.close()

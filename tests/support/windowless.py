@@ -15,11 +15,11 @@ from langsplat_viewer.actions import editing, opening, queries, settings, viewpo
 from langsplat_viewer.camera.controls import extent_of, from_camera, orbit
 from langsplat_viewer.camera.flight import Flight, Keyframe, pose_of
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.marks import Marks, unmarked
+from langsplat_viewer.marks import unmarked
 from langsplat_viewer.rendering.renderer import Backend, open_renderer
 from langsplat_viewer.rendering.request import Clip, RenderRequest, Splats
 from langsplat_viewer.session import Marked
-from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
+from langsplat_viewer.state import GLIDE_SECONDS, OpenScene, ViewerState
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene
 
@@ -207,14 +207,20 @@ def blob(word: str) -> np.ndarray:
     return np.repeat([word == other for other in WORDS], PER_BLOB)
 
 
-def marks_of(viewer: Viewer) -> Marks:
-    return viewer.state.marks
+def means(viewer: Viewer) -> np.ndarray:
+    return viewer.state.open.scene.gaussians.means
+
+
+def put_scene(viewer: Viewer, scene: Scene) -> None:
+    """Show another scene from where one is seen, if one is."""
+    seen = viewer.state.open or OpenScene(Path("a.ply"), scene, scene, None, None)
+    viewer.state.open = replace(seen, scene=scene)
 
 
 def put_marks(viewer: Viewer, **masks: np.ndarray) -> None:
     """Mark nothing but the (N,) `selected`, `hidden` and `deleted` that are given."""
     nothing = unmarked(viewer.state.count)
-    viewer.put(marks=Marked().of(replace(nothing, **masks), nothing))
+    viewer.put(marks=Marked().of(replace(nothing, **masks)))
 
 
 def names(rows: np.ndarray) -> str:
@@ -227,7 +233,7 @@ def names(rows: np.ndarray) -> str:
 
 def marked(viewer: Viewer) -> tuple[str, str, str]:
     """Selected, hidden, deleted."""
-    marks = marks_of(viewer)
+    marks = viewer.state.marks
     return names(marks.selected), names(marks.hidden), names(marks.deleted)
 
 

@@ -73,7 +73,7 @@ class Rider:
         viewer, now = self.window.viewer, time.monotonic()
         self._framed = now
         state = viewer.state
-        if state.scene is None or viewer.worker.current is not None or state.stats.width == 0:
+        if state.open is None or viewer.worker.current is not None or state.stats.width == 0:
             self._waited = now
         elif now - self._waited < self.seconds and not self._pictures:
             return  # while the scene is merged
@@ -144,7 +144,7 @@ def ride(
     params.fps_idling.vsync_to_monitor = False
     immapp.run(params)
     state = window.viewer.state
-    rider.seen.gaussians, rider.seen.backend = len(state.scene.gaussians), state.backend
+    rider.seen.gaussians, rider.seen.backend = len(state.open.scene.gaussians), state.backend
     return rider.seen
 
 
@@ -188,7 +188,7 @@ def idle(path: Path) -> None:
         time.sleep(1.5 * AWAKE_SECONDS * is_slow)
 
     def measure() -> None:
-        while window.viewer.state.scene is None or window.viewer.worker.current is not None:
+        while window.viewer.state.open is None or window.viewer.worker.current is not None:
             time.sleep(0.05)
         nonlocal is_slow
         count = -1
@@ -238,13 +238,13 @@ def press(window: Window, *keys: str) -> Iterator[None]:
 def typing(window: Window) -> Iterator[None]:
     """However slow the frames, each key does what it did in its own moment."""
     state = window.viewer.state
-    while state.scene is None or window.viewer.worker.current is not None:
+    while state.open is None or window.viewer.worker.current is not None:
         yield
     while not state.suggestions.phrases:
         yield
-    before = state.view
+    before = state.open.view
     yield from press(window, "Ctrl+F", *"hamburger")
-    assert (state.drafts["##phrase"], state.view is before) == ("hamburger", True)
+    assert (state.drafts["##phrase"], state.open.view is before) == ("hamburger", True)
     yield from press(window, "escape", "Ctrl+A", "h")  # keys of the scene again
     assert state.marks.hidden.all()
     held = (imgui.Key.u, "u"), (imgui.Key.slash, "/"), (imgui.Key.h, "h")  # all at once

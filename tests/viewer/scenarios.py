@@ -38,7 +38,7 @@ def split_the_view(s: Any) -> None:
     rgb = s.shot("rgb")
     s.key("V")
     assert s.state.session.split.mode == "wipe"
-    both, area, before = s.shot("both"), scene_area(), s.state.view
+    both, area, before = s.shot("both"), scene_area(), s.state.open.view
     np.testing.assert_allclose(s.at(both, MUG), s.at(rgb, MUG), atol=2)
     assert np.abs(s.at(both, PLANT) - s.at(rgb, PLANT)).max() > 40  # depth
 
@@ -46,12 +46,12 @@ def split_the_view(s: Any) -> None:
     drawn = s.drawn
     s.drag((middle, y), (area.left + 0.9 * area.width, y))
     assert abs(s.state.session.split.at - 0.9) < 0.02
-    assert s.state.view is before
+    assert s.state.open.view is before
     assert s.drawn == drawn
     np.testing.assert_allclose(s.at(s.shot("wiped"), PLANT), s.at(rgb, PLANT), atol=2)
 
     s.drag((middle, y), (middle + 40, y))  # beside the line the camera turns as ever
-    assert s.state.view is not before
+    assert s.state.open.view is not before
     s.open_panel("Search")
     s.menu("View", "Three levels side by side")
     assert not s.ctx.item_exists("//**/##phrase")  # the search would cover two of them
@@ -69,30 +69,30 @@ def draw_over_the_scene(s: Any) -> None:
     right = int(area.left + area.width)
     assert (s.shot("axes") != plain)[int(area.top) : int(area.top) + 75, right - 75 : right].any()
     s.menu("View", "Show or hide the training cameras")
-    forward = from_side(s.state.view, "top").rotation[2]
+    forward = from_side(s.state.open.view, "top").rotation[2]
     s.key("keypad7")
-    np.testing.assert_allclose(s.state.view.rotation[2], forward, atol=1e-6)
+    np.testing.assert_allclose(s.state.open.view.rotation[2], forward, atol=1e-6)
 
     turn_the_wheel(s, 8)  # until all cameras are in the picture
-    camera = s.state.scene.cameras[2]
+    camera = s.state.open.scene.cameras[2]
     seen = s.shot("cameras")
     s.menu("View", "Show or hide the training cameras")
     assert np.abs(seen - s.shot("none"))[:, int(area.left) :].max() > 60
     s.menu("View", "Show or hide the training cameras")
     s.click_at(s.on_screen(camera.position))
     assert s.state.camera_index == 2
-    got = s.state.view.camera(160, 120).world_to_camera
+    got = s.state.open.view.camera(160, 120).world_to_camera
     np.testing.assert_allclose(got, camera.world_to_camera, atol=1e-9)
 
     s.key("M", frames=2)
-    turned = s.state.view
+    turned = s.state.open.view
     for thing in (MUG, BOOK):
         s.click_at(s.on_screen(thing))
-    assert s.state.view is turned
+    assert s.state.open.view is turned
     assert abs(s.state.session.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
     s.ctx.mouse_double_click(0)  # two points in quick succession; elsewhere it would move the view
     s.settle()
-    assert s.state.view is turned
+    assert s.state.open.view is turned
     assert s.state.session.ruler.length is not None
     assert s.state.session.ruler.length < 0.05
     s.draws_nothing()
@@ -190,12 +190,12 @@ def move_aside_for_what_is_covered(s: Any) -> None:
     for _ in range(3):
         by = panel.pos + panel.size / 2 - ImVec2(*s.on_screen(BOOK))
         viewpoint.move(s.viewer, lambda view, by=by: pan(view, by.x, by.y, s.state.size))
-    below = s.state.view
+    below = s.state.open.view
     s.search("book", stay=True)
     assert s.on_screen(BOOK)[0] > panel.pos.x + panel.size.x
     viewpoint.move(s.viewer, lambda view: below)
     s.rest(20)
-    assert s.state.view is below
+    assert s.state.open.view is below
 
 
 def turn_the_wheel(s: Any, times: int) -> None:
@@ -210,14 +210,14 @@ def turn_the_wheel(s: Any, times: int) -> None:
 
 def look_without_perspective(s: Any) -> None:
     """A key takes perspective away until it is pressed again; the picture says what it is."""
-    view = s.state.view
+    view = s.state.open.view
     s.key("O")
-    assert s.state.view.orthographic
+    assert s.state.open.view.orthographic
     flat, area = s.shot("flat"), scene_area()
     corner = (slice(int(area.top + area.height) - 40, None), slice(int(area.left), int(area.left) + 200))
     assert (flat[corner].min(-1) > 200).sum() > 100  # words
     s.key("keypad5")
-    poses = [one.camera(160, 120).world_to_camera for one in (s.state.view, view)]
+    poses = [one.camera(160, 120).world_to_camera for one in (s.state.open.view, view)]
     np.testing.assert_allclose(*poses, atol=1e-9)
 
 
@@ -227,7 +227,7 @@ def look_without_perspective(s: Any) -> None:
 def around(s: Any, centre: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
     """Two corners around a blob, as it is seen now."""
     x, y = s.on_screen(centre)
-    right, _ = s.on_screen(centre + 0.6 * s.state.view.rotation[0])
+    right, _ = s.on_screen(centre + 0.6 * s.state.open.view.rotation[0])
     half = right - x
     return (x - half, y - half), (x + half, y + half)
 
@@ -247,9 +247,9 @@ def select_with_the_mouse(s: Any) -> None:
     seen = s.state.marks.selected
     assert 10 < seen.sum() < 110  # the front of it
     s.click("//**/Only what is visible")
-    before = s.state.view
+    before = s.state.open.view
     s.drag(*around(s, PLANT))
-    assert s.state.view is before  # the drag turned nothing
+    assert s.state.open.view is before  # the drag turned nothing
     assert marked(s.viewer) == ("plant", "", "")
     chosen = s.shot("chosen")
     assert looks_selected(s.at(chosen, PLANT))
@@ -265,7 +265,7 @@ def select_with_the_mouse(s: Any) -> None:
     s.key("escape", frames=3)
     assert s.state.tools.tool is None
     s.drag((600, 300), (656, 279))
-    assert not np.array_equal(before.rotation, s.state.view.rotation)  # the drag turns again
+    assert not np.array_equal(before.rotation, s.state.open.view.rotation)  # the drag turns again
 
 
 def outline_and_rest(s: Any) -> None:
@@ -315,15 +315,15 @@ def ask_before_leaving(s: Any) -> None:
 
 def drag_the_gizmo(s: Any) -> None:
     """What was found is moved by the gizmo's middle; the camera stays."""
-    viewer, before = s.viewer, s.state.scene.gaussians.means.copy()
+    viewer, before = s.viewer, s.state.open.scene.gaussians.means.copy()
     s.search("mug")
     editing.select_query(viewer)
     settings.set_display(viewer, "rgb")
     s.key("R")  # from where the view has moved aside
     s.open_panel("Transform", frames=1)
     s.key("G")
-    view, chosen = s.state.view, s.state.marks.selected
-    x, y = s.on_screen(editing.pivot(viewer))
+    view, chosen = s.state.open.view, s.state.marks.selected
+    x, y = s.on_screen(editing.pivot(viewer, s.state.open))
     s.ctx.mouse_teleport_to_pos((x, y))
     for covered in (True, False):  # by a window over the scene, whose mouse it leaves alone
         viewer.state.show_help = covered
@@ -332,11 +332,11 @@ def drag_the_gizmo(s: Any) -> None:
     with s.dragging((x, y), (x + 60, y - 120)):
         assert s.state.moving is not None
     s.settle()
-    assert s.state.view is view
-    moved = s.state.scene.gaussians.means - before
+    assert s.state.open.view is view
+    moved = s.state.open.scene.gaussians.means - before
     assert (moved[~chosen] == 0).all()
     assert np.ptp(moved[chosen], axis=0).max() < 1e-5
-    went = s.on_screen(editing.pivot(viewer))
+    went = s.on_screen(editing.pivot(viewer, s.state.open))
     np.testing.assert_allclose(went, (x + 60, y - 120), atol=3)
 
 
@@ -344,7 +344,7 @@ def drag_the_crop_box(s: Any) -> None:
     """A corner of the box is dragged, and what lies outside is cropped."""
     s.open_panel("Transform", frames=1)
     s.click("//**/Box##gizmo", frames=2)  # around everything, as nothing is selected
-    form, means = s.state.edit_form, s.state.scene.gaussians.means
+    form, means = s.state.edit_form, s.state.open.scene.gaussians.means
     middle = np.mean([form.low, form.high], 0)
     start, end = np.array(s.on_screen(np.r_[form.low[:2], middle[2]])), np.array(s.on_screen(middle))
     s.drag(tuple(start), tuple(start + 0.8 * (end - start)))
@@ -370,7 +370,7 @@ def use_the_mouse_alone(s: Any) -> None:
     s.drag((x, y), (x + 60, y))
     assert s.state.edit_form.scale > 1.05
     s.drag((x - 30, y - 60), (x + 30, y - 60))  # the first number of "Move"
-    assert 0.01 < s.state.edit_form.move[0] / s.state.extent.radius < 0.1
+    assert 0.01 < s.state.edit_form.move[0] / s.state.open.extent.radius < 0.1
     stops, out, done = Event(), s.folder / "trained.ply", {f"stage {n}": 1.0 for n in range(200)}
     said, by = SimpleNamespace(stages=done, left="", curves={}, said=[]), stops.set
     training = SimpleNamespace(
@@ -514,13 +514,13 @@ def export_from_the_menu(s: Any) -> None:
 
 def reload_what_changed(s: Any) -> None:
     """A bar appears by itself, its button reads the file again."""
-    before = s.state.scene
+    before = s.state.open.scene
     assert not s.ctx.item_exists("//changed/Reload")
     scene = replace(blob_scene(), path=None)
     save_scene(s.state.path, replace(scene, gaussians=replace(scene.gaussians, sh=-scene.gaussians.sh)))
     s.until(lambda: s.viewer.watch.changed)
     s.ctx.item_click("//changed/Reload")
-    s.until(lambda: s.state.scene is not before)
+    s.until(lambda: s.state.open.scene is not before)
     assert not s.ctx.item_exists("//changed/Reload")
 
 
@@ -678,11 +678,11 @@ def record_and_play(s: Any) -> None:
         s.drag((600, 300), end)
     s.click("//Timeline/Add keyframe", frames=2)
     assert [key.seconds for key in s.state.session.keyframes] == [0, 2, 4]
-    last = s.state.view
+    last = s.state.open.view
     viewpoint.set_path_seconds(s.viewer, 1.0)
     s.ctx.item_click("//Timeline/Play##path")
     s.wait(lambda: record.began is None)
-    np.testing.assert_allclose(s.state.view.eye, last.eye, atol=1e-6)
+    np.testing.assert_allclose(s.state.open.view.eye, last.eye, atol=1e-6)
     viewpoint.set_path_seconds(s.viewer, 60.0)  # longer than a frame may take
     s.key("Shift+K", frames=1)  # from the start again
     s.wait(lambda: 0 < record.at < 59.0)
@@ -695,16 +695,16 @@ def record_and_play(s: Any) -> None:
 
 def use_shortcuts(s: Any) -> None:
     """Chords work everywhere, letters only by themselves and never while typing."""
-    before = s.state.view
+    before = s.state.open.view
     for key in "RPD2E":
         s.key(f"Ctrl+{key}", frames=3)
-    assert s.state.view is before
+    assert s.state.open.view is before
     assert s.state.session.picture.display == "rgb"
     assert not list(s.folder.glob("blobs-*.png"))
 
     s.key("Ctrl+F", frames=3)
     s.type("far", frames=3)
-    assert (s.state.drafts["##phrase"], s.state.view is before) == ("far", True)
+    assert (s.state.drafts["##phrase"], s.state.open.view is before) == ("far", True)
     s.key("f1", frames=2)  # also while typing
     assert s.state.show_help
     s.key("f1", frames=1)
@@ -712,10 +712,10 @@ def use_shortcuts(s: Any) -> None:
     assert not imgui.get_io().want_text_input
     assert not s.state.show_help
     s.key("Shift+F")
-    assert s.state.view is not before
+    assert s.state.open.view is not before
     s.key("home")
-    first = s.state.scene.cameras[0].world_to_camera
-    np.testing.assert_allclose(s.state.view.camera(160, 120).world_to_camera, first, atol=1e-9)
+    first = s.state.open.scene.cameras[0].world_to_camera
+    np.testing.assert_allclose(s.state.open.view.camera(160, 120).world_to_camera, first, atol=1e-9)
 
     s.type("?")
     assert s.state.show_help
@@ -915,9 +915,9 @@ def click_with_a_key(s: Any) -> None:
     assert note.text == "a fern", note.text
     assert np.linalg.norm(note.at - PLANT) < 0.5
     s.key("escape", frames=2)
-    before = s.state.view
+    before = s.state.open.view
     s.key("X")
-    assert s.state.view.distance < before.distance  # the surface, not the middle of the plant
+    assert s.state.open.view.distance < before.distance  # the surface, not the middle of the plant
     editing.use_tool(s.viewer, "thing")
     s.key("X")
     assert marked(s.viewer)[0] == "plant"
@@ -926,14 +926,14 @@ def click_with_a_key(s: Any) -> None:
 
 def turn_with_keys(s: Any) -> None:
     """The keypad turns around the centre and goes nearer; the line of a comparison is moved by a number."""
-    before = s.state.view
+    before = s.state.open.view
     for key in (imgui.Key.keypad6, imgui.Key.keypad_add):
         s.ctx.key_down(key)
         s.ctx.yield_(8)
         s.ctx.key_up(key)
-    np.testing.assert_allclose(s.state.view.target, before.target)
-    assert s.state.view.distance < before.distance
-    assert s.state.view.rotation[2] @ before.rotation[2] < 0.9999
+    np.testing.assert_allclose(s.state.open.view.target, before.target)
+    assert s.state.open.view.distance < before.distance
+    assert s.state.open.view.rotation[2] @ before.rotation[2] < 0.9999
     s.key("V")
     s.open_panel("Display")
     s.ctx.item_input_value("//**/Line", 0.25)

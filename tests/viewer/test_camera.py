@@ -164,17 +164,17 @@ def share(sample: controls.Sample, camera: Camera) -> float:
 
 def share_seen(viewer: Viewer, size: tuple[int, int]) -> float:
     """Of the scene, in a window of that size."""
-    return share(viewer.state.extent.sample, viewer.state.view.camera(*size))
+    return share(viewer.state.open.extent.sample, viewer.state.open.view.camera(*size))
 
 
 @pytest.mark.parametrize("frame", [viewpoint.frame_scene, viewpoint.focus_result])  # without a result
 @pytest.mark.parametrize("size", [(160, 120), (400, 100), (90, 300)])
 def test_everything_is_framed_in_a_window_of_any_shape(opened, size, frame):
     settings.resize(opened, *size)
-    forward = opened.state.view.rotation[2]
+    forward = opened.state.open.view.rotation[2]
     viewpoint.move(opened, lambda view: controls.focus(view, np.array([4.0, 1.0, 2.0]), 0.3))
     go(frame, opened)
-    assert_allclose(opened.state.view.rotation[2], forward, atol=1e-9)
+    assert_allclose(opened.state.open.view.rotation[2], forward, atol=1e-9)
     assert share_seen(opened, size) >= 0.99
     viewpoint.move(opened, lambda view: controls.focus(view, view.target, 0.8 * view.distance))
     assert share_seen(opened, size) < 0.99
@@ -182,26 +182,26 @@ def test_everything_is_framed_in_a_window_of_any_shape(opened, size, frame):
 
 def test_training_cameras_wrap_round(opened):
     go(viewpoint.step_camera, opened, -1)
-    last = opened.state.scene.cameras[-1]
+    last = opened.state.open.scene.cameras[-1]
     assert opened.state.camera_index == 2
-    assert_allclose(opened.state.view.camera(160, 120).world_to_camera, last.world_to_camera, atol=1e-9)
+    assert_allclose(opened.state.open.view.camera(160, 120).world_to_camera, last.world_to_camera, atol=1e-9)
     viewpoint.step_camera(opened, 1)
     assert opened.state.camera_index == 0
 
 
 def test_double_click_turns_around_the_surface(opened):
     go(viewpoint.focus_pixel, opened, 0.75, 0.5)
-    assert_allclose(opened.state.view.target, (0.25, 0.0, 0.0))
+    assert_allclose(opened.state.open.view.target, (0.25, 0.0, 0.0))
 
 
 def test_the_hand_stops_a_glide(opened):
     viewpoint.reset_view(opened)
     viewpoint.tick(opened, opened.clock + 0.3 * GLIDE_SECONDS)
-    here = opened.state.view
+    here = opened.state.open.view
     viewpoint.move(opened, lambda view: view)
     assert opened.state.glide is None
     viewpoint.tick(opened, opened.clock + 9)
-    assert opened.state.view is here
+    assert opened.state.open.view is here
 
 
 @pytest.mark.parametrize(
@@ -216,12 +216,12 @@ def test_scene_without_cameras_opens_with_all_in_view(viewer, size, orthographic
         viewpoint.toggle_orthographic(viewer)
     viewpoint.zoom_by(viewer, 0.1)
     go(viewpoint.reset_view, viewer)
-    assert viewer.state.view.orthographic == orthographic
+    assert viewer.state.open.view.orthographic == orthographic
     assert share_seen(viewer, size[::-1]) >= (0.98 if orthographic else 0.99)
 
 
 def test_reset_returns_to_the_opening_view(opened):
-    cameras = opened.state.scene.cameras
+    cameras = opened.state.open.scene.cameras
     for index, camera in ((0, cameras[0]), (2, cameras[2])):
         if index:
             viewpoint.open_at(opened, camera.resized(40, 30))  # as --camera asks for it
@@ -229,18 +229,19 @@ def test_reset_returns_to_the_opening_view(opened):
         viewpoint.go_to_camera(opened, 1)
         viewpoint.zoom_by(opened, 0.3)
         go(viewpoint.reset_view, opened)
-        assert_allclose(opened.state.view.camera(160, 120).world_to_camera, camera.world_to_camera, atol=1e-9)
+        seen = opened.state.open.view.camera(160, 120)
+        assert_allclose(seen.world_to_camera, camera.world_to_camera, atol=1e-9)
 
 
 def test_zooming_out_ends_while_the_scene_is_still_seen(opened):
     for _ in range(200):
         viewpoint.zoom_by(opened, 1 / 0.88)
-    view, extent = opened.state.view, opened.state.extent
+    view, extent = opened.state.open.view, opened.state.open.extent
     assert view.distance == pytest.approx(extent.farthest)
     pixels, _ = view.camera(1000, 1000).project(extent.sample.points)
     assert np.ptp(pixels, axis=0).max() > 30
     viewpoint.zoom_by(opened, 0.88)
-    assert opened.state.view.distance < extent.farthest
+    assert opened.state.open.view.distance < extent.farthest
 
 
 def test_focus_distance_follows_the_size_of_the_thing(opened):
@@ -251,16 +252,17 @@ def test_focus_distance_follows_the_size_of_the_thing(opened):
         smaller = replace(found, box=place + size * (box - place))
         opened.state.answers["mug"] = QueryAnswer(smaller)
         go(viewpoint.focus_result, opened)
-        distances.append(opened.state.view.distance)
+        distances.append(opened.state.open.view.distance)
     assert_allclose(distances, distances[0] * np.array([1, 0.1, 0.01]), rtol=1e-6)
-    assert_allclose(opened.state.view.target, place)
-    pixels, _ = opened.state.view.camera(100, 100).project(smaller.box)
+    assert_allclose(opened.state.open.view.target, place)
+    pixels, _ = opened.state.open.view.camera(100, 100).project(smaller.box)
     assert 10 < np.ptp(pixels, axis=0).max() < 100
     huge = replace(found, box=1e3 * np.array([[-1.0] * 3, [1.0] * 3]))
     opened.state.answers["mug"] = QueryAnswer(huge)
-    before = np.linalg.norm(opened.state.view.eye - place)
+    before = np.linalg.norm(opened.state.open.view.eye - place)
     go(viewpoint.focus_result, opened)
-    assert opened.state.view.distance <= max(before, opened.state.extent.radius * 5)  # stays in the room
+    room = max(before, opened.state.open.extent.radius * 5)
+    assert opened.state.open.view.distance <= room  # stays in it
 
 
 # Standing where everything is seen, and not farther.
@@ -326,7 +328,7 @@ def names(viewer) -> list[str]:
 
 def test_a_bookmark_leads_back_and_is_undone(opened):
     viewpoint.move(opened, lambda view: controls.orbit(view, 0.4, 0.1))
-    marked = opened.state.view
+    marked = opened.state.open.view
     viewpoint.add_bookmark(opened, "  the  mug ")
     assert opened.state.is_changed
     viewpoint.add_bookmark(opened)
@@ -337,9 +339,9 @@ def test_a_bookmark_leads_back_and_is_undone(opened):
     go(
         viewpoint.glide_to,
         opened,
-        viewpoint.bookmarked_view(opened.state.session.bookmarks[0], opened.state.extent),
+        viewpoint.bookmarked_view(opened.state.session.bookmarks[0], opened.state.open.extent),
     )
-    assert_same(opened.state.view, marked)
+    assert_same(opened.state.open.view, marked)
     open_scene(opened, "plain.ply")
     assert names(opened) == []
 
@@ -482,7 +484,7 @@ def flat(opened: Viewer) -> Viewer:
 )
 def test_moving_keeps_it(flat, move):
     ask(flat, "plant")
-    before = flat.state.view
+    before = flat.state.open.view
     go(move, flat)
-    assert flat.state.view is not before
-    assert flat.state.view.orthographic
+    assert flat.state.open.view is not before
+    assert flat.state.open.view.orthographic

@@ -30,7 +30,7 @@ from langsplat_viewer.canvas import (
 from langsplat_viewer.rendering.renderer import ArrayRenderer, renderer_for
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
-from tests.support.windowless import CHANGES, FakeRenderer, go, on_screen, put_marks, rest
+from tests.support.windowless import CHANGES, FakeRenderer, go, on_screen, put_marks, put_scene, rest
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def test_canvas_draws_each_edit_once_and_keeps_few_textures(gl, shown):
             canvas.update(shown.state, float(second))
         (request,) = renderer.drawn
         assert len(request.gaussians) == count
-    assert request.gaussians is shown.state.scene.gaussians  # the source itself again
+    assert request.gaussians is shown.state.open.scene.gaussians  # the source itself again
     renderer.nothing = True
     put_marks(shown, deleted=everything)
     canvas.update(shown.state, 9.0)
@@ -98,7 +98,7 @@ def test_point_at_is_the_surface_in_the_last_image(gl, shown):
     canvas = Canvas(gl, FakeRenderer())
     assert canvas.point_at(0.8, 0.5) is None  # nothing was drawn yet
     canvas.update(shown.state, 0.0)
-    pixels, depth = shown.state.view.camera(200, 120).project(canvas.point_at(0.8, 0.25)[None])
+    pixels, depth = shown.state.open.view.camera(200, 120).project(canvas.point_at(0.8, 0.25)[None])
     np.testing.assert_allclose(pixels[0], (160, 30))
     np.testing.assert_allclose(depth, 2.0)
     assert canvas.point_at(0.2, 0.25) is None
@@ -190,9 +190,9 @@ def test_merged_gaussians_are_drawn_while_a_large_scene_moves(merging, shown):
     now = moved_until_merged(canvas, renderer, shown)
     *others, request = renderer.drawn
     assert all(one.merged is None for one in others)
-    assert len(request.gaussians) < len(shown.state.scene.gaussians) == 360
+    assert len(request.gaussians) < len(shown.state.open.scene.gaussians) == 360
     assert sizes(renderer)[-1] == (100, 60)
-    away = np.linalg.norm(canvas.point_at(0.8, 0.5) - shown.state.view.camera(200, 120).position)
+    away = np.linalg.norm(canvas.point_at(0.8, 0.5) - shown.state.open.view.camera(200, 120).position)
     assert away > 2.9  # of the merged ones: they were drawn last
     assert not canvas.update(shown.state, now + 1.0)
     assert sizes(renderer) == [(200, 120)]  # at rest all of them again
@@ -289,7 +289,7 @@ STALE = {
     "undone camera": lambda v: (viewpoint.look_from(v, "left"), viewpoint.reset_view(v)),
     "deleted": lambda v: (editing.select_all(v), editing.delete_selected(v)),
     "undone": lambda v: (editing.select_all(v), editing.delete_selected(v), editing.undo(v)),
-    "scene": lambda v: setattr(v.state, "scene", replace(v.state.scene)),
+    "scene": lambda v: put_scene(v, replace(v.state.open.scene)),
 }
 
 
@@ -371,11 +371,11 @@ def test_the_other_thread_wakes_the_window(asked, begun, gated):
 
 
 def test_the_other_thread_lets_go_of_a_scene_that_was_left(asked, canvas, gated):
-    asked.state.scene = replace(asked.state.scene)
-    left = weakref.ref(asked.state.scene)
+    put_scene(asked, replace(asked.state.open.scene))
+    left = weakref.ref(asked.state.open.scene)
     canvas.update(asked.state, 0.0)
     until(lambda: len(gated.threads) == 1)
-    asked.state.scene = replace(asked.state.scene)
+    put_scene(asked, replace(asked.state.open.scene))
     gated.gate.set()
     rest(canvas, asked.state, 1.0)
     gc.collect()

@@ -13,7 +13,7 @@ import pytest
 from langsplat_core.cli.app import parse
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.scene import look_at
+from langsplat_core.scene import Scene, look_at
 from langsplat_core.scene.transform import AXES, IDENTITY, moving, rotating, scaling
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.actions.editing import take
@@ -21,7 +21,7 @@ from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
 from langsplat_viewer.projects import BUNDLED
 from langsplat_viewer.session import Move
-from langsplat_viewer.state import EditForm, ExportForm, QueryAnswer
+from langsplat_viewer.state import EditForm, ExportForm, QueryAnswer, Saved
 from tests.support.fakes import CENTRES, PER_BLOB
 from tests.support.windowless import (
     SCENES,
@@ -32,9 +32,10 @@ from tests.support.windowless import (
     blob,
     errors,
     marked,
-    marks_of,
+    means,
     open_scene,
     phrases,
+    put_scene,
     recorded,
     result,
     settle,
@@ -124,7 +125,7 @@ def test_answers_and_instances_are_selected(searched):
     assert marked(searched)[0] == "mug book"
     (thing,) = answer(searched, 0).things
     take(searched, np.isin(np.arange(360), thing.members))
-    np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), thing.members)
+    np.testing.assert_array_equal(np.flatnonzero(searched.state.marks.selected), thing.members)
     editing.select_none(searched)
     queries.remove(searched, "mug")
     absent = replace(result(searched), judgement=result(searched).judgement.absent)
@@ -138,25 +139,25 @@ def test_answers_and_instances_are_selected(searched):
 
 
 def test_growing_and_shrinking_follow_the_surface(opened):
-    means = opened.state.scene.gaussians.means
+    means = opened.state.open.scene.gaussians.means
     core = np.linalg.norm(means, axis=1) < 0.15
     take(opened, core)
     editing.set_tools(opened, reach=0.15)
     act(editing.grow_selection, opened)
-    grown = marks_of(opened).selected.copy()
+    grown = opened.state.marks.selected.copy()
     assert core.sum() < grown.sum()
     assert (grown >= core).all()
     assert not (grown & ~blob("book")).any()  # the others are not on its surface
     act(editing.shrink_selection, opened)
-    assert marks_of(opened).selected.sum() < grown.sum()
+    assert opened.state.marks.selected.sum() < grown.sum()
     editing.undo(opened)
-    assert (marks_of(opened).selected == grown).all()
+    assert (opened.state.marks.selected == grown).all()
 
 
 def test_late_result_of_another_scene_is_dropped(opened):
     take(opened, blob("mug"))
     editing.grow_selection(opened)
-    opened.state.scene = None  # another one is being shown
+    opened.engine = None  # another one is being shown
     settle(opened)
     assert marked(opened)[0] == "mug"
 
@@ -181,13 +182,13 @@ FRONT = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZ
 def front(opened):
     """From straight ahead, so that the blobs lie in a row: mug, book, plant from left to right."""
     settings.resize(opened, *SIZE)
-    viewpoint.move(opened, lambda view: from_camera(FRONT, opened.state.extent))
+    viewpoint.move(opened, lambda view: from_camera(FRONT, opened.state.open.extent))
     return opened
 
 
 def place(viewer, point) -> tuple[float, float]:
     """Of a world point, as fractions of the picture."""
-    (pixel,), _ = viewer.state.view.camera(*SIZE).project(np.asarray(point, float)[None])
+    (pixel,), _ = viewer.state.open.view.camera(*SIZE).project(np.asarray(point, float)[None])
     return pixel[0] / SIZE[0], pixel[1] / SIZE[1]
 
 
@@ -221,7 +222,7 @@ def test_stroke_selects_what_it_encloses(front):
     assert draw(front, "brush", [place(front, CENTRES[0]), place(front, CENTRES[1])]) == "mug book"
     editing.set_tools(front, brush=0.01)
     draw(front, "brush", [place(front, CENTRES[2])])
-    assert 0 < marks_of(front).selected.sum() < PER_BLOB
+    assert 0 < front.state.marks.selected.sum() < PER_BLOB
 
 
 @pytest.mark.parametrize("tool", ["sphere", "box"])
@@ -229,10 +230,11 @@ def test_sphere_and_box_are_as_large_as_the_drag(front, tool, monkeypatch):
     monkeypatch.setattr(FakeSurface, "point_at", lambda self, u, v: CENTRES[2])
     assert draw(front, tool, [place(front, CENTRES[2]), place(front, CENTRES[2] + [0.7, 0, 0])]) == "plant"
     draw(front, tool, [place(front, CENTRES[2])])  # a click
-    offsets = np.abs(front.state.scene.gaussians.means - CENTRES[2])
+    offsets = np.abs(front.state.open.scene.gaussians.means - CENTRES[2])
     far = np.linalg.norm(offsets, axis=1) if tool == "sphere" else offsets.max(1)
-    np.testing.assert_array_equal(marks_of(front).selected, far <= editing.reach(front))
-    assert marks_of(front).selected.any()
+    reach = front.state.tools.reach * front.state.open.extent.radius
+    np.testing.assert_array_equal(front.state.marks.selected, far <= reach)
+    assert front.state.marks.selected.any()
 
 
 @pytest.mark.parametrize("perspective", [True, False])
@@ -242,11 +244,11 @@ def test_stroke_leaves_out_occluded_gaussians(front, monkeypatch, perspective):
         viewpoint.toggle_orthographic(front)
     monkeypatch.setattr(FakeSurface, "depths", lambda self: np.full((30, 40), 4.95))
     draw(front, "rectangle", corners(front, CENTRES[1]))
-    z = front.state.scene.gaussians.means[:, 2]
-    in_front = marks_of(front).selected
+    z = front.state.open.scene.gaussians.means[:, 2]
+    in_front = front.state.marks.selected
     editing.set_tools(front, only_visible=False)
     assert draw(front, "rectangle", corners(front, CENTRES[1])) == "book"
-    np.testing.assert_array_equal(in_front, marks_of(front).selected & (z + 5 <= 4.95 * 1.03))
+    np.testing.assert_array_equal(in_front, front.state.marks.selected & (z + 5 <= 4.95 * 1.03))
     assert 20 < in_front.sum() < 100
 
 
@@ -260,7 +262,7 @@ def test_click_selects_the_thing_at_the_chosen_level(front, monkeypatch):
 def test_click_without_surface_or_field_says_why(front, monkeypatch):
     draw(front, "sphere", [(0.95, 0.5)])  # where the picture is empty
     assert "nothing under the cursor" in front.state.messages[-1].text
-    front.state.scene = type(front.state.scene)(front.state.scene.gaussians)
+    put_scene(front, Scene(front.state.open.scene.gaussians))
     draw(front, "thing", [(0.5, 0.5)])
     assert "language field" in errors(front)[-1]
     assert marked(front) == ("", "", "")
@@ -342,7 +344,7 @@ def test_export_size_is_said_before_it_is_written(viewer, tmp_path, suffix):
     viewer.services = replace(viewer.services, load_scene=load_scene)
     open_scene(viewer, BUNDLED)
     said, unit = saving.export_size(viewer, form_of(viewer, "scene", suffix=suffix)).split()[1:]
-    save_scene(tmp_path / f"a{suffix}", viewer.state.scene, tell=False)
+    save_scene(tmp_path / f"a{suffix}", viewer.state.open.scene, tell=False)
     written = sum(path.stat().st_size for path in tmp_path.iterdir())
     assert float(said) == pytest.approx(written / 1e6, rel=0.1)
     assert unit == "MB"
@@ -399,14 +401,11 @@ def test_failed_export_of_a_command_says_why(opened, tmp_path, monkeypatch):
     saving.run_export(opened, tmp_path / "a.ply", form_of(opened, "labels"))
     recorded(opened)
     assert errors(opened) == ["describe has no cameras; --encoder=my own"]
-    opened.state.path = tmp_path / "blobs.ply"
+    opened.state.open = replace(opened.state.open, path=tmp_path / "blobs.ply")
     opened.state.path.touch()
     saving.run_export(opened, opened.state.path, form_of(opened, "scene"))
     recorded(opened)
     assert "would replace the original scene" in errors(opened)[-1]
-    saving.run_export(opened, opened.state.path / "a.html", form_of(opened, "web page"))
-    recorded(opened)
-    assert errors(opened)[-1].endswith("is a file, not a folder; choose another name")
 
 
 def test_exported_selection_has_its_field(pruned, tmp_path):
@@ -507,49 +506,45 @@ def selected_mug(viewer) -> np.ndarray:
     return chosen
 
 
-def means(viewer) -> np.ndarray:
-    return viewer.state.scene.gaussians.means
-
-
 def test_transform_moves_only_the_selection(opened):
     chosen, before = selected_mug(opened), means(opened)
-    place, cameras = result(opened, 0).place, opened.state.scene.cameras
+    place, cameras = result(opened, 0).place, opened.state.open.scene.cameras
     act(editing.transform, opened, moving(STEP))
     np.testing.assert_allclose(means(opened)[chosen], before[chosen] + STEP, atol=1e-5)
     np.testing.assert_array_equal(means(opened)[~chosen], before[~chosen])
-    assert opened.state.scene.cameras is cameras
+    assert opened.state.open.scene.cameras is cameras
     np.testing.assert_allclose(result(opened, 0).place, place + STEP, atol=1e-4)
     np.testing.assert_array_equal(opened.state.marks.selected, chosen)
     act(editing.name_selection, opened, "trophy")  # what is taught goes along
     act(editing.transform, opened, moving(STEP))
     assert opened.engine.is_taught("trophy")
-    assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]
-    opened.state.saved = opened.state.session
+    assert [word.name for word in opened.state.open.scene.language.taught] == ["trophy"]
+    opened.state.saved = Saved(opened.state.session)
     open_scene(opened, "plain.ply")  # begins without transforms, and has no language field
-    assert (opened.state.session.moves, opened.state.opened) == ((), None)
+    assert (opened.state.session.moves, opened.state.open.in_file) == ((), opened.state.open.scene)
     before = means(opened)
     act(editing.transform, opened, moving(STEP))
     np.testing.assert_allclose(means(opened), before + STEP, atol=1e-5)
-    assert opened.state.scene.language is None
+    assert opened.state.open.scene.language is None
 
 
 def test_transform_of_the_scene_moves_its_cameras(opened):
-    up, before = opened.state.extent.up, means(opened)
-    eyes = [camera.position for camera in opened.state.scene.cameras]
+    up, before = opened.state.open.extent.up, means(opened)
+    eyes = [camera.position for camera in opened.state.open.scene.cameras]
     to = rotating(AXES["z"], 90).then(scaling(3)).then(moving(STEP))
     editing.transform(opened, to)
     np.testing.assert_allclose(means(opened), to.points(before), atol=1e-4)
-    moved = [camera.position for camera in opened.state.scene.cameras]
+    moved = [camera.position for camera in opened.state.open.scene.cameras]
     np.testing.assert_allclose(moved, to.points(np.array(eyes)), atol=1e-9)
-    np.testing.assert_allclose(opened.state.extent.up, to.rotation @ up, atol=1e-6)
+    np.testing.assert_allclose(opened.state.open.extent.up, to.rotation @ up, atol=1e-6)
 
 
 def test_a_session_that_leads_too_far_is_not_adopted(opened):
-    before, shown = opened.state.session, opened.state.scene
+    before, shown = opened.state.session, opened.state.open.scene
     far = replace(before, level="part", moves=(Move(scaling(1e9)), Move(scaling(1e9))))
     with pytest.raises(InputError):
         editing.adopt(opened, far)
-    assert (opened.state.session, opened.state.scene) == (before, shown)
+    assert (opened.state.session, opened.state.open.scene) == (before, shown)
 
 
 def test_transforms_are_undone_exactly(opened):
@@ -591,7 +586,7 @@ def test_held_gizmo_previews_the_transform(opened):
         editing.preview(opened, moving(np.array([1e39, 0, 0])))
     assert opened.state.request((32, 24)) == seen
     editing.transform(opened, IDENTITY)
-    assert opened.state.request((32, 24)).scene.source is opened.state.scene
+    assert opened.state.request((32, 24)).scene.source is opened.state.open.scene
 
 
 def test_transformed_scene_is_saved_as_seen(opened, tmp_path):
@@ -618,16 +613,16 @@ def test_cropping_keeps_earlier_deletions(opened):
 
 def test_panel_numbers_transform_about_the_middle(opened):
     """Scaled and rotated about the middle of the selection, then moved; then the fields are neutral again."""
-    before = opened.state.scene
+    before = opened.state.open.scene
     refused = (EditForm(scale=0), EditForm(scale=-1), EditForm(move=(1e39, 0.0, 0.0)))
     for count, form in enumerate(refused, start=1):
         opened.state.edit_form = form
         editing.apply_form(opened)
         assert len(errors(opened)) == count
-    assert opened.state.scene is before
+    assert opened.state.open.scene is before
     assert opened.history.past == []
     chosen, before = selected_mug(opened), means(opened)
-    centre = editing.pivot(opened)
+    centre = editing.pivot(opened, opened.state.open)
     form = EditForm(move=(1.0, 0.0, 0.0), rotate=(0.0, 0.0, 90.0), scale=2.0)
     opened.state.edit_form = form
     editing.apply_form(opened)

@@ -238,7 +238,7 @@ def record_three(viewer: Viewer) -> list:
     """Keyframes at 0, 2 and 4 seconds; returns the views."""
     views = []
     for _ in range(3):
-        views.append(viewer.state.view)
+        views.append(viewer.state.open.view)
         viewpoint.add_keyframe(viewer)
         turn(viewer, 0.3)
     return views
@@ -262,8 +262,8 @@ def test_a_played_path_goes_through_its_keyframes(opened):
     viewpoint.toggle_playing(opened)
     for seconds, view in zip((0, 2, 4), views, strict=True):
         viewpoint.tick(opened, 100.0 + seconds)
-        assert_allclose(opened.state.view.eye, view.eye, atol=1e-9)
-        assert_allclose(opened.state.view.rotation, view.rotation, atol=1e-9)
+        assert_allclose(opened.state.open.view.eye, view.eye, atol=1e-9)
+        assert_allclose(opened.state.open.view.rotation, view.rotation, atol=1e-9)
     assert opened.state.record.began is None  # it has ended
     assert opened.state.record.at == 4
 
@@ -277,24 +277,24 @@ def test_playing_resumes_loops_and_ends_with_a_drag(opened):
             viewpoint.toggle_playing(opened)
         viewpoint.tick(opened, opened.clock + seconds)  # around, of 4 seconds
         assert opened.state.record.at == pytest.approx(at)
-    assert_allclose(opened.state.view.eye, views[1].eye, atol=1e-9)
+    assert_allclose(opened.state.open.view.eye, views[1].eye, atol=1e-9)
     turn(opened, 0.1)
-    view = opened.state.view
+    view = opened.state.open.view
     viewpoint.tick(opened, opened.clock + 1.0)
-    assert opened.state.view is view
+    assert opened.state.open.view is view
 
 
 def test_turntable_comes_back_and_is_undone(opened):
-    start = opened.state.view
+    start = opened.state.open.view
     viewpoint.turn_around(opened)
     viewpoint.set_path_seconds(opened, 4.0)
     viewpoint.toggle_playing(opened)
     began = opened.clock
     viewpoint.tick(opened, began + 2)
-    flat = (opened.state.view.eye - start.target) + (start.eye - start.target)
+    flat = (opened.state.open.view.eye - start.target) + (start.eye - start.target)
     assert_allclose(flat - (flat @ start.up) * start.up, 0, atol=1e-9)  # on the other side
     viewpoint.tick(opened, began + 4)
-    assert_allclose(opened.state.view.eye, start.eye, atol=1e-9)
+    assert_allclose(opened.state.open.view.eye, start.eye, atol=1e-9)
     viewpoint.move(opened, lambda view: zoom(view, 0.5, 0.01))
     assert opened.state.record.began is None
     for _ in range(2):  # its duration, and the turn
@@ -318,8 +318,8 @@ def test_keyframes_are_changed_and_changes_undone(opened):
     assert opened.state.session.keyframes == (first, second)
     editing.redo(opened)
     assert opened.state.session.keyframes == (first, second, third)
-    viewpoint.put_keyframe(opened, first, replace(first, pose=pose_of(opened.state.view)))
-    assert_allclose(opened.state.session.keyframes[0].pose.position, opened.state.view.eye)
+    viewpoint.put_keyframe(opened, first, replace(first, pose=pose_of(opened.state.open.view)))
+    assert_allclose(opened.state.session.keyframes[0].pose.position, opened.state.open.view.eye)
     viewpoint.set_path_seconds(opened, 8)
     assert times(opened) == [0, 4, 8]
     viewpoint.set_path(opened, ())
@@ -398,7 +398,7 @@ def test_a_film_can_be_stopped(opened, tmp_path, frames):
 def test_a_saved_view_can_be_read_again(opened, tmp_path):
     opened.state.size = (321, 123)
     camera = read_cameras(saving.save_view(opened, tmp_path))[0]
-    expected = opened.state.view.camera(321, 123)
+    expected = opened.state.open.view.camera(321, 123)
     assert (camera.width, camera.height) == (321, 123)
     assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
     assert camera.fx == pytest.approx(expected.fx)
@@ -406,7 +406,7 @@ def test_a_saved_view_can_be_read_again(opened, tmp_path):
     for save in (saving.save_picture, saving.save_view):
         assert save(opened, tmp_path / "file") is None
     assert ["not saved" in text for text in errors(opened)] == [True, True]
-    opened.state.path = tmp_path / "blobs.ply"
+    opened.state.open = replace(opened.state.open, path=tmp_path / "blobs.ply")
     assert saving.save_view(opened, tmp_path / "gone").parent == tmp_path  # beside the scene
 
 

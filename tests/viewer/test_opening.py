@@ -24,14 +24,14 @@ def test_opening_counts_unusable_gaussians(viewer):
     viewer.services = replace(viewer.services, load_scene=lambda path: scene)
     open_scene(viewer, "holes.ply")
     assert viewer.state.messages[0].text == "holes.ply: 360 Gaussians; not drawn: 2 with position not finite"
-    assert np.isfinite(viewer.state.view.camera(160, 120).world_to_camera).all()
+    assert np.isfinite(viewer.state.open.view.camera(160, 120).world_to_camera).all()
 
 
 def test_broken_file_leaves_the_open_scene(opened):
-    before = opened.state.view
+    before = opened.state.open.view
     open_scene(opened, "broken.ply")
-    assert opened.state.scene is SCENES["blobs.ply"]
-    assert opened.state.view is before
+    assert opened.state.open.scene is SCENES["blobs.ply"]
+    assert opened.state.open.view is before
     assert opened.state.opening is None
     assert errors(opened) == ["broken.ply: broken; export it again"]
 
@@ -65,7 +65,7 @@ def test_cancelled_opening_shows_nothing(viewer):
     release.set()
     viewer.worker.submit("after it", lambda progress: None, lambda nothing: None, pytest.fail)
     settle(viewer)
-    assert viewer.state.scene is None
+    assert viewer.state.open is None
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_display_returns_with_its_scene_and_visits_keep_no_arrays(three):
 
 
 def test_scene_returns_with_its_camera_and_queries(three):
-    assert (three.state.scene, three.state.scenes) == (SCENES["blobs.ply"], (BLOBS, PLAIN, BARE))
+    assert (three.state.open.scene, three.state.scenes) == (SCENES["blobs.ply"], (BLOBS, PLAIN, BARE))
     assert settings.take(three.state, "wanted_panel") == "Scene"
     ask(three, "mug", "book")
     queries.show(three, "mug", shown=False)
@@ -123,18 +123,18 @@ def test_scene_returns_with_its_camera_and_queries(three):
     go(viewpoint.go_to_camera, three, 2)
     settings.set_clip(three, Clip(1.0, 9.0))
     viewpoint.add_keyframe(three)
-    view = three.state.view
+    view = three.state.open.view
     act(opening.switch_scene, three, BARE)
-    assert three.state.scene is SCENES["bare.ply"]
+    assert three.state.open.scene is SCENES["bare.ply"]
     assert three.state.session.queries == ()
     assert three.state.session.clip == UNCLIPPED
     ask(three, "plant")
     viewpoint.zoom_by(three, 2.0)
-    bare = three.state.view
+    bare = three.state.open.view
 
     act(opening.switch_scene, three, BLOBS)
     state = three.state
-    assert state.view is view
+    assert state.open.view is view
     assert [(q.phrase, q.slot, q.cut) for q in state.session.queries] == [
         ("mug", None, None),
         ("book", 1, 0.7),
@@ -143,7 +143,7 @@ def test_scene_returns_with_its_camera_and_queries(three):
     assert (state.camera_index, len(state.session.keyframes)) == (2, 1)
     assert state.session.clip == Clip(1.0, 9.0)
     act(opening.switch_scene, three, BARE)
-    assert three.state.view is bare
+    assert three.state.open.view is bare
     assert errors(three) == []
     assert [query.phrase for query in three.state.session.queries] == ["plant"]
     assert three.state.shown_results()[0].found
@@ -179,7 +179,7 @@ def test_chosen_path_is_opened(viewer, folder, typed):
     act(settings.choose, viewer, "  ")
     assert viewer.state.choice.start == folder
     act(settings.choose, viewer, typed)
-    assert viewer.state.scene is SCENES["blobs.ply"]
+    assert viewer.state.open.scene is SCENES["blobs.ply"]
     assert viewer.state.choice is None
     opening.ask_for_file(viewer)
     settings.escape(viewer)
@@ -252,15 +252,15 @@ def test_reload_keeps_camera_queries_and_settings(shown):
     viewpoint.add_keyframe(shown)
     shown.change(splats=replace(shown.state.session.splats, size=0.5))
     settings.set_picture(shown, replace(shown.state.session.picture, dim=0.1))
-    view, before = shown.state.view, shown.state.scene
+    view, before = shown.state.open.view, shown.state.open.scene
     dyed = replace(before.gaussians, sh=-before.gaussians.sh)
     save_scene(shown.state.path, replace(before, gaussians=dyed, cameras=before.cameras[:2], path=None))
     assert look(shown)
     act(opening.reload, shown)
     state = shown.state
-    assert state.scene is not before
-    np.testing.assert_array_equal(state.scene.gaussians.sh, dyed.sh)
-    assert state.view is view
+    assert state.open.scene is not before
+    np.testing.assert_array_equal(state.open.scene.gaussians.sh, dyed.sh)
+    assert state.open.view is view
     assert [(q.phrase, q.slot, q.cut) for q in state.session.queries] == [
         ("mug", 0, 0.6),
         ("book", None, None),
@@ -290,19 +290,19 @@ def test_reload_with_other_gaussians_asks_anew(shown):
 @pytest.mark.parametrize("name", FILES)
 def test_half_written_file_leaves_the_scene(shown, name):
     ask(shown, "mug")
-    before, view, found = shown.state.scene, shown.state.view, result(shown)
+    before, view, found = shown.state.open.scene, shown.state.open.view, result(shown)
     file = shown.state.path.with_name(name)
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])
     assert look(shown)
     act(opening.reload, shown)
-    assert shown.state.scene is before
-    assert (shown.state.view, result(shown)) == (view, found)
+    assert shown.state.open.scene is before
+    assert (shown.state.open.view, result(shown)) == (view, found)
     assert name in errors(shown)[-1]
     assert shown.watch.changed  # to be tried again
     file.write_bytes(whole)
     act(opening.reload, shown)
-    assert shown.state.scene is not before
+    assert shown.state.open.scene is not before
     assert not look(shown)
 
 
@@ -342,7 +342,7 @@ def test_second_scene_follows_view_and_queries(two):
     assert other.path == Path("book.ply")
     assert [(query.phrase, query.slot) for query in other.session.queries] == [("mug", 0)]
     assert result(two.beside).found
-    assert other.view is two.state.view
+    assert other.open.view is two.state.open.view
     two.put(adds=True)
     for phrase in ("book", "nothing like this"):
         queries.ask(two, phrase)
@@ -354,7 +354,7 @@ def test_second_scene_follows_view_and_queries(two):
     assert {query.phrase: query.slot for query in other.session.queries} == {"mug": 0, "book": 1}
     seen = other.session.level, other.session.picture.display, other.size
     assert seen == ("whole", "segmentation", (77, 55))
-    assert other.view is two.state.view
+    assert other.open.view is two.state.open.view
     queries.show(two, "mug", shown=False)
     queries.remove(two, "book")
     meet(two)
@@ -369,26 +369,23 @@ def test_second_scene_without_field_shows_colours_or_says_why(two):
         if name == "plain.ply":
             assert (two.beside.state.session.picture.display, two.beside.state.session.queries) == ("rgb", ())
     assert "broken.ply" in errors(two)[-1]
-    assert two.state.scene is not None
-    two.beside = None  # as where a project is opened that compared them
-    meet(two)
-    assert two.state.session.split.mode == "off"
-    assert "choose it in Compare with" in two.state.messages[-1].text
+    assert two.state.open is not None
 
 
 @pytest.mark.parametrize("away", [(-90, 0, 0), (90, 0, 0)])
 def test_opening_view_shows_a_compared_scene_far_away(two, monkeypatch, away):
     """Each scene on its side of the line; a near one leaves the opening view as it is."""
     go(viewpoint.reset_view, two)
-    np.testing.assert_array_equal(two.state.view.eye, viewpoint.opening_view(two).eye)
     blobs, state = SCENES["blobs.ply"], two.state
+    home = viewpoint.opening_view(state.open, state.size)
+    np.testing.assert_array_equal(state.open.view.eye, home.eye)
     there = (blobs.gaussians.means + away).astype(np.float32)
     monkeypatch.setitem(SCENES, "far.ply", replace(blobs, gaussians=replace(blobs.gaussians, means=there)))
     opening.open_beside(two, Path("far.ply"))
     meet(two)
     for show in (viewpoint.reset_view, viewpoint.frame_scene):
         go(show, two)
-        camera = state.view.camera(*state.size)
+        camera = state.open.view.camera(*state.size)
         for means, is_right in ((blobs.gaussians.means, False), (there, True)):
             pixels, depths = camera.project(means.astype(np.float64))
             assert camera.in_image(pixels, depths).all()

@@ -290,7 +290,7 @@ def nodes(outlined) -> list[int]:
 
 
 def test_outline_row_is_named_and_selects_its_thing(outlined, monkeypatch):
-    before = outlined.state.view
+    before = outlined.state.open.view
     for word, centre in zip(("mug", "book", "plant"), CENTRES, strict=True):
         row = row_of(outlined, word)
         assert word in outline.name_of(outlined, row)

@@ -401,7 +401,7 @@ def test_the_far_cut_is_not_nearer_than_the_near_one(opened):
 def beside(opened):
     """Stands at `SIDE`."""
     settings.resize(opened, *SIZE)
-    viewpoint.move(opened, lambda view: from_camera(SIDE, opened.state.extent))
+    viewpoint.move(opened, lambda view: from_camera(SIDE, opened.state.open.extent))
     return opened
 
 

@@ -38,6 +38,7 @@ from tests.support.windowless import (
     on_screen,
     open_scene,
     picture,
+    put_scene,
     recorded,
     rest,
     result,
@@ -77,7 +78,7 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
     opened.surface = canvas = Canvas(gl, renderer)
     state.backend = renderer.backend
     request = state.request()
-    plain = plain_request(state.scene, request.camera, PictureConfig())
+    plain = plain_request(state.open.scene, request.camera, PictureConfig())
     for field in fields(RenderRequest):
         if field.name not in ("scene", "camera", "pose", "width", "merged"):  # merged: only while moving
             assert field.default is not MISSING or field.default_factory is not MISSING, field.name
@@ -101,7 +102,7 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
     recorded(opened)
     images["film"] = picture(tmp_path / "film" / "frame-00000.png")
     expected = ArrayRenderer(ReferenceRasterizer()).read(request).astype(int)
-    bare = ArrayRenderer(ReferenceRasterizer()).read(replace(request, scene=edited_scene(state.scene)))
+    bare = ArrayRenderer(ReferenceRasterizer()).read(replace(request, scene=edited_scene(state.open.scene)))
     assert np.abs(bare - expected).max() > 60  # the edits are seen
     for name, got in images.items():
         assert got.shape == expected.shape == (120, 160, 3), name
@@ -200,7 +201,7 @@ def test_three_levels_of_latents_or_of_answers(opened):
 
 
 def test_without_a_field_levels_and_latents_are_refused(viewer):
-    viewer.state.scene = Scene(random_gaussians(5))
+    put_scene(viewer, Scene(random_gaussians(5)))
     settings.toggle_levels(viewer)
     settings.compare(viewer, "wipe", "latent", 1)
     assert viewer.state.session.split.mode == "off"

@@ -16,6 +16,7 @@ import pytest
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io.cameras import read_cameras
+from langsplat_core.scene import Scene
 from langsplat_core.scene.transform import moving, place_scene
 from langsplat_viewer import options
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
@@ -35,6 +36,7 @@ from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.session import Note, Preferences, Query, Ruler, Things
 from langsplat_viewer.viewer import GESTURE, MOST_STEPS, Viewer
 from tests.support.file_kinds import FileKind, few_and_many, in_json
+from tests.support.scenes import random_gaussians
 from tests.support.windowless import (
     SCENES,
     act,
@@ -44,9 +46,11 @@ from tests.support.windowless import (
     errors,
     go,
     marked,
+    means,
     new_viewer,
     open_scene,
     phrases,
+    put_scene,
     render_image,
     result,
     settle,
@@ -226,7 +230,7 @@ def changed(marks: Marks, rng: np.random.Generator, step: int) -> Marks:
 def test_history_of_a_million_gaussians_takes_little_memory(viewer):
     """At random, so that nothing could be shared."""
     count, rng = 1_000_000, np.random.default_rng(0)
-    viewer.state.count = count
+    put_scene(viewer, Scene(random_gaussians(count)))
     tracemalloc.start()
     try:
         for step in range(MOST_STEPS):
@@ -287,13 +291,13 @@ def test_project_restores_the_whole_session(opened, saved, again):
     for place in range(4):
         np.testing.assert_array_equal(result(again, place).members, result(opened, place).members)
     assert marked(again) == marked(opened) == ("book", "plant", "")
-    np.testing.assert_allclose(after.scene.gaussians.means, before.scene.gaussians.means, atol=1e-6)
+    np.testing.assert_allclose(means(again), means(opened), atol=1e-6)
     for part in fields(before.session):
         if part.name not in ("moves", "keyframes"):  # of arrays
             assert getattr(after.session, part.name) == getattr(before.session, part.name), part.name
-    np.testing.assert_allclose(after.view.eye, before.view.eye, atol=1e-9)
-    assert after.view.intrinsics == before.view.intrinsics
-    np.testing.assert_allclose(after.view.target, before.view.target, atol=1e-6)
+    np.testing.assert_allclose(after.open.view.eye, before.open.view.eye, atol=1e-9)
+    assert after.open.view.intrinsics == before.open.view.intrinsics
+    np.testing.assert_allclose(after.open.view.target, before.open.view.target, atol=1e-6)
     assert len(after.session.keyframes) == 1
     assert settings.take(again.state, "wanted_panel") == ""
     assert after.preferences.panels == ("Search", "Notes")
@@ -316,7 +320,7 @@ def test_two_windows_save_one_project_and_lose_nothing(saved, opened, again):
     assert apart.name in errors(again)[-1]
     for path, window in ((apart, opened), (saved, again)):
         assert read_project(path).session.notes == window.state.session.notes
-    assert again.state.saved == again.state.session
+    assert again.state.saved.session == again.state.session
     act(saving.save_project, again)  # what it holds is known
     saved.write_text("damaged")
     act(saving.save_project, again)
@@ -347,8 +351,8 @@ def test_places_in_files_are_in_the_world(opened, saved, again, monkeypatch, tmp
     act(opening.open_project, again, saved)
     before, after = opened.state, again.state
     np.testing.assert_array_equal(after.origin, origin)
-    np.testing.assert_allclose(after.view.eye + origin, before.view.eye, atol=1e-9)
-    np.testing.assert_allclose(after.scene.gaussians.means + origin, before.scene.gaussians.means, atol=1e-5)
+    np.testing.assert_allclose(after.open.view.eye + origin, before.open.view.eye, atol=1e-9)
+    np.testing.assert_allclose(means(again) + origin, means(opened), atol=1e-5)
     (note,), (was,) = after.session.notes, before.session.notes
     np.testing.assert_allclose(note.at + origin, was.at, atol=1e-9)
     viewpoint.load_path(again, path)
@@ -357,8 +361,8 @@ def test_places_in_files_are_in_the_world(opened, saved, again, monkeypatch, tmp
     np.testing.assert_allclose(*keys, atol=1e-9)
     poses = [read_cameras(file)[0].world_to_camera for file in (view, files[1])]
     np.testing.assert_allclose(*poses, atol=1e-9)
-    camera = options.chosen_camera(str(view), after.scene)
-    np.testing.assert_allclose(camera.position + origin, before.view.eye, atol=1e-9)
+    camera = options.chosen_camera(str(view), after.open.scene)
+    np.testing.assert_allclose(camera.position + origin, before.open.view.eye, atol=1e-9)
 
 
 def test_project_without_scene_or_window_is_refused(saved, opened, run_viewer):
@@ -368,7 +372,7 @@ def test_project_without_scene_or_window_is_refused(saved, opened, run_viewer):
     Path("blobs.ply").unlink()
     opening.open_dropped(opened, [saved])
     assert "not there" in errors(opened)[-1]
-    assert opened.state.scene is not None
+    assert opened.state.open is not None
 
 
 def test_project_of_a_changed_scene_restores_only_queries(saved, viewer, monkeypatch):
@@ -406,13 +410,13 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
     assert session.picture == PictureConfig("relevancy", dim=0.7, heat_scale=(0.4, 0.9), colour_map="magma")
     assert (session.clip, session.overlays) == (Clip(0.5, 40.0), ("grid",))  # it says nothing of overlays
     assert marked(viewer) == ("book", "plant", "")
-    moved = state.scene.gaussians.means - SCENES["blobs.ply"].gaussians.means
+    moved = state.open.scene.gaussians.means - SCENES["blobs.ply"].gaussians.means
     np.testing.assert_allclose(moved[blob("plant")], np.tile([0.0, 1.0, 0.0], (120, 1)), atol=1e-6)
     assert session.notes == (Note('a "note" <b>of</b> 1987', (0.0, 0.0, 0.0)),)
     assert session.ruler.length == 1.0
     assert [(key.seconds, key.pose.span is None) for key in session.keyframes] == [(0.0, True), (2.0, False)]
     assert [bookmark.name for bookmark in session.bookmarks] == ["from the left"]
-    np.testing.assert_allclose(state.view.eye, [-3.551118, -1.122909, -3.418507], atol=1e-5)
+    np.testing.assert_allclose(state.open.view.eye, [-3.551118, -1.122909, -3.418507], atol=1e-5)
     assert state.preferences.panels == ("Search", "Notes")
 
 
@@ -464,7 +468,7 @@ def opened_again(path: Path) -> float:
             raise InputError(max(problems, key=len))
         shown = [made.state.request((32, 24))]
         for bookmark in made.state.session.bookmarks:
-            go(viewpoint.glide_to, made, viewpoint.bookmarked_view(bookmark, made.state.extent))
+            go(viewpoint.glide_to, made, viewpoint.bookmarked_view(bookmark, made.state.open.extent))
             shown.append(made.state.request((32, 24)))
         if made.state.session.keyframes:
             viewpoint.scrub(made, viewpoint.path_seconds(made) / 3)
@@ -564,7 +568,7 @@ def test_first_save_asks_for_a_file_and_the_next_do_not(opened, tmp_path, monkey
     saving.save(opened)
     assert opened.state.choice.start == tmp_path / "blobs-001.langsplat"
     settings.choose(opened, "mine")
-    assert (opened.state.project, opened.state.is_changed) == (tmp_path / "mine.langsplat", False)
+    assert (opened.state.saved.project, opened.state.is_changed) == (tmp_path / "mine.langsplat", False)
     settings.pin_at(opened, 0.4, 0.4)
     assert opened.state.is_changed
     saving.save(opened)
@@ -586,4 +590,4 @@ def test_notes_return_with_their_scene(opened):
         assert opened.state.session.notes == there
     act(opening.reload, opened)
     assert opened.state.session.notes == notes
-    assert opened.state.has_unsaved_notes
+    assert opened.state.is_changed

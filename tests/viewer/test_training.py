@@ -77,7 +77,7 @@ def test_training_opens_its_scene(viewer, folder, begin):
     finish(viewer)
     assert progress.stages == {"reading photographs": 1.0}
     assert any(message.text == "done: 3 Gaussians" for message in viewer.state.messages)
-    assert viewer.state.scene is SCENES["blobs.ply"]
+    assert viewer.state.open.scene is SCENES["blobs.ply"]
 
 
 def test_quality_warnings_are_said(viewer, folder, begin):
@@ -91,20 +91,20 @@ def test_quality_warnings_are_said(viewer, folder, begin):
     report.write_text(json.dumps({"gaussians": 360, "warnings": warnings}))
     begin(GOOD + "".join(f"; print('warning: {warning}')" for warning in warnings), "blobs.ply")
     finish(viewer)
-    assert viewer.state.warnings == tuple(warnings)
+    assert viewer.state.open.warnings == tuple(warnings)
     assert errors(viewer) == warnings
     said = [message.text for message in viewer.state.messages]
     assert "done: 3 Gaussians" in said  # not pushed out by the warnings, which are not said twice
     assert not any(text.startswith("warning") for text in said)
     open_scene(viewer, folder.with_name("plain.ply"))
-    assert viewer.state.warnings == ()
+    assert viewer.state.open.warnings == ()
 
 
 def test_failed_training_says_why(viewer, begin):
     begin(BAD)
     finish(viewer)
     assert errors(viewer) == ["langsplat: photos: none can be located"]
-    assert viewer.state.scene is None
+    assert viewer.state.open is None
 
 
 def test_training_is_stopped_and_runs_once(viewer, begin):
@@ -128,7 +128,7 @@ def test_gaussians_are_shown_before_the_end(viewer, folder, begin, monkeypatch):
     monkeypatch.setitem(SCENES, PREVIEW, SCENES["plain.ply"])
     act(opening.watch_training, viewer)  # nothing else is open
     viewer.training.end()
-    assert viewer.state.scene is SCENES["plain.ply"]
+    assert viewer.state.open.scene is SCENES["plain.ply"]
 
 
 @pytest.mark.parametrize("dataset", ["", "  ", "gone", "."])
@@ -183,24 +183,24 @@ def test_checkpoints_are_shown_and_followed(viewer, folder, begin):
     path.write_bytes(path.read_bytes()[:100])  # damaged
     act(opening.look_at_training, viewer)
     assert "no Gaussians in training" in errors(viewer)[-1]
-    assert viewer.state.scene is None
+    assert viewer.state.open is None
     viewer.state.messages.clear()
 
     checkpoint(folder.parent, whole.take(np.arange(0, 360, 2)))
     act(opening.look_at_training, viewer)
     assert viewer.state.path == folder.parent / "photos.work" / PREVIEW
-    seen = viewer.state.scene.gaussians
+    seen = viewer.state.open.scene.gaussians
     assert (len(seen), seen.sh_degree) == (180, 1)
     np.testing.assert_array_equal(seen.means, whole.gaussians.means[::2])
     viewpoint.zoom_by(viewer, 1.5)
-    view = viewer.state.view
+    view = viewer.state.open.view
     opening.watch_training(viewer)
     assert viewer.worker.current is None  # nothing new
 
     checkpoint(folder.parent, whole)
     act(opening.watch_training, viewer)
-    assert len(viewer.state.scene.gaussians) == 360
-    assert viewer.state.view is view
+    assert len(viewer.state.open.scene.gaussians) == 360
+    assert viewer.state.open.view is view
     assert errors(viewer) == []
     assert viewer.state.scenes == ()  # what is on its way is not kept in the list
     write_preview(checkpoint(folder.parent, whole.take(np.arange(9))))

@@ -90,7 +90,7 @@ class Session:
             engine = imgui.test_engine.get_io(hello_imgui.get_imgui_test_engine())
             engine.config_watchdog_warning = engine.config_watchdog_kill_test = self.patience
             if not self.is_slow:
-                self.wait(lambda: self.state.scene is not None)
+                self.wait(lambda: self.state.open is not None)
                 self.settle()
             if folds:
                 self.fold()
@@ -214,7 +214,7 @@ class Session:
 
     def on_screen(self, point: np.ndarray) -> tuple[float, float]:
         """Return where a world point is in the window."""
-        area, (pixels, _) = scene_area(), self.state.view.camera(*self.state.size).project(point[None])
+        area, (pixels, _) = scene_area(), self.state.open.view.camera(*self.state.size).project(point[None])
         return float(pixels[0, 0] + area.left), float(pixels[0, 1] + area.top)
 
     def at(self, shot: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -281,12 +281,12 @@ def look_and_search(s: Session) -> None:
 
 
 def find_the_plant(s: Session, rgb: np.ndarray) -> None:
-    before = s.state.view
+    before = s.state.open.view
     s.search("plant")
     assert list(s.folder.glob("blobs-*.png")) == []  # its p saves no picture
     assert result(s, 0).found
     s.key("F")
-    np.testing.assert_allclose(s.state.view.target, result(s, 0).place)
+    np.testing.assert_allclose(s.state.open.view.target, result(s, 0).place)
     s.key("R")
     heat = s.shot("heat")
     assert is_hot(s.at(heat, PLANT))  # it is blue
@@ -296,7 +296,7 @@ def find_the_plant(s: Session, rgb: np.ndarray) -> None:
     # The heat stays on the thing while the camera moves round it. Blended relevancy depends on the view:
     # the colour may be another hot one.
     s.drag((600, 300), (656, 279))
-    assert s.state.view is not before
+    assert s.state.open.view is not before
     assert is_hot(s.at(s.shot("moved"), PLANT))
     assert not is_hot(s.at(rgb, PLANT))
 
@@ -392,11 +392,11 @@ def from_the_command_line(s: Session) -> None:
     assert [s.state.result(query) is not None for query in s.state.session.queries] == [True, False, True]
     assert s.state.session.picture.display == "latent"
     assert s.state.session.level == "whole"
-    expected = s.state.scene.cameras[2]
-    np.testing.assert_allclose(s.state.view.eye, expected.position, atol=1e-9)
-    np.testing.assert_allclose(s.state.view.rotation, expected.rotation, atol=1e-9)
-    assert s.state.view.orthographic
-    assert abs(s.state.view.span - 4.0) < 1e-9
+    expected = s.state.open.scene.cameras[2]
+    np.testing.assert_allclose(s.state.open.view.eye, expected.position, atol=1e-9)
+    np.testing.assert_allclose(s.state.open.view.rotation, expected.rotation, atol=1e-9)
+    assert s.state.open.view.orthographic
+    assert abs(s.state.open.view.span - 4.0) < 1e-9
 
 
 def broken_renderer(s: Session) -> None:
@@ -442,7 +442,7 @@ def slow_load(path: Path) -> Scene:
 
 def close_while_opening(s: Session) -> None:
     """The window may be closed at any time; the process ends when the reading does."""
-    assert s.state.scene is None
+    assert s.state.open is None
     assert s.viewer.worker.current is not None
     s.ctx.item_click("//**/Cancel")
     assert s.viewer.worker.current is None

@@ -27,14 +27,14 @@ from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.marks import Drawn, Marks, Mode, Stroke, Tool
 from langsplat_viewer.rendering.request import UNCLIPPED
 from langsplat_viewer.session import Move, Point, Query, Session, change_between, pack, point_of
-from langsplat_viewer.state import EditForm, Gizmo
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.state import EditForm, Gizmo, OpenScene
+from langsplat_viewer.viewer import Viewer, needs_scene
 
 
 def mark(viewer: Viewer, marks: Marks) -> None:
     """Set the marks, as a step that can be undone, unless they mark the same."""
     before, session = viewer.state.marks, viewer.state.session
-    viewer.change(marks=session.marks.of(marks, before))
+    viewer.change(marks=session.marks.of(marks))
     gone = int(marks.deleted.sum() - before.deleted.sum())
     if gone > 0:
         viewer.state.say(f"deleted {gone:,} Gaussians", undoes=session)
@@ -48,15 +48,11 @@ def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
     mark(viewer, marks.combined(state.marks, found, mode or state.tools.mode))
 
 
-def has_scene(viewer: Viewer) -> bool:
-    """Return whether a scene is open to select in; report where none is."""
-    return viewer.has_scene("select in it")
-
-
-def has_selection(viewer: Viewer) -> bool:
+@needs_scene("select in it")
+def has_selection(viewer: Viewer, seen: OpenScene) -> bool:
     """Return whether something is selected; report where nothing is."""
-    some = has_scene(viewer) and bool(viewer.state.marks.selected.any())
-    if not some and viewer.state.scene is not None:
+    some = bool(viewer.state.marks.selected.any())
+    if not some:
         viewer.state.say("nothing is selected: choose a tool, or an answer of the search")
     return some
 
@@ -67,11 +63,12 @@ def has_selection(viewer: Viewer) -> bool:
 Action = Callable[[Viewer], None]
 
 
-def _verb(change: Callable[[Marks], Marks], needs: Callable[[Viewer], bool] = has_selection) -> Action:
-    """Return the action that applies `change` to the marks if `needs` holds."""
+def _verb(change: Callable[[Marks], Marks], *, needs_selection: bool = True) -> Action:
+    """Return the action that applies `change` to the marks."""
 
-    def act(viewer: Viewer) -> None:
-        if needs(viewer):
+    @needs_scene("select in it")
+    def act(viewer: Viewer, seen: OpenScene) -> None:
+        if not needs_selection or has_selection(viewer):
             mark(viewer, change(viewer.state.marks))
 
     return act
@@ -81,28 +78,24 @@ def _nothing(marks: Marks) -> Array:
     return np.zeros_like(marks.selected)
 
 
-select_all = _verb(lambda marks: replace(marks, selected=marks.shown), has_scene)
-select_none = _verb(lambda marks: replace(marks, selected=_nothing(marks)), has_scene)
-invert_selection = _verb(lambda marks: replace(marks, selected=marks.shown & ~marks.selected), has_scene)
+_of_all = partial(_verb, needs_selection=False)
+select_all = _of_all(lambda marks: replace(marks, selected=marks.shown))
+select_none = _of_all(lambda marks: replace(marks, selected=_nothing(marks)))
+invert_selection = _of_all(lambda marks: replace(marks, selected=marks.shown & ~marks.selected))
 hide_selected = _verb(lambda marks: Marks(_nothing(marks), marks.hidden | marks.selected, marks.deleted))
 isolate_selected = _verb(lambda marks: replace(marks, hidden=marks.kept & ~marks.selected))
-show_hidden = _verb(lambda marks: replace(marks, hidden=_nothing(marks)), has_scene)
+show_hidden = _of_all(lambda marks: replace(marks, hidden=_nothing(marks)))
 # The file that was opened stays as it is.
 delete_selected = _verb(lambda marks: Marks(_nothing(marks), marks.hidden, marks.deleted | marks.selected))
-
-
-def reach(viewer: Viewer) -> float:
-    """Return the distance that a selection grows or shrinks by at a time, world units."""
-    extent = viewer.state.extent
-    return viewer.state.tools.reach * (0.0 if extent is None else extent.radius)
 
 
 def _found(label: str, found: Callable[[QueryEngine, Array, float], Array], mode: Mode) -> Action:
     """Return the action that selects what `found` returns for the selection and reach, on the worker."""
 
-    def act(viewer: Viewer) -> None:
+    @needs_scene("select in it")
+    def act(viewer: Viewer, seen: OpenScene) -> None:
         if has_selection(viewer):
-            selected, distance = viewer.state.marks.selected, reach(viewer)
+            selected, distance = viewer.state.marks.selected, viewer.state.tools.reach * seen.extent.radius
             viewer.ask_engine(
                 f"{label} the selection",
                 lambda engine, _: found(engine, selected, distance),
@@ -163,12 +156,13 @@ def chosen_query(viewer: Viewer) -> Query | None:
     return session.query(session.chosen) or (session.queries[-1] if session.queries else None)
 
 
-def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None = None) -> None:
+@needs_scene("select in it")
+def select_query(
+    viewer: Viewer, seen: OpenScene, query: Query | None = None, mode: Mode | None = None
+) -> None:
     """Select the members of an answer, by default that of `chosen_query`."""
     query = query or chosen_query(viewer)
     result = None if query is None else viewer.state.result(query)
-    if not has_scene(viewer):
-        return
     if query is None or result is None:
         viewer.state.say("search for something first, then select what was found")
     elif result.verdict == "not here":
@@ -197,7 +191,7 @@ def begin_stroke(viewer: Viewer, u: float, v: float) -> None:
     """Begin at a place; a sphere and a box are drawn around the surface that lies there."""
     state = viewer.state
     tool, centre = state.tools.tool, None
-    if tool is None or state.scene is None or state.view is None:
+    if tool is None or state.open is None:
         return
     if tool not in marks.ON_SCREEN:
         centre = viewer.point_at(u, v, "select")
@@ -229,7 +223,7 @@ def extend_stroke(viewer: Viewer, u: float, v: float) -> None:
 def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
     """Select what the stroke encloses; `mode` in place of the one that is set."""
     state, drawn = viewer.state, drawn_stroke(viewer)
-    if drawn is None or state.scene is None:
+    if drawn is None or state.open is None:
         return
     set_tools(viewer, stroke=None)
     if drawn.tool == "thing":
@@ -238,7 +232,7 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
     on_screen = drawn.tool in marks.ON_SCREEN
     wanted = state.tools.only_visible and on_screen and viewer.surface is not None
     depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
-    means, clip = state.scene.gaussians.means, state.session.clip
+    means, clip = state.open.scene.gaussians.means, state.session.clip
     found = marks.caught(drawn, means, depths)
     if clip != UNCLIPPED and on_screen:  # Gaussians that are not drawn lie under no outline
         found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])
@@ -247,11 +241,11 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
 
 def drawn_stroke(viewer: Viewer) -> Drawn | None:
     """Return the stroke under way, in the image as it is; None without one."""
-    state = viewer.state
-    tool, stroke = state.tools.tool, state.tools.stroke
-    if tool is None or stroke is None or state.view is None:
+    tools, seen = viewer.state.tools, viewer.state.open
+    if tools.tool is None or tools.stroke is None or seen is None:
         return None
-    return Drawn(tool, stroke, state.view.camera(*state.size), state.tools.brush, reach(viewer))
+    camera, reach = seen.view.camera(*viewer.state.size), tools.reach * seen.extent.radius
+    return Drawn(tools.tool, tools.stroke, camera, tools.brush, reach)
 
 
 # Transforms of the selection, else of the scene.
@@ -271,36 +265,28 @@ def set_gizmo(viewer: Viewer, kind: Gizmo) -> None:
         fill_box(viewer)
 
 
-def pivot(viewer: Viewer) -> Array | None:
-    """Return (3,) middle of what is transformed, world units: selection, else scene; None without one."""
-    state = viewer.state
-    if state.scene is None or state.extent is None:
-        return None
-    selected, kept = state.marks.selected, state.pivot
-    if kept is None or kept[0] is not state.scene or kept[1] is not selected:  # cached: asked in every frame
-        chosen = selected & state.scene.gaussians.valid()
-        middle = state.extent.centre
-        if chosen.any():
-            middle = np.median(state.scene.gaussians.means[chosen].astype(np.float64), axis=0)
-        kept = state.pivot = state.scene, selected, np.asarray(middle)
-    return kept[2]
+def pivot(viewer: Viewer, seen: OpenScene) -> Array:
+    """Return (3,) middle of what is transformed, world units: the selection, else the scene."""
+    selected = viewer.state.middle(seen.scene, viewer.state.marks)
+    return seen.extent.centre if selected is None else selected
 
 
 def _move_of(viewer: Viewer, to: Similarity) -> Move:
     return Move(to, pack(viewer.state.marks.selected))
 
 
-def preview(viewer: Viewer, to: Similarity) -> None:
+@needs_scene()
+def preview(viewer: Viewer, seen: OpenScene, to: Similarity) -> None:
     """Show the result of `transform` before it is applied. Raises InputError where it leads too far."""
-    if viewer.state.scene is not None:
-        move = _move_of(viewer, to)
-        viewer.state.moving = move, move.applied(viewer.state.scene)
+    move = _move_of(viewer, to)
+    viewer.state.moving = move, move.applied(seen.scene)
 
 
-def transform(viewer: Viewer, to: Similarity) -> None:
+@needs_scene("transform it")
+def transform(viewer: Viewer, seen: OpenScene, to: Similarity) -> None:
     """Transform the selection or, without one, the scene with its cameras. Reports why where that fails."""
     viewer.state.moving = None
-    if not viewer.has_scene("transform it") or to.is_identity:
+    if to.is_identity:
         return
     move, before = _move_of(viewer, to), viewer.state.session
     moves = before.moves
@@ -316,30 +302,26 @@ def transform(viewer: Viewer, to: Similarity) -> None:
     viewer.state.say(f"transformed {what}; save the scene to keep it")
 
 
-def place(viewer: Viewer, moves: Sequence[Move]) -> None:
+@needs_scene()
+def place(viewer: Viewer, seen: OpenScene, moves: Sequence[Move]) -> None:
     """Rebuild the shown scene from a session's transforms; InputError, and no change, where that fails."""
-    state = viewer.state
-    if state.scene is None:
-        return
-    scene = opened = state.opened or state.scene
+    scene = seen.in_file
     for move in moves:
         scene = move.applied(scene)
     scene = replace(scene, language=viewer.language)
-    state.opened, state.scene, state.extent, state.moving = opened, scene, extent_of(scene), None
+    viewer.state.open, viewer.state.moving = replace(seen, scene=scene, extent=extent_of(scene)), None
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
 
 
-def apply_form(viewer: Viewer) -> None:
+@needs_scene("transform it")
+def apply_form(viewer: Viewer, seen: OpenScene) -> None:
     """Transform by the numbers of the panel: scaled and rotated about the middle, then moved."""
-    form, centre = viewer.state.edit_form, pivot(viewer)
-    if centre is None:
-        viewer.has_scene("transform it")
-        return
+    form = viewer.state.edit_form
     try:
         to = scaling(form.scale)
         for axis, degrees in zip("xyz", form.rotate, strict=True):
             to = to.then(rotating(AXES[axis], degrees))
-        to = (to if to.is_identity else to.about(centre)).then(moving(np.array(form.move)))
+        to = (to if to.is_identity else to.about(pivot(viewer, seen))).then(moving(np.array(form.move)))
     except LangSplatError as error:
         viewer.say_error(str(error))
         return
@@ -355,30 +337,28 @@ def set_box(viewer: Viewer, low: Point, high: Point) -> None:
     viewer.state.edit_form = replace(viewer.state.edit_form, low=low, high=high)
 
 
-def fill_box(viewer: Viewer) -> None:
+@needs_scene()
+def fill_box(viewer: Viewer, seen: OpenScene) -> None:
     """Set the box around the selection, or without one around everything that is shown."""
-    state, marks = viewer.state, viewer.state.marks
-    if state.scene is None:
-        return
-    chosen = (marks.selected if marks.selected.any() else marks.shown) & state.scene.gaussians.valid()
+    marks, gaussians = viewer.state.marks, seen.scene.gaussians
+    chosen = (marks.selected if marks.selected.any() else marks.shown) & gaussians.valid()
     if chosen.any():
-        means = state.scene.gaussians.means[chosen].astype(np.float64)
+        means = gaussians.means[chosen].astype(np.float64)
         set_box(viewer, point_of(means.min(0)), point_of(means.max(0)))
 
 
 def in_crop_box(viewer: Viewer) -> Array:
     """Return (N,) bool: Gaussians whose centres lie in the box of the panel."""
-    form, scene = viewer.state.edit_form, viewer.state.scene
+    form, seen = viewer.state.edit_form, viewer.state.open
     corners = np.array([form.low, form.high])
-    means = np.zeros((0, 3)) if scene is None else scene.gaussians.means
+    means = np.zeros((0, 3)) if seen is None else seen.scene.gaussians.means
     return in_box(means, corners.min(0), corners.max(0))
 
 
-def crop(viewer: Viewer) -> None:
+@needs_scene("crop it")
+def crop(viewer: Viewer, seen: OpenScene) -> None:
     """Show the box of the panel, then delete what lies outside; refused where nothing lies inside."""
     marks, form = viewer.state.marks, viewer.state.edit_form
-    if not viewer.has_scene("crop it"):
-        return
     inside = in_crop_box(viewer)
     if (form.low, form.high) == (EditForm.low, EditForm.high):
         set_gizmo(viewer, "box")

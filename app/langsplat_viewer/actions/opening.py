@@ -23,14 +23,14 @@ from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.editing import adopt
 from langsplat_viewer.actions.saving import COMPANIONS, leave
 from langsplat_viewer.actions.settings import ask_for, compare, open_panel
-from langsplat_viewer.camera.controls import Extent, extent_of
+from langsplat_viewer.camera.controls import Extent, default_view, extent_of
 from langsplat_viewer.disk import Stamps, stamps
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.output import free_name
 from langsplat_viewer.projects import PATHS, PROJECTS, Project, digest_of, read_project
 from langsplat_viewer.rendering.request import Split, why_undrawable
 from langsplat_viewer.session import OF_PROJECT, Marked, Query, Session, Things
-from langsplat_viewer.state import FileChoice, Recording, SceneState, ViewerState
+from langsplat_viewer.state import FileChoice, OpenScene, Recording, Saved, SceneState, ViewerState, Visit
 from langsplat_viewer.viewer import History, Training, Viewer
 
 
@@ -101,28 +101,24 @@ def cancel(viewer: Viewer) -> None:
 
 def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state, scene, field = viewer.state, opened.scene, opened.scene.language
-    if state.path is not None:
-        viewer.visits[state.path.absolute()] = state.visit()
+    if state.open is not None:
+        viewer.visits[state.open.path.absolute()] = state.visit(state.open)
     session = state.session.of_next_scene()
     if field is None:
         state.pointing = False
         session = _without_field(session)
+    view = default_view(scene, opened.extent, state.size)
     state.begin(
         SceneState(
             session=session,
-            saved=session,
-            count=len(scene.gaussians),
-            origin=scene.origin,
-            scene=scene,
-            path=path,
-            extent=opened.extent,
-            warnings=opened.warnings,
+            saved=Saved(session),
+            open=OpenScene(path, scene, scene, opened.extent, view, warnings=opened.warnings),
             nothing=why_undrawable(scene.gaussians),
             camera_index=0 if scene.cameras else None,
             record=Recording(size=state.record.size, fps=state.record.fps),
         )
     )
-    state.view, state.opening, state.leaving = viewpoint.opening_view(viewer), None, None
+    state.opening = state.leaving = None
     state.tools, state.show_start = replace(state.tools, stroke=None), False
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
     viewer.watch.begin(() if disk.is_preview(path) else opened.read)  # which is followed
@@ -166,20 +162,19 @@ def _prepare_search(viewer: Viewer) -> None:
 # Visits: a scene that was shown before is restored as it was left.
 
 
-def return_to(viewer: Viewer, visit: SceneState | None) -> None:
+def return_to(viewer: Viewer, visit: Visit | None) -> None:
     """Restore the scene that was just opened as it was left, if it was; its queries are asked anew."""
-    state = viewer.state
-    if state.scene is None or visit is None:
+    state, seen = viewer.state, viewer.state.open
+    if seen is None or visit is None:
         return
     offset, opening = visit.origin - state.origin, visit.opening_camera  # a changed file may have another
-    state.view = state.view if visit.view is None else visit.view.moved(offset)
-    state.opening_camera = None if opening is None else opening.moved(offset)
-    if visit.camera_index is not None and visit.camera_index < len(state.scene.cameras):
+    opening = None if opening is None else opening.moved(offset)
+    state.open = replace(seen, view=visit.view.moved(offset), opening_camera=opening)
+    if visit.camera_index is not None and visit.camera_index < len(seen.scene.cameras):
         state.camera_index = visit.camera_index
-    session, saved = visit.session.moved(offset).found_again(now=state.session), visit.saved.moved(offset)
-    kept = {name: getattr(saved, name) for name in OF_PROJECT}
-    state.saved = replace(state.session, **kept)
-    state.project, state.project_digest = visit.project, visit.project_digest
+    session, saved = visit.session.moved(offset).found_again(now=state.session), visit.saved
+    kept = {name: getattr(saved.session.moved(offset), name) for name in OF_PROJECT}
+    state.saved = replace(saved, session=replace(state.session, **kept))
     take_session(viewer, session if visit.count == state.count else replace(session, things=Things()))
 
 
@@ -194,14 +189,13 @@ def take_session(viewer: Viewer, session: Session) -> None:
 
 def reload(viewer: Viewer) -> None:
     """Read the scene's files again and keep the view; where that fails the scene is kept."""
-    state = viewer.state
-    path, shown = state.path, state.scene
-    if path is None or shown is None:
+    seen = viewer.state.open
+    if seen is None:
         viewer.say_error("open a scene first; it can be read again when its file has changed")
         return
-    if state.opening is not None:
+    if viewer.state.opening is not None:
         return
-    known = shown.unread
+    path, known = seen.path, seen.scene.unread
 
     def check(scene: Scene) -> None:
         new = [reason for reason in scene.unread if reason not in known]
@@ -243,7 +237,8 @@ def step_scene(viewer: Viewer, by: int) -> None:
 def unlist_scene(viewer: Viewer, path: Path) -> None:
     """Take a scene off the list, and drop its visit if nothing in it is unsaved; the one shown stays."""
     viewer.state.scenes = tuple(other for other in viewer.state.scenes if other != path)
-    if path in viewer.visits and not viewer.visits[path].has_unsaved_notes:
+    visit = viewer.visits.get(path)
+    if visit is not None and not visit.saved.lacks_notes(visit.session):
         del viewer.visits[path]
 
 
@@ -317,7 +312,6 @@ def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = la
 
 def _restore(viewer: Viewer, project: Project, path: Path, digest: str) -> None:
     state, now, session = viewer.state, viewer.state.session, project.session
-    assert state.extent is not None
     offset = np.array(project.origin) - state.origin
     session = session.moved(offset)
     if project.version == 1:  # which had no other settings
@@ -335,10 +329,11 @@ def _restore(viewer: Viewer, project: Project, path: Path, digest: str) -> None:
     except LangSplatError as error:
         viewer.say_error(f"{path}: its transforms are left out: {one_line(error)}")
         take_session(viewer, replace(kept, moves=()))
-    view = viewpoint.bookmarked_view(project.view.moved(offset), state.extent)
-    state.view = view if project.intrinsics is None else replace(view, intrinsics=project.intrinsics)
+    assert state.open is not None
+    view = viewpoint.bookmarked_view(project.view.moved(offset), state.open.extent)
+    state.look(view if project.intrinsics is None else replace(view, intrinsics=project.intrinsics))
     whole = state.session == session and not project.left_out  # else saving keeps the file as it was, too
-    state.saved, state.project, state.project_digest = state.session, path, digest if whole else ""
+    state.saved = Saved(state.session, path, digest if whole else "")
     state.preferences = state.preferences.with_recent(path)
     if project.panels:
         state.preferences = replace(state.preferences, panels=project.panels)
@@ -361,10 +356,9 @@ def train_language(viewer: Viewer) -> None:
 
     The photographs are named where they lie as COLMAP has them, in "images" beside the scene or one above.
     """
-    path = viewer.state.path
-    if path is None:
+    if viewer.state.path is None:
         return
-    path = path.absolute()
+    path = viewer.state.path.absolute()
     near = (place for place in (path.parent, path.parent.parent) if (place / "images").is_dir())
     viewer.state.training_form = replace(
         viewer.state.training_form,
@@ -426,7 +420,7 @@ def watch_training(viewer: Viewer) -> None:
     if training is None:
         return
     if training.exit_code is None:
-        follows = state.scene is None or state.path == work_folder(training.out) / PREVIEW
+        follows = state.open is None or state.path == work_folder(training.out) / PREVIEW
         if follows and viewer.worker.current is None and state.opening is None:
             written = disk.newest(training.out)
             if written and written != training.previewed:
@@ -464,8 +458,7 @@ def follow_beside(viewer: Viewer) -> None:
     state, beside = viewer.state, viewer.beside
     is_wanted = state.session.split.mode == "scenes"
     if beside is None or not is_wanted:
-        if is_wanted:  # undone, or of a project
-            state.say("the compared scene is not open any more: choose it in Compare with")
+        if is_wanted:  # undone
             viewer.put(split=replace(state.session.split, mode="off"))
         elif beside is not None:
             beside.worker.close()
@@ -477,9 +470,9 @@ def follow_beside(viewer: Viewer) -> None:
     for message in other.messages:
         state.say(f"compared scene: {message.text}", message.is_error)
     other.messages, other.size = [], state.size
-    if other.scene is None or state.view is None:
+    if other.open is None or state.open is None:
         return
-    other.view = state.view.moved(state.origin - other.origin)
+    other.look(state.open.view.moved(state.origin - other.origin))
     session = _mirrored(state, other)
     if session != beside.mirrored:
         beside.mirrored = session

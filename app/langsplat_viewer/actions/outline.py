@@ -12,14 +12,13 @@ from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.inventory import Outline, scene_outline
-from langsplat_core.scene import NO_NODE
 from langsplat_core.scene.language import tidy
 from langsplat_viewer.actions.editing import Target, mark, of_thing, select_alike, take
 from langsplat_viewer.actions.queries import teach
 from langsplat_viewer.actions.viewpoint import focus_on
 from langsplat_viewer.session import point_of
-from langsplat_viewer.state import OutlineView
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.state import OpenScene, OutlineView
+from langsplat_viewer.viewer import Viewer, needs_scene
 
 SURE = 0.7  # probability below which a name is shown as a question
 BACKGROUND = {"wall", "floor", "ground", "ceiling", "skirting", "rug", "carpet"}  # listed last in the outline
@@ -47,9 +46,7 @@ def _find(viewer: Viewer) -> None:
         describer = viewer.describing(engine, progress)
         progress("looking for what is here", 0.5)
         roots = things_first(scene_outline(describer))
-        tree = engine.tree
-        sizes = tree.totals(np.bincount(tree.leaves[tree.leaves != NO_NODE], minlength=tree.count))
-        return describer, OutlineView(roots, tree, sizes)
+        return describer, OutlineView(roots, engine.tree)
 
     def done(found: tuple[Describer, OutlineView]) -> None:
         viewer.describer, viewer.state.outline = found
@@ -98,26 +95,21 @@ def filtered(viewer: Viewer, rows: Iterable[Outline], text: str) -> Iterator[Out
 
 def hidden_nodes(viewer: Viewer) -> Array:
     """Return (K,) bool: nodes of which nothing is shown."""
-    state, view, marks = viewer.state, viewer.state.outline, viewer.state.marks
+    view = viewer.state.outline
     if view is None or view.tree is None:
         return np.zeros(0, bool)
-    if state.out_of_sight is None or state.out_of_sight[:2] != (view, marks):
-        gone = view.tree.leaves[~marks.shown & (view.tree.leaves != NO_NODE)]
-        counts = view.tree.totals(np.bincount(gone, minlength=view.tree.count))
-        state.out_of_sight = view, marks, counts >= np.maximum(view.sizes, 1)
-    return state.out_of_sight[2]
+    return view.hidden(view.tree, viewer.state.marks)
 
 
 def colour_of(viewer: Viewer, node: int) -> tuple[float, float, float] | None:
     """Return a node's mean colour in the display if that colours things: the latents, or the tree."""
     state = viewer.state
     display, view = state.session.picture.display, state.outline
-    if display not in ("latent", "tree") or view is None or view.tree is None or state.scene is None:
+    if display not in ("latent", "tree") or view is None or view.tree is None or viewer.engine is None:
         return None
-    key = (display, state.session.latent_level, node)
-    field = state.scene.language
+    key, field = (display, state.session.latent_level, node), viewer.engine.scene.language
     if key not in view.colours and field is not None:
-        subject = Subject(len(state.scene.gaussians), field, level=state.session.latent_level)
+        subject = Subject(state.count, field, level=state.session.latent_level)
         values = field.colours[state.session.latent_level] if display == "latent" else nodes(subject)
         inside = view.tree.members(node)
         mean = np.zeros(3) if values is None else np.median(values[inside], axis=0)
@@ -128,14 +120,14 @@ def colour_of(viewer: Viewer, node: int) -> tuple[float, float, float] | None:
 def in_view(viewer: Viewer) -> list[Outline]:
     """Return the rows of named wholes whose middle is in the image, those that look largest first."""
     state = viewer.state
-    if state.outline is None or state.view is None:
+    if state.outline is None or state.open is None:
         return []
     rows = [
         row for row in state.outline.roots if row.word is not None or row.node in state.session.things.names
     ]
     if not rows:
         return []
-    camera = state.view.camera(*state.size)
+    camera = state.open.view.camera(*state.size)
     pixels, depths = camera.project(np.array([row.centre for row in rows]))
     inside = (depths > 0) & (pixels >= 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
     order = sorted(np.flatnonzero(inside), key=lambda place: -rows[place].share / depths[place] ** 2)
@@ -151,12 +143,11 @@ def _hidden(viewer: Viewer, hidden: Array) -> None:
 
 
 @of_thing
-def visit(viewer: Viewer, members: Array) -> None:
+@needs_scene()
+def visit(viewer: Viewer, seen: OpenScene, members: Array) -> None:
     """Select a thing, and look at it from as near as it is small."""
     take(viewer, members, "replace")
-    scene = viewer.state.scene
-    assert scene is not None
-    box = axis_aligned_box(scene.gaussians.means[members].astype(np.float64))
+    box = axis_aligned_box(seen.scene.gaussians.means[members].astype(np.float64))
     focus_on(viewer, box.mean(0), box)
 
 

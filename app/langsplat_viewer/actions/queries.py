@@ -67,18 +67,18 @@ def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = (), *, alike
     finds all that is like what it was given to. Its instances come later: the surface that they are told
     apart on takes seconds where there are a million Gaussians.
     """
-    state, engine, level = viewer.state, viewer.engine, viewer.state.session.level
-    if engine is None:
+    state, engine, seen = viewer.state, viewer.engine, viewer.state.open
+    if engine is None or seen is None:
         return
-    viewpoint = None if state.view is None else state.view.camera(*state.size)
-    path, members = state.path, None if alike else state.session.things.named(phrase)
+    viewpoint, level = seen.view.camera(*state.size), state.session.level
+    members = None if alike else state.session.things.named(phrase)
 
     def work(progress: Progress) -> QueryAnswer:
         try:
             composed = run_phrase(engine, phrase, level, viewpoint, progress)
         except UnknownWordError as error:
             return QueryAnswer(problem=str(error), meant=corrected(phrase, error.near) or "")
-        return _answer_of(composed, members, path is not None and is_kept(path, engine.scene))
+        return _answer_of(composed, members, is_kept(seen.path, engine.scene))
 
     def done(found: QueryAnswer) -> None:
         if phrase not in state.answers:  # the query was taken off meanwhile
@@ -145,7 +145,7 @@ def focus_search(viewer: Viewer) -> None:
     In that case letters are no commands until a click or Esc.
     """
     state, can_search = viewer.state, viewer.searchable() is not None
-    if state.scene is not None:
+    if state.open is not None:
         open_panel(viewer, "Search")
     state.focus_input = state.awaits_keyboard = can_search
     state.letters_muted = not can_search
@@ -233,9 +233,9 @@ def set_cut(viewer: Viewer, phrase: str, cut: float | None) -> None:
 def explain(viewer: Viewer, query: Query) -> None:
     """Have the worker draw the evidence of an answer, and show it."""
     engine, state, result = viewer.engine, viewer.state, viewer.state.result(query)
-    if engine is None or result is None or state.path is None:
+    if engine is None or result is None or state.open is None:
         return
-    path, scene, asked_for = state.path, engine.scene, state.answer(query).asked_for
+    path, scene, asked_for = state.open.path, engine.scene, state.answer(query).asked_for
 
     def work(progress: Progress) -> Array:
         features = kept_features(path, scene)
@@ -257,17 +257,16 @@ def explain(viewer: Viewer, query: Query) -> None:
 
 def prepare_suggestions(viewer: Viewer) -> None:
     """Have the worker find examples, once per scene, when it has nothing else to do."""
-    state = viewer.state
-    if state.scene is state.suggestions_of or viewer.worker.current is not None:
+    state, engine = viewer.state, viewer.engine
+    if engine is state.suggestions_of or viewer.worker.current is not None:
         return
-    scene = state.scene
-    state.suggestions, state.suggestions_of = Suggestions(), scene
-    if scene is None or not state.has_field:
+    state.suggestions, state.suggestions_of = Suggestions(), engine
+    if not state.has_field:
         return
     here = viewer.has_encoder_here
 
     def work(engine: QueryEngine, progress: Progress) -> Suggestions:
-        asked = engine if here else QueryEngine(scene)  # by the phrasebook
+        asked = engine if here else QueryEngine(engine.scene)  # by the phrasebook
         found = suggest(asked, progress=progress)
         if asked.basis.guesses:  # colours, of which nothing is a part
             return found

@@ -21,7 +21,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.cameras import write_cameras
-from langsplat_core.io.files import check_output_file, write_whole
+from langsplat_core.io.files import write_whole
 from langsplat_core.io.scenes import check_keeps, save_scene, scene_files
 from langsplat_core.pipeline.webpage import make_page
 from langsplat_core.progress import Progress
@@ -35,8 +35,8 @@ from langsplat_viewer.options import say_compiling
 from langsplat_viewer.projects import PATHS, PROJECTS, Project, write_flight, write_project
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.session import Bookmark, Session, point_of
-from langsplat_viewer.state import ExportForm, FileChoice, Leaving, SceneState, flight_of
-from langsplat_viewer.viewer import CommandProcess, Viewer, program
+from langsplat_viewer.state import ExportForm, FileChoice, Leaving, OpenScene, Saved, Visit, flight_of
+from langsplat_viewer.viewer import CommandProcess, Viewer, needs_scene, program
 
 
 def _new_file(scene: Path | None, folder: Path, suffix: str, more: str = "") -> Path:
@@ -49,14 +49,14 @@ def _new_file(scene: Path | None, folder: Path, suffix: str, more: str = "") -> 
 # Pictures, views and paths.
 
 
-def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
+@needs_scene("save a picture of it")
+def save_picture(viewer: Viewer, seen: OpenScene, folder: Path = Path()) -> Path | None:
     """Save the scene as shown to a new PNG in `folder`; return its path, None if that failed."""
-    state = viewer.state
-    if not viewer.has_scene("save a picture of it") or viewer.surface is None or state.view is None:
+    if viewer.surface is None:
         return None
-    path = _new_file(viewer.state.path, folder, ".png")
+    state, path = viewer.state, _new_file(seen.path, folder, ".png")
     beside, transparent = viewer.beside, state.session.picture.transparent
-    shown = [viewer] if beside is None or beside.state.scene is None else [viewer, beside]
+    shown = [viewer] if beside is None or beside.state.open is None else [viewer, beside]
 
     def write() -> None:
         requests = [(one.surface, one.state.request(None, transparent)) for one in shown]
@@ -82,15 +82,14 @@ def _record(
     viewer.recorder.submit(label, work, done, viewer.say_error)
 
 
-def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
+@needs_scene("save a picture of it")
+def save_sized_picture(viewer: Viewer, seen: OpenScene, folder: Path = Path()) -> None:
     """Have the scene as shown drawn by the CPU in the size of a film, and saved to a new file."""
     state, (width, height) = viewer.state, viewer.state.record.size
-    if not viewer.has_scene("save a picture of it") or state.view is None:
-        return
     request = state.request((width, height), state.session.picture.transparent)
 
     def work(progress: Progress) -> tuple[Path, str]:
-        path = _new_file(viewer.state.path, folder, ".png", f"-{width}x{height}")
+        path = _new_file(seen.path, folder, ".png", f"-{width}x{height}")
         progress("drawing", 0.0, path.name)
         with output.in_one_line(path, f"{width}x{height}"), open_renderer("cpu") as renderer:
             output.save_png(path, output.draw_something(request, renderer))
@@ -99,14 +98,12 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
     _record(viewer, f"picture of {width} x {height}", work)
 
 
-def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
+@needs_scene("save a view of it")
+def save_view(viewer: Viewer, seen: OpenScene, folder: Path = Path()) -> Path | None:
     """Save the camera, in perspective, to a new file that `--camera` reads; its path, None if that failed."""
-    state = viewer.state
-    if not viewer.has_scene("save a view of it") or state.view is None:
-        return None
-    path = _new_file(viewer.state.path, folder, ".json", "-view")
-    camera = replace(state.view, orthographic=False).camera(*state.size).moved(state.origin)
-    span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
+    path, size = _new_file(seen.path, folder, ".json", "-view"), viewer.state.size
+    camera = replace(seen.view, orthographic=False).camera(*size).moved(seen.scene.origin)
+    span = f" --orthographic {seen.view.span_in(*size):.6g}" if seen.view.orthographic else ""
     more = f"; show it again with --camera {path.name}{span}"
     return viewer.save(path, lambda: write_cameras(path, (camera,)), more)
 
@@ -128,7 +125,7 @@ def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
 def save_film(viewer: Viewer, folder: Path = Path()) -> None:
     """Have a film made along the path, to the typed place or to a new name in `folder`."""
     state, record, path = viewer.state, viewer.state.record, viewer.state.session.keyframes
-    if state.extent is None or path_seconds(viewer) <= 0:
+    if state.open is None or path_seconds(viewer) <= 0:
         viewer.say_error("a film needs a path: add two keyframes, or press Turntable")
         return
     typed, fps, request = record.film_file.strip(), record.fps, state.request(record.size)
@@ -140,7 +137,7 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
 
     try:
         named()
-        seen_by = output.cameras_of(flight_of(path), state.extent, fps, record.size)
+        seen_by = output.cameras_of(flight_of(path), state.open.extent, fps, record.size)
     except (InputError, OSError) as error:
         viewer.say_error(f"no film: {error}")
         return
@@ -159,23 +156,23 @@ COMPANIONS = (sidecar.SUFFIX, cameras.SUFFIX)
 LONGEST_WAIT = 60.0  # seconds that a window which is closed waits for what is being written
 
 
-def save_edited(viewer: Viewer, folder: Path, then: Callable[[Viewer], None] = lambda viewer: None) -> None:
+@needs_scene("save it")
+def save_edited(
+    viewer: Viewer, seen: OpenScene, folder: Path, then: Callable[[Viewer], None] = lambda viewer: None
+) -> None:
     """Have the worker write the scene without what was deleted to a new file; `then` runs after that."""
     state = viewer.state
-    if not viewer.has_scene("save it") or state.scene is None:
-        return
-    shown, marked = state.scene, state.session
-    rows, stem = np.flatnonzero(state.marks.kept), state.path.stem if state.path else "scene"
-    scene = replace(shown, language=viewer.language)
+    marked, rows = state.session, np.flatnonzero(state.marks.kept)
+    scene = replace(seen.scene, language=viewer.language)
 
     def work(progress: Progress) -> Path:
-        path = output.free_name(folder, f"{stem}-edited", ".ply", COMPANIONS)
+        path = output.free_name(folder, f"{seen.path.stem}-edited", ".ply", COMPANIONS)
         save_scene(path, replace(scene.take(rows), path=path))
         return path
 
     def done(path: Path) -> None:
         state.say(f"saved {path}: {len(rows):,} Gaussians", file=path)
-        _count_as_saved(viewer, shown, marked)
+        _count_as_saved(viewer, seen.scene, marked)
         then(viewer)
 
     state.writing = viewer.run(
@@ -185,9 +182,10 @@ def save_edited(viewer: Viewer, folder: Path, then: Callable[[Viewer], None] = l
 
 def _count_as_saved(viewer: Viewer, shown: Scene, session: Session) -> None:
     """Count the edits of a session as saved, if its scene is still shown."""
-    state = viewer.state
-    if state.scene is shown:
-        state.saved = replace(state.saved, marks=session.marks, moves=session.moves)
+    state, saved = viewer.state, viewer.state.saved
+    if state.open is not None and state.open.scene is shown:
+        edits = replace(saved.session, marks=session.marks, moves=session.moves)
+        state.saved = replace(saved, session=edits)
 
 
 def finish_writing(viewer: Viewer) -> None:
@@ -263,13 +261,13 @@ def exports() -> tuple[str, ...]:
     return tuple(title for title, row in EXPORTS.items() if row.words.split()[0] in known)
 
 
-def ask_export(viewer: Viewer, title: str, only_selected: bool = False) -> None:
+@needs_scene("export it")
+def ask_export(viewer: Viewer, seen: OpenScene, title: str, only_selected: bool = False) -> None:
     """Open the dialog of the export `title`."""
-    scene, row = viewer.state.scene, EXPORTS[title]
-    if viewer.has_scene("export it") and scene is not None:
-        shown = (flag for flag in row.options if flag != UNIT or scene.metres_per_unit is None)
-        values = {flag: OPTIONS[flag][1] for flag in shown}
-        viewer.state.export_form = ExportForm(title, next(iter(row.sizes)), values, only_selected)
+    row = EXPORTS[title]
+    shown = (flag for flag in row.options if flag != UNIT or seen.scene.metres_per_unit is None)
+    values = {flag: OPTIONS[flag][1] for flag in shown}
+    viewer.state.export_form = ExportForm(title, next(iter(row.sizes)), values, only_selected)
 
 
 def exported(viewer: Viewer, form: ExportForm) -> Array:
@@ -278,38 +276,37 @@ def exported(viewer: Viewer, form: ExportForm) -> Array:
     return marks.selected if form.only_selected else marks.kept
 
 
-def export_size(viewer: Viewer, form: ExportForm) -> str:
+@needs_scene()
+def export_size(viewer: Viewer, seen: OpenScene, form: ExportForm) -> str:
     """Return about how large the files will be, in words."""
-    scene, path, row = viewer.state.scene, viewer.state.path, EXPORTS[form.title]
-    assert scene is not None
-    assert path is not None
-    rows, (in_all, each, by_colour) = exported(viewer, form), row.sizes[form.suffix]
-    size = in_all + rows.sum() * (each + by_colour * scene.gaussians.sh.shape[1])
+    row, rows = EXPORTS[form.title], exported(viewer, form)
+    in_all, each, by_colour = row.sizes[form.suffix]
+    size = in_all + rows.sum() * (each + by_colour * seen.scene.gaussians.sh.shape[1])
     size *= (OPTIONS[CELL][1] / form.values.get(CELL, OPTIONS[CELL][1])) ** 2
     if row.beside:
-        size += rows.mean() * sum(file.stat().st_size for file in scene_files(path)[1:] if file.exists())
+        size += rows.mean() * sum(file.stat().st_size for file in scene_files(seen.path)[1:] if file.exists())
     return f"{'At most' if row.at_most else 'About'} {float(f'{size / 1e6:.2g}'):g} MB"
 
 
-def choose_export(viewer: Viewer) -> None:
+@needs_scene()
+def choose_export(viewer: Viewer, seen: OpenScene) -> None:
     """Have a dialog ask for the file or folder, and write it."""
     form, viewer.state.export_form = viewer.state.export_form, None
     if form is None:
         return
     then = partial(run_export, form=form)
-    new = _new_file(viewer.state.path, folder_of(viewer), form.suffix, f"-{form.title.split()[0]}")
+    new = _new_file(seen.path, folder_of(viewer), form.suffix, f"-{form.title.split()[0]}")
     ask_for(viewer, FileChoice(f"Export: {form.title}", then, "save", (form.suffix,), new))
 
 
-def run_export(viewer: Viewer, out: Path, form: ExportForm) -> None:
+@needs_scene()
+def run_export(viewer: Viewer, seen: OpenScene, out: Path, form: ExportForm) -> None:
     """Have the recorder's thread run the command, on the scene's file or, if it was edited, a copy."""
-    state, row, path, session = viewer.state, EXPORTS[form.title], viewer.state.path, viewer.state.session
-    assert state.scene is not None
-    assert path is not None
-    shown, mask, scene = state.scene, exported(viewer, form), replace(state.scene, language=viewer.language)
+    row, session = EXPORTS[form.title], viewer.state.session
+    path, mask, scene = seen.path, exported(viewer, form), replace(seen.scene, language=viewer.language)
     taught = viewer.engine is not None and bool(viewer.engine.taught)
-    is_own = mask.all() and not (state.session.moves or taught or viewer.watch.changed) and path.exists()
-    rows, write_page_of, chosen = np.flatnonzero(mask), _page(viewer), viewer.services.encoder_id
+    is_own = mask.all() and not (session.moves or taught or viewer.watch.changed) and path.exists()
+    rows, write_page_of, chosen = np.flatnonzero(mask), _page(viewer, seen), viewer.services.encoder_id
     encoder = f"--encoder={chosen}" if chosen else ""  # of the window
     is_new = not out.exists()
     words = [flag if value is True else f"{flag}={value:g}" for flag, value in form.values.items() if value]
@@ -319,7 +316,6 @@ def run_export(viewer: Viewer, out: Path, form: ExportForm) -> None:
         if is_new and out.exists():
             raise InputError(f"{out}: was written by an earlier export; choose another name")
         if form.title == PAGE:
-            check_output_file(out)
             return out, write_page_of(out, scene.take(rows), progress)
         with TemporaryDirectory(prefix="langsplat-") as folder:
             source = path.absolute() if is_own else Path(folder) / f"{path.stem}.ply"
@@ -339,7 +335,7 @@ def run_export(viewer: Viewer, out: Path, form: ExportForm) -> None:
 
     def then() -> None:
         if form.title == SCENE and out.suffix == ".ply" and not form.only_selected:
-            _count_as_saved(viewer, shown, session)
+            _count_as_saved(viewer, seen.scene, session)
 
     _record(viewer, form.title, work, then)
 
@@ -353,16 +349,14 @@ def _said(process: CommandProcess, out: Path) -> str:
     return "; ".join([f"saved {out}", *(own or [line for line in said[-3:] if str(out) not in line])])
 
 
-def _page(viewer: Viewer) -> Callable[[Path, Scene, Progress], str]:
+def _page(viewer: Viewer, seen: OpenScene) -> Callable[[Path, Scene, Progress], str]:
     """Return the function that writes a web page with the current view, the bookmarks and the notes.
 
     The command line does not know these. The function returns the message about the page.
     """
     state, services = viewer.state, viewer.services
-    assert state.view is not None
-    assert state.extent is not None
-    stands = {"as exported": replace(state.view, orthographic=False)}
-    stands |= {mark.name: bookmarked_view(mark, state.extent) for mark in state.session.bookmarks}
+    stands = {"as exported": replace(seen.view, orthographic=False)}
+    stands |= {mark.name: bookmarked_view(mark, seen.extent) for mark in state.session.bookmarks}
     first = [replace(view.camera(*state.size), name=name) for name, view in stands.items()]
     notes = [(note.text, note.at) for note in state.session.notes]
 
@@ -380,36 +374,36 @@ def _page(viewer: Viewer) -> Callable[[Path, Scene, Progress], str]:
 
 def save(viewer: Viewer) -> None:
     """Save the project to its file; where it has none yet, a dialog asks for one."""
-    if viewer.state.project is None:
+    if viewer.state.saved.project is None:
         save_as(viewer)
     else:
         save_project(viewer)
 
 
-def save_as(viewer: Viewer) -> None:
+@needs_scene("save the project")
+def save_as(viewer: Viewer, seen: OpenScene) -> None:
     """Have a dialog ask for the file that the project is saved to from now on."""
-    if viewer.has_scene("save the project"):
-        new = _new_file(viewer.state.path, folder_of(viewer), PROJECTS)
-        ask_for(viewer, FileChoice("Save the project", save_project, "save", (PROJECTS,), new))
+    new = _new_file(seen.path, folder_of(viewer), PROJECTS)
+    ask_for(viewer, FileChoice("Save the project", save_project, "save", (PROJECTS,), new))
 
 
-def save_project(viewer: Viewer, to: Path = Path(), of: SceneState | None = None) -> Path | None:
+@needs_scene("save the project")
+def save_project(viewer: Viewer, seen: OpenScene, to: Path = Path(), of: Visit | None = None) -> Path | None:
     """Save the project as `to`, or where that is a folder to the file that it came from or a new one there.
 
     `of`: a scene that was left, by default the one shown. Return the path, None where saving failed.
     """
-    state = of or viewer.state
-    if not viewer.has_scene("save the project") or not (state.path and state.view):
-        return None
-    path = to if to.name.endswith(PROJECTS) else state.project or _new_file(state.path, to, PROJECTS)
-    known = state.project_digest if path == state.project else ""
+    visit = of or viewer.state.visit(seen)
+    saved, view = visit.saved, visit.view
+    path = to if to.name.endswith(PROJECTS) else saved.project or _new_file(visit.path, to, PROJECTS)
+    known = saved.digest if path == saved.project else ""
     project = Project(
-        scene=os.path.abspath(state.path),
-        gaussians=state.count,
-        origin=point_of(state.origin),
-        view=Bookmark("view", pose_of(state.view), state.view.distance),
-        session=state.session,
-        intrinsics=state.view.intrinsics,
+        scene=os.path.abspath(visit.path),
+        gaussians=visit.count,
+        origin=point_of(visit.origin),
+        view=Bookmark("view", pose_of(view), view.distance),
+        session=visit.session,
+        intrinsics=view.intrinsics,
         panels=viewer.state.preferences.panels or (),
     )
     written: list[tuple[str, Path | None]] = []
@@ -417,10 +411,12 @@ def save_project(viewer: Viewer, to: Path = Path(), of: SceneState | None = None
     apart = partial(output.free_name, path.parent, f"{path.name.removesuffix(PROJECTS)}-other", PROJECTS)
     if viewer.save(path, lambda: written.append(write_project(path, project, apart, known))) is None:
         return None
-    ((state.project_digest, kept),) = written
+    ((digest, kept),) = written
     if kept is not None:
         viewer.say_error(f"{path.name} held what this window has not: kept as {kept.name}")
-    state.saved, state.project = state.session, path
+    visit.saved = Saved(visit.session, path, digest)
+    if visit.path is seen.path:
+        viewer.state.saved = visit.saved
     viewer.state.preferences = viewer.state.preferences.with_recent(path)
     return path
 
@@ -476,8 +472,8 @@ def end(viewer: Viewer, folder: Path = Path()) -> None:
     Where they are is said in the terminal.
     """
     viewer.state.echoes = True
-    for state in viewer.unsaved():
-        save_project(viewer, folder, state)
+    for visit in viewer.unsaved():
+        save_project(viewer, folder, visit)
     if viewer.state.is_unsaved:
         save_edited(viewer, folder, end_at_once)
     else:
@@ -500,6 +496,6 @@ def save_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
 
 def save_project_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
     """Save the projects of all scenes that need it and go on; stay where one cannot be saved."""
-    edited = [viewer.state] if viewer.state.is_unsaved else []
-    if all(save_project(viewer, folder, state) for state in dict.fromkeys((*edited, *viewer.unsaved()))):
+    is_saved = save_project(viewer, folder) is not None if viewer.state.is_changed else True
+    if is_saved and all(save_project(viewer, folder, visit) for visit in viewer.unsaved()):
         go_on(viewer)

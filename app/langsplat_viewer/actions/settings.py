@@ -99,7 +99,7 @@ def move_line(viewer: Viewer, at: float) -> None:
 
 def _can_show(viewer: Viewer, needs_field: bool) -> bool:
     """Return whether the scene has a language field or needs none; report a missing one."""
-    return not needs_field or viewer.state.scene is None or viewer.searchable() is not None
+    return not needs_field or viewer.state.open is None or viewer.searchable() is not None
 
 
 # Overlays, the ruler, and notes that are pinned to places.
@@ -224,7 +224,7 @@ def escape(viewer: Viewer) -> None:
     state, tools = viewer.state, viewer.state.tools
     forms = state.choice or state.export_form or state.leaving
     lay_over = state.show_help or state.show_palette or forms or state.show_start
-    state.show_start &= state.scene is None
+    state.show_start &= state.open is None
     state.show_help = state.show_palette = state.pins_notes = state.letters_muted = False
     state.choice = state.export_form = state.leaving = None
     if state.session.ruler.measures:

@@ -1,6 +1,6 @@
 """The viewpoint: camera moves, the camera path and its keyframes, the cursor, bookmarks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,8 +20,8 @@ from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight
 from langsplat_viewer.rendering.request import Split, image_formation
 from langsplat_viewer.session import LONGEST_NAME, MOST_BOOKMARKS, Bookmark, Query
-from langsplat_viewer.state import GLIDE_SECONDS, SPACING, Glide, Hover, flight_of
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.state import GLIDE_SECONDS, SPACING, Glide, Hover, OpenScene, flight_of
+from langsplat_viewer.viewer import Viewer, needs_scene
 
 # Camera moves, at once or gliding from view to view.
 
@@ -34,118 +34,110 @@ def tick(viewer: Viewer, now: float) -> None:
     glide = viewer.state.glide
     if glide is not None:
         t = (now - glide.began) / GLIDE_SECONDS
-        viewer.state.view = controls.between(glide.start, glide.end, t)
+        viewer.state.look(controls.between(glide.start, glide.end, t))
         if t >= 1:
             viewer.state.glide = None
     _play(viewer)
 
 
-def move(viewer: Viewer, step: Callable[[OrbitCamera], OrbitCamera]) -> None:
+@needs_scene()
+def move(viewer: Viewer, seen: OpenScene, step: Callable[[OrbitCamera], OrbitCamera]) -> None:
     """Apply one of the functions of `controls` at once; it ends a glide."""
-    if viewer.state.view is not None:
-        viewer.state.record.began = None
-        viewer.state.view, viewer.state.glide = step(viewer.state.view), None
+    viewer.state.record.began = viewer.state.glide = None
+    viewer.state.look(step(seen.view))
 
 
-def glide_to(viewer: Viewer, end: OrbitCamera) -> None:
+@needs_scene()
+def glide_to(viewer: Viewer, seen: OpenScene, end: OrbitCamera) -> None:
     """Send the camera to a view."""
-    if viewer.state.view is not None:
-        viewer.state.record.began = None
-        viewer.state.glide = Glide(viewer.state.view, end, viewer.clock)
+    viewer.state.record.began = None
+    viewer.state.glide = Glide(seen.view, end, viewer.clock)
 
 
-def open_at(viewer: Viewer, camera: Camera) -> None:
+@needs_scene()
+def open_at(viewer: Viewer, seen: OpenScene, camera: Camera) -> None:
     """Take a camera's view at once; it is the opening view from now on."""
-    extent, scene = viewer.state.extent, viewer.state.scene
-    if extent is not None and scene is not None:
-        same = [np.array_equal(own.world_to_camera, camera.world_to_camera) for own in scene.cameras]
-        viewer.state.camera_index = same.index(True) if any(same) else None
-        viewer.state.opening_camera = camera
-        move(viewer, lambda view: controls.from_camera(camera, extent))
+    same = [np.array_equal(own.world_to_camera, camera.world_to_camera) for own in seen.scene.cameras]
+    viewer.state.camera_index = same.index(True) if any(same) else None
+    viewer.state.open = replace(seen, opening_camera=camera)
+    move(viewer, lambda view: controls.from_camera(camera, seen.extent))
 
 
-def zoom_by(viewer: Viewer, factor: float) -> None:
+@needs_scene()
+def zoom_by(viewer: Viewer, seen: OpenScene, factor: float) -> None:
     """Multiply the distance to the centre of turning, within limits set by the scene's size."""
-    if (extent := viewer.state.extent) is not None:
-        nearest, farthest = NEAREST * extent.radius, extent.farthest
-        move(viewer, lambda view: controls.zoom(view, factor, nearest, farthest))
+    nearest, farthest = NEAREST * seen.extent.radius, seen.extent.farthest
+    move(viewer, lambda view: controls.zoom(view, factor, nearest, farthest))
 
 
-def opening_view(viewer: Viewer) -> OrbitCamera | None:
-    """Return the first view of a scene, None without a scene.
+def opening_view(seen: OpenScene, size: tuple[int, int]) -> OrbitCamera:
+    """Return the first view of a scene in an area of `size` pixels.
 
-    It is the requested camera, else the first training camera, else a view of the whole scene in the window
-    as it is now.
+    It is the requested camera, else the first training camera, else a view of the whole scene.
     """
-    state = viewer.state
-    if state.scene is None or state.extent is None:
-        return None
-    if state.opening_camera is not None:
-        return controls.from_camera(state.opening_camera, state.extent)
-    return controls.default_view(state.scene, state.extent, state.size)
+    if seen.opening_camera is not None:
+        return controls.from_camera(seen.opening_camera, seen.extent)
+    return controls.default_view(seen.scene, seen.extent, size)
 
 
-def reset_view(viewer: Viewer) -> None:
+@needs_scene()
+def reset_view(viewer: Viewer, seen: OpenScene) -> None:
     """Return to the opening view, in the current projection; to a view of both scenes if it shows one."""
-    view, state = opening_view(viewer), viewer.state
-    if view is None or state.scene is None or state.extent is None:
-        return
-    if state.view is not None and state.view.orthographic:
+    size = viewer.state.size
+    view = opening_view(seen, size)
+    if seen.view.orthographic:
         view = replace(view, orthographic=True)
-        if state.opening_camera is None and not state.scene.cameras:
-            view = controls.frame_all(view, state.extent, state.size)
+        if seen.opening_camera is None and not seen.scene.cameras:
+            view = controls.frame_all(view, seen.extent, size)
     if (other := _compared(viewer)) is not None:
-        camera = view.camera(*state.size)
+        camera = view.camera(*size)
         if not camera.in_image(*camera.project(other.points)).any():
-            is_left = (other.points.mean(0) - state.extent.centre) @ view.rotation[0] < 0
+            is_left = (other.points.mean(0) - seen.extent.centre) @ view.rotation[0] < 0
             view = controls.orbit(view, np.pi * is_left, 0)  # it is drawn right of the line
-            view = controls.frame_all(view, controls.joined(state.extent, other), state.size)
+            view = controls.frame_all(view, controls.joined(seen.extent, other), size)
     glide_to(viewer, view)
 
 
 def _compared(viewer: Viewer) -> Sample | None:
     """Return the sample of a scene that is compared, in the coordinates of the first."""
-    beside, origin = viewer.beside, viewer.state.origin
-    if beside is None or beside.state.extent is None:
+    seen = None if viewer.beside is None else viewer.beside.state.open
+    if seen is None:
         return None
-    sample = beside.state.extent.sample
-    return replace(sample, points=sample.points + (beside.state.origin - origin))
+    sample = seen.extent.sample
+    return replace(sample, points=sample.points + (seen.scene.origin - viewer.state.origin))
 
 
-def frame_scene(viewer: Viewer) -> None:
+@needs_scene()
+def frame_scene(viewer: Viewer, seen: OpenScene) -> None:
     """Show the whole scene, and one that is compared, from the current direction."""
-    state, other = viewer.state, _compared(viewer)
-    if state.view is not None and state.extent is not None:
-        extent = state.extent if other is None else controls.joined(state.extent, other)
-        glide_to(viewer, controls.frame_all(state.view, extent, state.size))
+    other = _compared(viewer)
+    extent = seen.extent if other is None else controls.joined(seen.extent, other)
+    glide_to(viewer, controls.frame_all(seen.view, extent, viewer.state.size))
 
 
-def look_from(viewer: Viewer, side: Side) -> None:
+@needs_scene()
+def look_from(viewer: Viewer, seen: OpenScene, side: Side) -> None:
     """Look along one of the world's axes, at the same target from the same distance."""
-    if viewer.state.view is not None:
-        glide_to(viewer, controls.from_side(viewer.state.view, side))
+    glide_to(viewer, controls.from_side(seen.view, side))
 
 
-def toggle_orthographic(viewer: Viewer) -> None:
+@needs_scene()
+def toggle_orthographic(viewer: Viewer, seen: OpenScene) -> None:
     """Switch between perspective and orthographic projection; a glide under way goes on."""
-    state = viewer.state
-    if state.view is not None:
-        orthographic, glide = not state.view.orthographic, state.glide
-        move(viewer, lambda view: replace(view, orthographic=orthographic))
-        if glide is not None:
-            state.glide = replace(glide, end=replace(glide.end, orthographic=orthographic))
+    orthographic, glide = not seen.view.orthographic, viewer.state.glide
+    move(viewer, lambda view: replace(view, orthographic=orthographic))
+    if glide is not None:
+        viewer.state.glide = replace(glide, end=replace(glide.end, orthographic=orthographic))
 
 
-def go_to_camera(viewer: Viewer, index: int) -> None:
+@needs_scene()
+def go_to_camera(viewer: Viewer, seen: OpenScene, index: int) -> None:
     """Stand where a training photograph was taken; indices beyond the ends wrap round."""
-    scene, extent = viewer.state.scene, viewer.state.extent
-    if scene is None or extent is None:
-        return
-    if not scene.cameras:
+    if not seen.scene.cameras:
         viewer.say_error("this scene has no training cameras (no .cameras.json beside it)")
         return
-    viewer.state.camera_index = index % len(scene.cameras)
-    glide_to(viewer, controls.from_camera(scene.cameras[viewer.state.camera_index], extent))
+    viewer.state.camera_index = index % len(seen.scene.cameras)
+    glide_to(viewer, controls.from_camera(seen.scene.cameras[viewer.state.camera_index], seen.extent))
 
 
 def step_camera(viewer: Viewer, by: int) -> None:
@@ -169,30 +161,30 @@ def focus_result(viewer: Viewer, query: Query | None = None) -> None:
         frame_scene(viewer)
 
 
-def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
+@needs_scene()
+def focus_on(viewer: Viewer, seen: OpenScene, place: Array, box: Array | None) -> None:
     """Bring a thing at `place` (3,) in `box` (2, 3) to the centre, at a distance that suits its size.
 
     The eye is no farther from it than now or in the opening view: beyond that, in a room, is its wall.
     """
-    view, extent, home = viewer.state.view, viewer.state.extent, opening_view(viewer)
-    if view is None or extent is None or home is None:
-        return
+    view, radius, home = seen.view, seen.extent.radius, opening_view(seen, viewer.state.size)
     if box is None:
-        box = np.stack([place, place + 0.1 * extent.radius])
+        box = np.stack([place, place + 0.1 * radius])
     most = max(float(np.linalg.norm(place - view.eye)), home.distance)
     angle = np.radians(min(view.intrinsics.fov_degrees, 170.0))  # the box takes about half of it
     holding = controls.SURROUNDINGS * 0.5 * float(np.linalg.norm(box[1] - box[0]) / np.sin(angle / 2))
-    distance = min(max(holding, NEAREST * extent.radius), most)
+    distance = min(max(holding, NEAREST * radius), most)
     glide_to(viewer, controls.focus(view, place, distance))
 
 
-def move_aside(viewer: Viewer, points: Array, left: float, right: float) -> None:
+@needs_scene()
+def move_aside(viewer: Viewer, seen: OpenScene, points: Array, left: float, right: float) -> None:
     """Glide sideways until (M, 3) points lie beside what covers the image from `left` to `right`.
 
     Both are fractions of its width. What is wider than the room beside it comes to the middle of that.
     """
-    view, (width, height) = viewer.state.view, viewer.state.size
-    if view is None or viewer.state.record.began is not None:
+    view, (width, height) = seen.view, viewer.state.size
+    if viewer.state.record.began is not None:
         return
     pixels, depths = view.camera(width, height).project(points)
     near, far = pixels[:, 0].min() / width, pixels[:, 0].max() / width
@@ -204,11 +196,11 @@ def move_aside(viewer: Viewer, points: Array, left: float, right: float) -> None
     glide_to(viewer, controls.pan(view, by * width * scale, 0, (width, height)))
 
 
-def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
+@needs_scene()
+def focus_pixel(viewer: Viewer, seen: OpenScene, u: float, v: float) -> None:
     """Make the surface under the cursor the centre of turning; (u, v) are fractions of the scene's area."""
-    view = viewer.state.view
-    point = None if view is None else viewer.point_at(u, v, "turn around")
-    if view is not None and point is not None:
+    view, point = seen.view, viewer.point_at(u, v, "turn around")
+    if point is not None:
         # The eye stays, but without perspective the size of things does.
         depth = None if view.orthographic else float((np.array(point) - view.eye) @ view.rotation[2])
         glide_to(viewer, controls.focus(view, np.array(point), depth))
@@ -223,13 +215,12 @@ def path_seconds(viewer: Viewer) -> float:
     return keyframes[-1].seconds if keyframes else 0.0
 
 
-def toggle_playing(viewer: Viewer) -> None:
+@needs_scene("play a path in it")
+def toggle_playing(viewer: Viewer, seen: OpenScene) -> None:
     """Play the path from where it is, or stop there."""
     record = viewer.state.record
     if record.began is not None:
         record.began = None
-    elif not viewer.has_scene("play a path in it"):
-        return
     elif path_seconds(viewer) <= 0:
         viewer.say_error("a path needs two keyframes: add one at the current view")
     else:
@@ -250,7 +241,7 @@ def _play(viewer: Viewer) -> None:
     if record.began is None:
         return
     seconds, at = path_seconds(viewer), viewer.clock - record.began
-    if viewer.state.view is None or seconds <= 0:
+    if viewer.state.open is None or seconds <= 0:
         record.began = None
         return
     if at >= seconds and record.loops:
@@ -263,9 +254,9 @@ def _play(viewer: Viewer) -> None:
 
 def _show(viewer: Viewer, seconds: float) -> None:
     state = viewer.state
-    if state.extent is not None and state.session.keyframes:
-        state.record.at = seconds
-        state.view = flight.view_of(flight.pose_at(flight_of(state.session.keyframes), seconds), state.extent)
+    if state.open is not None and state.session.keyframes:
+        state.record.at, pose = seconds, flight.pose_at(flight_of(state.session.keyframes), seconds)
+        state.look(flight.view_of(pose, state.open.extent))
 
 
 # Keyframes of the path.
@@ -275,56 +266,50 @@ TURN_SECONDS = 8.0  # duration of a turn, until another is set
 SLOW = 250.0  # milliseconds per image of the window above which there are no thumbnails
 
 
-def add_keyframe(viewer: Viewer) -> None:
+@needs_scene("record a path in it")
+def add_keyframe(viewer: Viewer, seen: OpenScene) -> None:
     """Add the current view as a keyframe, some seconds after the last one."""
-    state = viewer.state
-    if not viewer.has_scene("record a path in it") or state.view is None:
-        return
-    keyframes = state.session.keyframes
+    keyframes = viewer.state.session.keyframes
     last = keyframes[-1].seconds + SPACING if keyframes else 0.0
     if last > flight.LONGEST or len(keyframes) >= MOST_KEYFRAMES:
         viewer.say_error(f"a path has at most {MOST_KEYFRAMES} keyframes and {flight.LONGEST:.0f} seconds")
         return
-    added = Keyframe(last, flight.pose_of(state.view))
+    added = Keyframe(last, flight.pose_of(seen.view))
     set_path(viewer, (*keyframes, added), added)
-    state.say(f"keyframe {len(keyframes) + 1} at {added.seconds:.1f} s")
+    viewer.state.say(f"keyframe {len(keyframes) + 1} at {added.seconds:.1f} s")
 
 
-def turn_around(viewer: Viewer) -> None:
+@needs_scene("turn around in it")
+def turn_around(viewer: Viewer, seen: OpenScene) -> None:
     """Replace the path by one turn around the view's target."""
-    if viewer.has_scene("turn around in it") and viewer.state.view is not None:
-        set_path(viewer, flight.turntable(viewer.state.view, TURN_SECONDS).keyframes)
-        viewer.state.record.at = 0.0
-        viewer.state.say(f"the path is one turn of {TURN_SECONDS:.0f} s: Shift+K plays it")
+    set_path(viewer, flight.turntable(seen.view, TURN_SECONDS).keyframes)
+    viewer.state.record.at = 0.0
+    viewer.state.say(f"the path is one turn of {TURN_SECONDS:.0f} s: Shift+K plays it")
 
 
-def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
+@needs_scene()
+def choose_keyframe(viewer: Viewer, seen: OpenScene, key: Keyframe) -> None:
     """Go to a keyframe."""
-    state, record = viewer.state, viewer.state.record
-    if state.extent is not None:
-        glide_to(viewer, flight.view_of(key.pose, state.extent))
-        record.chosen, record.at = key, key.seconds
+    glide_to(viewer, flight.view_of(key.pose, seen.extent))
+    viewer.state.record.chosen, viewer.state.record.at = key, key.seconds
 
 
-def thumbnails(viewer: Viewer) -> Array:
-    """Return the first keyframes as they look in colours, (K * height, width, 3) uint8, one below the other.
+def thumbnails(viewer: Viewer) -> Mapping[Keyframe, Array]:
+    """Return the first keyframes as they look in colours, (height, width, 3) uint8 each.
 
     Each frame draws one more; none where images are slow.
     """
-    state, record = viewer.state, viewer.state.record
-    keys, (known, images) = state.session.keyframes[:MOST_THUMBNAILS], record.thumbnails
-    missing = next((key for key in keys if key not in known), None)
-    made = dict(zip(known, np.split(images, max(len(known), 1)), strict=False))
-    if missing and viewer.surface and state.extent and state.stats.milliseconds < SLOW:
-        camera = flight.view_of(missing.pose, state.extent).camera(*THUMBNAIL)
+    state, keys = viewer.state, viewer.state.session.keyframes[:MOST_THUMBNAILS]
+    made = {key: image for key, image in state.record.thumbnails.items() if key in keys}
+    missing = next((key for key in keys if key not in made), None)
+    if missing and viewer.surface and state.open and state.stats.milliseconds < SLOW:
+        camera = flight.view_of(missing.pose, state.open.extent).camera(*THUMBNAIL)
         request = replace(state.request(THUMBNAIL), camera=camera, split=Split(), answers=())
         picture = replace(request.picture, display="rgb")
         made[missing] = viewer.surface.capture(replace(request, picture=picture))
         viewer.worker.wake()  # for the next one
-    there = tuple(key for key in keys if key in made)
-    if there != known:
-        record.thumbnails = there, np.concatenate([images[:0], *map(made.__getitem__, there)])
-    return record.thumbnails[1]
+    state.record.thumbnails = made
+    return made
 
 
 def put_keyframe(viewer: Viewer, key: Keyframe, new: Keyframe | None = None) -> None:
@@ -385,10 +370,10 @@ def hover(viewer: Viewer, pixel: tuple[int, int] | None) -> None:
     """
     state, before, (width, height) = viewer.state, viewer.state.hover, viewer.state.size
     inside = pixel is not None and 0 <= pixel[0] < width and 0 <= pixel[1] < height
-    if not state.pointing or state.view is None or pixel is None or not inside:
+    if not state.pointing or state.open is None or pixel is None or not inside:
         state.hover = None
-    elif before is None or (before.pixel, before.view) != (pixel, state.view):
-        state.hover = Hover(pixel, state.view, viewer.clock)
+    elif before is None or (before.pixel, before.view) != (pixel, state.open.view):
+        state.hover = Hover(pixel, state.open.view, viewer.clock)
     elif not before.asked and viewer.clock - before.since >= REST_SECONDS and viewer.worker.current is None:
         before.asked = True
         _ask(viewer, before)
@@ -414,21 +399,20 @@ def _ask(viewer: Viewer, place: Hover) -> None:
 # Bookmarks.
 
 
-def add_bookmark(viewer: Viewer, name: str = "") -> None:
+@needs_scene("bookmark a view of it")
+def add_bookmark(viewer: Viewer, seen: OpenScene, name: str = "") -> None:
     """Add the current view, replacing one of the same name. Without a name it gets a number."""
-    state, kept = viewer.state, viewer.state.session.bookmarks
-    if not viewer.has_scene("bookmark a view of it") or state.view is None:
-        return
+    kept = viewer.state.session.bookmarks
     if not name.strip():
         taken, number = {bookmark.name for bookmark in kept}, len(kept) + 1
         name = next(f"view {n}" for n in range(number, 2 * number) if f"view {n}" not in taken)
-    added = Bookmark(printable_line(name, LONGEST_NAME), flight.pose_of(state.view), state.view.distance)
+    added = Bookmark(printable_line(name, LONGEST_NAME), flight.pose_of(seen.view), seen.view.distance)
     others = tuple(bookmark for bookmark in kept if bookmark.name != added.name)
     if len(others) >= MOST_BOOKMARKS:
         viewer.say_error(f"a scene has at most {MOST_BOOKMARKS} bookmarks: delete one")
         return
     viewer.change(bookmarks=(*others, added))
-    state.say(f"bookmark '{added.name}'")
+    viewer.state.say(f"bookmark '{added.name}'")
 
 
 def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:

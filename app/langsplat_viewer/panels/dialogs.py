@@ -42,7 +42,7 @@ class StartPage:
         """`folder`: of the preferences, with the thumbnails."""
         self._folder = folder
         self._cards: list[tuple[Path, np.ndarray | None]] = []
-        self._pictures: defaultdict[Path, ui.Picture] = defaultdict(ui.Picture)
+        self._pictures = defaultdict[int, ui.Picture](ui.Picture)  # by the places of the cards
 
     def _look_up(self, viewer: Viewer) -> None:
         """List the bundled scene and the recent files that are there, each with its thumbnail."""
@@ -82,7 +82,7 @@ class StartPage:
             if number % columns:
                 imgui.same_line()
             with imgui_ctx.push_id(str(number)):
-                if _card(path, None if image is None else self._pictures[path].texture(image), card):
+                if _card(path, None if image is None else self._pictures[number].texture(image), card):
                     opening.open_file(viewer, path)
         imgui.dummy(ImVec2(0, hello_imgui.em_size(0.4)))
         work, text = viewer.worker.current, "Drop a scene, a project or a folder of photographs here"
@@ -371,12 +371,13 @@ def _ask(viewer: Viewer, to: str) -> None:
     state = viewer.state
     if state.is_unsaved:
         count = int(state.marks.deleted.sum())
-        edits = [f"{count:,} deleted"] * (count > 0) + ["some transformed"] * bool(state.session.moves)
+        edits = [f"{count:,} deleted"] if count else []
+        if state.session.moves:
+            edits.append("some transformed")
         said = " and ".join(edits) or "as once opened"
         imgui.text_wrapped(f"Gaussians: {said}. The scene is not saved so.")
     for other in viewer.unsaved():
-        of = other.path.name if other.path else "the scene"
-        imgui.text_wrapped(f"Notes, names, bookmarks or keyframes of {of} are in no project.")
+        imgui.text_wrapped(f"Notes, names, bookmarks or keyframes of {other.path.name} are in no project.")
     imgui.text_unformatted(f"Save before {to}?")
     if state.is_unsaved:
         if ui.button("Save", "The scene as a new file, without what was deleted"):

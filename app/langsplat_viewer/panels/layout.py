@@ -107,7 +107,7 @@ def _draw(viewer: Viewer, panel: Panel) -> None:
     before, io, alpha = imgui.internal.ErrorRecoveryState(), imgui.get_io(), imgui.get_style().alpha
     imgui.internal.error_recovery_store_state(before)
     try:
-        with ui.disabled(panel.needs_scene and viewer.state.view is None):
+        with ui.disabled(panel.needs_scene and viewer.state.open is None):
             panel.draw(viewer)
     except Exception as error:  # noqa: BLE001  it would take the whole window down
         io.config_error_recovery_enable_assert = io.config_error_recovery_enable_tooltip = False
@@ -235,10 +235,10 @@ def draw_over(
     """Draw what lies over the scene: search, legends, tools, questions, dialogs, help and palette."""
     area = ui.scene_area()
     start.draw(viewer, area)
-    menus.draw_status(viewer)
+    menus.draw_status(viewer, [panel.title for panel in all_panels() if panel.dock == FOOT])
     free = _float_search(viewer, area, menus.draw_toolbar(viewer, area))
     state, said = viewer.state, viewer.state.nothing  # in place of an image
-    if state.scene is None and not state.show_start:
+    if state.open is None and not state.show_start:
         work = viewer.worker.current  # which may compile for half a minute
         said = f"{work[0]} ..." if state.opening and work else "Drop a scene here, or press Ctrl+O"
     if said:
@@ -259,7 +259,7 @@ def draw_over(
     dialogs.draw_export(viewer)
     files.draw(viewer)
     menus.draw_help(viewer)
-    menus.draw_palette(viewer)
+    menus.draw_palette(viewer, [panel.title for panel in all_panels()])
 
 
 def _float_search(viewer: Viewer, area: ui.Area, left: float) -> ui.Area:

@@ -8,22 +8,21 @@ from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import __version__
 from langsplat_viewer.actions import editing, opening, settings
-from langsplat_viewer.commands import BY_MENU, COMMANDS, HELD, MENUS, Command, matching, with_key
+from langsplat_viewer.commands import BY_MENU, COMMANDS, EXPORT_MENU, HELD, Command, matching, with_key
 from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.viewer import Viewer
 
 
 def draw_menus(viewer: Viewer, draw_titles: Callable[[Viewer], None]) -> None:
     """Draw the menus, for hello_imgui; `draw_titles` draws those of the panels."""
-    for menu in MENUS:
+    for menu, (first, *others) in BY_MENU.items():
         if imgui.begin_menu(menu):
-            first, *others = BY_MENU[menu]
             _items(viewer, [first])
             if menu == "File":
                 _recent(viewer)
             _items(viewer, others[:-1])
-            if menu == "File" and imgui.begin_menu("Export", viewer.state.scene is not None):
-                _items(viewer, BY_MENU["Export"])
+            if menu == "File" and imgui.begin_menu("Export", viewer.state.open is not None):
+                _items(viewer, EXPORT_MENU)
                 imgui.end_menu()
             _items(viewer, others[-1:])
             if menu == "Window":
@@ -54,14 +53,14 @@ def _recent(viewer: Viewer) -> None:
 
 # The toolbar: commands that have an icon, in a strip at the left edge of the scene.
 
-GROUPS = [group for menu in MENUS if (group := [command for command in BY_MENU[menu] if command.icon])]
+GROUPS = list(filter(None, ([one for one in commands if one.icon] for commands in BY_MENU.values())))
 SIDE_EM, GAP_EM, EDGE_EM = 1.8, 0.4, 0.3  # of a button, between menus, within the strip
 LEAST = 0.8  # of a button's side; a strip that is lower has more columns
 
 
 def draw_toolbar(viewer: Viewer, area: ui.Area) -> float:
     """Draw the buttons over the scene's left edge; return how far they reach into the scene."""
-    if viewer.state.scene is None or not viewer.state.show_panel or viewer.state.show_start:
+    if viewer.state.open is None or not viewer.state.show_panel or viewer.state.show_start:
         return 0.0
     side, gap, edge = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GAP_EM, EDGE_EM))
     margin, rest = 2 * gap, (len(GROUPS) - 1) * gap + 2 * edge
@@ -102,12 +101,12 @@ def button_label(command: Command) -> str:
 
 # The status line.
 
-STATUS_EM, BAR_EM, FOOT = 2.2, 18.0, ("Timeline", "Messages")
+STATUS_EM, BAR_EM = 2.2, 18.0
 DRAWN_BY = {"cpu": "the processor", "opengl": "OpenGL", "cuda": "CUDA", "": "nothing yet"}
 
 
-def draw_status(viewer: Viewer) -> None:
-    """Draw the work under way with its Cancel, the figures, and the buttons of windows at the foot."""
+def draw_status(viewer: Viewer, foot: Sequence[str]) -> None:
+    """Draw the work under way with its Cancel, the figures, and buttons of the panels titled `foot`."""
     if not viewer.state.show_panel or viewer.state.show_start:
         return
     flags = imgui.WindowFlags_.no_scrollbar | imgui.WindowFlags_.no_saved_settings
@@ -116,7 +115,7 @@ def draw_status(viewer: Viewer) -> None:
     imgui.push_style_var(imgui.StyleVar_.frame_padding, hello_imgui.em_to_vec2(0.6, 0.1))
     imgui.set_cursor_pos_y((imgui.get_window_height() - imgui.get_frame_height()) / 2)
     right = imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x
-    right -= sum(ui.button_width(title) + imgui.get_style().item_spacing.x for title in FOOT)
+    right -= sum(ui.button_width(title) + imgui.get_style().item_spacing.x for title in foot)
     imgui.align_text_to_frame_padding()
     work = viewer.worker.current
     if work is not None:
@@ -130,7 +129,7 @@ def draw_status(viewer: Viewer) -> None:
         ui.tip(about)
         imgui.same_line(0, hello_imgui.em_size(1.4))
     imgui.same_line(right)
-    for title in FOOT:
+    for title in foot:
         is_open = title in (viewer.state.preferences.panels or ())
         with theme.styled(text="accent" if is_open else "ink"):
             clicked = imgui.button(f"{title}##status")
@@ -144,8 +143,8 @@ def draw_status(viewer: Viewer) -> None:
 def _figures(viewer: Viewer) -> Iterator[tuple[str, str]]:
     """Yield figures of the scene, the selection and the image: words and their tip."""
     state, stats = viewer.state, viewer.state.stats
-    if state.scene is not None and state.path is not None:
-        yield f"{state.path.name}: {len(state.scene.gaussians):,} Gaussians", str(state.path)
+    if state.path is not None:
+        yield f"{state.path.name}: {state.count:,} Gaussians", str(state.path)
     selected = np.count_nonzero(state.marks.selected)
     if selected:
         yield f"{selected:,} selected", with_key("Selected Gaussians; none", editing.select_none)
@@ -161,8 +160,11 @@ def _figures(viewer: Viewer) -> Iterator[tuple[str, str]]:
 WIDTH_EM, HEIGHT_EM = 26.0, 20.0
 
 
-def draw_palette(viewer: Viewer) -> None:
-    """Draw the palette: a box and the commands that match; Enter does the first, Esc closes."""
+def draw_palette(viewer: Viewer, panels: Sequence[str]) -> None:
+    """Draw the palette: a box and the commands that match; Enter does the first, Esc closes.
+
+    `panels`: the titles of those that can be opened.
+    """
     if not viewer.state.show_palette:
         return
     top = imgui.get_main_viewport().get_center()
@@ -177,7 +179,7 @@ def draw_palette(viewer: Viewer) -> None:
     drafts = viewer.state.drafts
     entered, typed = ui.box("##command", "what to do", drafts.get("##command", ""))
     typing, drafts["##command"] = imgui.is_item_active(), typed
-    found = matching(typed, viewer.state.preferences.recent)
+    found = matching(typed, panels, viewer.state.preferences.recent)
     chosen = found[0] if entered and found else _clicked(found, typing)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
     escaped = imgui.is_key_pressed(imgui.Key.escape)

@@ -126,13 +126,13 @@ def handle(viewer: Viewer, area: ui.Area) -> None:
     held = select.holds_mouse(viewer)
     if not held:
         select.handle_stroke(viewer, area)
-    if viewer.state.view is not None and not io.want_capture_mouse and not held:
+    if viewer.state.open is not None and not io.want_capture_mouse and not held:
         _mouse(viewer, area)
     viewpoint.hover(viewer, _pixel(area))
     handle_keys(viewer)
     letters = not (io.want_text_input or io.key_ctrl or viewer.state.letters_muted)
-    if viewer.state.view is not None and letters:
-        _fly(viewer)
+    if viewer.state.open is not None and letters:
+        _fly(viewer, viewer.state.open.extent.radius)
 
 
 def _pixel(area: ui.Area) -> tuple[int, int] | None:
@@ -175,10 +175,9 @@ def _held(button: int) -> bool:
     return imgui.is_mouse_down(button) and not imgui.is_mouse_clicked(button)
 
 
-def _fly(viewer: Viewer) -> None:
-    """Move the camera by the keys that act as long as they are held."""
-    io, extent, key = imgui.get_io(), viewer.state.extent, imgui.Key
-    assert extent is not None
+def _fly(viewer: Viewer, radius: float) -> None:
+    """Move the camera by the keys that act as long as they are held; `radius`: the scene's."""
+    io, key = imgui.get_io(), imgui.Key
 
     def held(plus: imgui.Key, minus: imgui.Key) -> int:
         return int(imgui.is_key_down(plus)) - int(imgui.is_key_down(minus))
@@ -187,7 +186,7 @@ def _fly(viewer: Viewer) -> None:
     right, up, ahead = held(key.d, key.a), held(key.e, key.q), held(key.w, key.s)
     if right or up or ahead:
         factor = 4.0 if io.key_shift else 0.25 if io.key_alt else 1.0
-        step = factor * viewer.state.preferences.fly_speed * extent.radius * seconds
+        step = factor * viewer.state.preferences.fly_speed * radius * seconds
         viewpoint.move(viewer, lambda view: controls.fly(view, right * step, up * step, ahead * step))
     turn = TURN_SPEED * seconds
     if roll := held(key.right_bracket, key.left_bracket):

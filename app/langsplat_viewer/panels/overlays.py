@@ -23,8 +23,8 @@ from langsplat_viewer.commands import with_key
 from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.rendering.request import Split
 from langsplat_viewer.session import Note, Point, Ruler
-from langsplat_viewer.state import Hover
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.state import Hover, OpenScene
+from langsplat_viewer.viewer import Viewer, needs_scene
 
 TOOLS_EM = 5.2  # of the left edge that two columns of tools take
 GRIP = 12.0  # width of what can be taken hold of, window units
@@ -87,7 +87,7 @@ def text_on_shade(text: str, x: float, y: float, area: ui.Area) -> None:
 def draw_grip(viewer: Viewer, area: ui.Area) -> None:
     """Draw the grip of the line of a wipe; a double click puts it into the middle."""
     split = viewer.state.session.split
-    if not split.has_line or viewer.state.scene is None:
+    if not split.has_line or viewer.state.open is None:
         return
     x = area.left + split.at * area.width
     imgui.set_next_window_pos(ImVec2(x - GRIP / 2, area.top))
@@ -174,32 +174,30 @@ class Pen:
         return pixels[0] + self.corner if inside else None
 
 
-def draw_lines(viewer: Viewer, area: ui.Area) -> None:
+@needs_scene()
+def draw_lines(viewer: Viewer, seen: OpenScene, area: ui.Area) -> None:
     """Draw grid, cameras, boxes, ruler and notes over every image in the area, after they are drawn."""
     state, shown = viewer.state, viewer.state.session.overlays
-    if state.scene is None or state.view is None or state.extent is None:
-        return
-    paint, metres = imgui.get_background_draw_list(), state.scene.metres_per_unit
-    place = state.extent, state.view.up, metres, state.origin
+    view, radius, metres = seen.view, seen.extent.radius, seen.scene.metres_per_unit
+    place, paint = (seen.extent, view.up, metres, seen.scene.origin), imgui.get_background_draw_list()
     grid = overlays.ground_grid(*place) if "grid" in shown else None
     for part in area.columns(state.session.split.columns):
-        pen = Pen(part, state.view.camera(*part.size), overlays.LEAST_DEPTH * state.extent.radius)
+        pen = Pen(part, view.camera(*part.size), overlays.LEAST_DEPTH * radius)
         paint.push_clip_rect(*part.corners, True)
         if grid is not None:
             _lines(pen.segments(grid[0])[0], GRID, 1.0)
         if "cameras" in shown:
-            depth = overlays.FRUSTUM_DEPTH * state.extent.radius
-            _cameras(viewer, overlays.frusta(state.scene.cameras, depth), pen)
+            _cameras(viewer, seen.scene.cameras, overlays.FRUSTUM_DEPTH * radius, pen)
         if "things" in shown:  # after the lines, so that its words are readable
             _things(viewer, pen)
         _ruler(state.session.ruler, pen, metres)
         _notes(state.session.notes, pen)
         paint.pop_clip_rect()
     if "cube" in shown:  # as files call them
-        _axes(state.view, area)
+        _axes(view, area)
     foot = [] if grid is None else [f"grid {overlays.measured(grid[1], metres)}"]
-    if state.view.orthographic:
-        span = overlays.measured(state.view.span_in(*state.size), metres)
+    if view.orthographic:
+        span = overlays.measured(view.span_in(*state.size), metres)
         foot.append(f"orthographic, {span} across the shorter side")
     left, y = area.left + hello_imgui.em_size(TOOLS_EM), area.top + area.height
     for text in foot:
@@ -242,10 +240,9 @@ def _dot(place: Array, colour: Colour) -> None:
     paint.add_circle(middle, 5.0, SHADE)
 
 
-def _cameras(viewer: Viewer, edges: Array, pen: Pen) -> None:
-    """Draw cameras, (C, 8, 2, 3) edges, but the one that the view looks through; a click stands there."""
-    state, mouse = viewer.state, imgui.get_io().mouse_pos
-    assert state.scene is not None
+def _cameras(viewer: Viewer, cameras: tuple[Camera, ...], depth: float, pen: Pen) -> None:
+    """Draw cameras, `depth` deep, but the one that the view looks through; a click stands there."""
+    state, mouse, edges = viewer.state, imgui.get_io().mouse_pos, overlays.frusta(cameras, depth)
     away = np.linalg.norm(edges[:, 0, 0] - pen.camera.position, axis=1) > pen.least
     edges = edges * away[:, None, None, None]  # all in one point, which is no line
     segments, rows = pen.segments(edges.reshape(-1, 2, 3))
@@ -260,8 +257,7 @@ def _cameras(viewer: Viewer, edges: Array, pen: Pen) -> None:
     _lines(segments[owners == chosen], CHOSEN, 2.0)
     if under >= 0:
         _lines(segments[owners == under], HOVERED, 2.0)
-        name = state.scene.cameras[under].name
-        text_on_shade(f"camera {under}  {name}", mouse.x + 14, mouse.y + 10, pen.area)
+        text_on_shade(f"camera {under}  {cameras[under].name}", mouse.x + 14, mouse.y + 10, pen.area)
         if clicked(pen.area):
             viewpoint.go_to_camera(viewer, under)
 
@@ -387,8 +383,9 @@ def _bars(viewer: Viewer, drawing: Drawing, of: str) -> list[Callable[[float], N
     """Return functions that draw a bar of a width: one for depth, or one for each query shown as heat."""
     state, picture, shown = viewer.state, viewer.state.session.picture, viewer.state.shown_results()
     depths, answers = state.stats.depths, painted(shown) if drawing is Drawing.HEAT else {}
-    if drawing is Drawing.DEPTH and depths is not None and state.scene is not None:
-        scale, unit = (1.0, "units") if (metres := state.scene.metres_per_unit) is None else (metres, "m")
+    if drawing is Drawing.DEPTH and depths is not None and state.open is not None:
+        metres = state.open.scene.metres_per_unit
+        scale, unit = (1.0, "units") if metres is None else (metres, "m")
         colours = bar_colours(1.0, picture.colour_map)[::-1]  # the nearest is the hottest
         return [partial(_bar, f"depth, {unit}{of}", colours, (scale * depths[0], scale * depths[1]), None)]
     bars: list[Callable[[float], None]] = []

@@ -21,16 +21,16 @@ from langsplat_viewer.viewer import Training, Viewer
 
 def draw_scene(viewer: Viewer) -> None:
     """Draw the panel "Scene": name and figures of the scene, then the buttons."""
-    state, scene = viewer.state, viewer.state.scene
-    if scene is None:
+    state, seen = viewer.state, viewer.state.open
+    if seen is None:
         imgui.text("Opening ..." if state.opening else "No scene is open")
     else:
-        imgui.text(state.path.name if state.path else "scene")
-        figures = f"{len(scene.gaussians):,} Gaussians, SH {scene.gaussians.sh_degree}"
-        figures += f", {len(scene.cameras)} cameras" if scene.cameras else ""
-        figures += ", no language field" if scene.language is None else ", searchable"
+        imgui.text(seen.path.name)
+        figures = f"{state.count:,} Gaussians, SH {seen.scene.gaussians.sh_degree}"
+        figures += f", {len(seen.scene.cameras)} cameras" if seen.scene.cameras else ""
+        figures += ", searchable" if state.has_field else ", no language field"
         ui.small_wrapped(figures)
-        for warning in state.warnings:
+        for warning in seen.warnings:
             ui.small_wrapped(warning.partition(":")[0], "bad")
             ui.tip(warning)
     ui.verbs(viewer, "Open a scene ...", "Save picture", "Save view", "First steps")

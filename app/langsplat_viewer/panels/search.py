@@ -10,7 +10,6 @@ from langsplat_core.arrays import Array, length_text
 from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, painted
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import disk
 from langsplat_viewer.actions import opening, queries, settings, viewpoint
@@ -226,12 +225,12 @@ def _details(viewer: Viewer, query: Query) -> None:
 def _uncover(viewer: Viewer, answer: QueryAnswer) -> None:
     """Move the view aside if a panel covers what was found: once, and not during a drag; else say so."""
     state, area = viewer.state, ui.scene_area()
-    if state.view is None or state.glide is not None or not answer.things:
+    if state.open is None or state.glide is not None or not answer.things:
         return
     is_new = state.uncovered is not answer.things
     settings.put(state, uncovered=answer.things)
     corners = np.concatenate([thing.oriented.corners for thing in answer.things])
-    pixels, depths = state.view.camera(*area.size).project(corners)
+    pixels, depths = state.open.view.camera(*area.size).project(corners)
     pixels, gap = pixels + (area.left, area.top), hello_imgui.em_size(1)
     for low, high in ui.lying_over(TITLE):
         under = ((pixels >= tuple(low)) & (pixels <= tuple(high))).all(1) & (depths > 0)
@@ -268,24 +267,23 @@ LEVEL_TIPS: dict[LevelChoice, str] = {
 
 def why(viewer: Viewer) -> str:
     """Return why nothing can be searched, or why the chosen query was not answered, in one line."""
-    state = viewer.state
-    query, scene = state.session.query(state.session.chosen), state.scene
+    state, query = viewer.state, viewer.state.session.query(viewer.state.session.chosen)
     problem = "" if query is None else state.answer(query).problem
-    return " ".join((no_field(scene) if scene is not None and scene.language is None else problem).split())
+    return " ".join((state.why_no_field or problem).split())
 
 
 def draw(viewer: Viewer) -> None:
     """Draw the search box, the level and the list of queries."""
-    scene = viewer.state.scene
-    if viewer.training is not None and disk.is_preview(viewer.state.path):
+    state = viewer.state
+    if viewer.training is not None and disk.is_preview(state.path):
         ui.small_wrapped("in training: the scene opens when its language field is done")
         return
-    if scene is not None and scene.language is None:
-        ui.small_wrapped(no_field(scene))
+    if state.why_no_field:
+        ui.small_wrapped(state.why_no_field)
         if ui.button("Train one ...", "From the photographs of this scene, which stays as it is"):
             opening.train_language(viewer)
         return
-    with ui.disabled(scene is None):
+    with ui.disabled(state.open is None):
         _box(viewer)
         _level(viewer)
     _answers(viewer)

@@ -131,7 +131,7 @@ def held_mode() -> Mode | None:
 def draw_stroke(viewer: Viewer, area: ui.Area) -> None:
     """Draw the outline of the stroke under way, and the brush."""
     tools = viewer.state.tools
-    if tools.tool is None or viewer.state.scene is None:
+    if tools.tool is None or viewer.state.open is None:
         return
     paint = imgui.get_foreground_draw_list()
     paint.push_clip_rect(*area.corners)
@@ -158,7 +158,7 @@ def draw_hint(viewer: Viewer, area: ui.Area) -> None:
     state, tool = viewer.state, viewer.state.tools.tool
     if state.session.ruler.measures:
         text = "Ruler: click two points on the surface, or X: the middle; Esc ends it"
-        if state.scene is not None and state.scene.metres_per_unit is None:
+        if state.open is not None and state.open.scene.metres_per_unit is None:
             text += ". langsplat scale gives the scene metres"
     elif state.pins_notes:
         text = "Note: click what it is about, or X: the middle; Esc leaves"
@@ -195,7 +195,7 @@ def draw_transform(viewer: Viewer) -> None:
     if kind != state.edit_form.gizmo:
         editing.set_gizmo(viewer, kind)
     form = state.edit_form
-    step = NEAR * (1.0 if state.extent is None else state.extent.radius)  # per pixel that is dragged
+    step = NEAR * (1.0 if state.open is None else state.open.extent.radius)  # per pixel that is dragged
     move = _three("Move", form.move, step, "World units along x, y and z")
     rotate = _three("Rotate", form.rotate, 0.5, "Degrees about x, then y, then z, right-handed")
     ui.leave_room("Scale", 12)
@@ -231,7 +231,7 @@ def _is_shown(viewer: Viewer) -> bool:
     """Return whether the gizmo is drawn: not under what lies over the scene."""
     state = viewer.state
     covered = state.show_help or state.show_palette or imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
-    return state.edit_form.gizmo != "off" and state.scene is not None and not covered
+    return state.edit_form.gizmo != "off" and state.open is not None and not covered
 
 
 def holds_mouse(viewer: Viewer) -> bool:
@@ -243,13 +243,10 @@ def draw_gizmo(viewer: Viewer, area: ui.Area) -> None:
     """Draw the chosen gizmo where it was dragged to; a drag is previewed, and applied on release."""
     state = viewer.state
     kind = state.edit_form.gizmo
-    if not _is_shown(viewer) or state.view is None or state.session.split.columns > 1:
+    if state.open is None or not _is_shown(viewer) or state.session.split.columns > 1:
         return
-    centre = editing.pivot(viewer)
-    if centre is None:
-        return
-    camera = state.view.camera(*area.size)
-    view, projection = gl_matrices(camera, state.view.distance)
+    centre, camera = editing.pivot(viewer, state.open), state.open.view.camera(*area.size)
+    view, projection = gl_matrices(camera, state.open.view.distance)
     paint = imgui.get_foreground_draw_list()
     paint.push_clip_rect(*area.corners)
     gizmo.begin_frame()

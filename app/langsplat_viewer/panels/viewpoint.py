@@ -1,6 +1,7 @@
 """The panels "Camera", "Timeline", "Record" and "Bookmarks"."""
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -23,14 +24,13 @@ CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut
 
 def draw_camera(viewer: Viewer) -> None:
     """Draw the panel "Camera"."""
-    state = viewer.state
-    if state.scene is not None and state.scene.cameras:
-        _training_cameras(viewer, state.scene.cameras)
+    state, seen = viewer.state, viewer.state.open
+    if seen is not None and seen.scene.cameras:
+        _training_cameras(viewer, seen.scene.cameras)
     ui.verbs(viewer, "Reset", "Focus", "Frame all", "Horizon", "Align up axis")
-    if state.view is not None:
-        _projection(viewer, state.view)
-    if state.extent is not None:
-        _cuts(viewer, state.extent.radius)
+    if seen is not None:
+        _projection(viewer, seen.view)
+        _cuts(viewer, seen.extent.radius)
     viewer.change("settings", **ui.draw_fields(state.session, "Camera"))
     settings.prefer(viewer, **ui.draw_fields(state.preferences, "Camera"))
 
@@ -121,29 +121,27 @@ def _keyframes(viewer: Viewer) -> None:
         if not keyframes:
             ui.small_wrapped("Add the current view; the path goes smoothly from one keyframe to the next")
         images = viewpoint.thumbnails(viewer)
-        drawn = record.thumbnails[0]
         for number, key in enumerate(keyframes):
             with imgui_ctx.push_id(str(number)):
-                _card(viewer, number, key, drawn.index(key) if key in drawn else None, images)
+                _card(viewer, number, key, images.get(key))
             imgui.same_line()
     imgui.end_child()
 
 
-_strip = ui.Picture()  # the thumbnails, one below the other
+_pictures = defaultdict[int, ui.Picture](ui.Picture)  # the thumbnails, by their numbers
 
 
-def _card(viewer: Viewer, number: int, key: Keyframe, place: int | None, images: Array) -> None:
+def _card(viewer: Viewer, number: int, key: Keyframe, image: Array | None) -> None:
     """Draw a keyframe as it will look, over its time; a click goes there."""
     room = imgui.get_content_region_avail().y - imgui.get_text_line_height_with_spacing()
-    height, count = min(hello_imgui.em_size(MOST_EM), max(room - 8, 16)), len(images) // THUMBNAIL[1]
+    height = min(hello_imgui.em_size(MOST_EM), max(room - 8, 16))
     size = ImVec2(height * THUMBNAIL[0] / THUMBNAIL[1], height)
     border = "accent" if key is viewer.state.record.chosen else "line"
     with imgui_ctx.begin_group():
         with theme.styled(border=border, frame_padding=hello_imgui.em_to_vec2(0.15, 0.15)):
-            if place is not None:
-                ends = ImVec2(0, place / count), ImVec2(1, (place + 1) / count)
-                texture = imgui.ImTextureRef(_strip.texture(images).glo)
-                clicked = imgui.image_button("##keyframe", texture, size, *ends)
+            if image is not None:
+                texture = imgui.ImTextureRef(_pictures[number].texture(image).glo)
+                clicked = imgui.image_button("##keyframe", texture, size)
             else:
                 clicked = imgui.button(f"{number + 1}##keyframe", size)
         ui.coloured(f"{number + 1}   {key.seconds:.2f} s")
@@ -158,9 +156,9 @@ def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
     ui.beside("Time", hello_imgui.em_size(NUMBER_EM))
     if (seconds := _number("Time", key.seconds, 0.5)) is not None:
         viewpoint.put_keyframe(viewer, key, replace(key, seconds=seconds))
-    view = viewer.state.view
-    if ui.next_button("Set to this view", "Put the current view in its place") and view is not None:
-        viewpoint.put_keyframe(viewer, key, replace(key, pose=pose_of(view)))
+    seen = viewer.state.open
+    if ui.next_button("Set to this view", "Put the current view in its place") and seen is not None:
+        viewpoint.put_keyframe(viewer, key, replace(key, pose=pose_of(seen.view)))
     if ui.next_button("Remove", "Take it off the path"):
         viewpoint.put_keyframe(viewer, key)
 
@@ -198,7 +196,7 @@ def draw_bookmarks(viewer: Viewer) -> None:
     bookmarks, words = viewer.state.session.bookmarks, "views that you keep are listed here"
     rows = [ui.Row(bookmark.name) for bookmark in bookmarks]
     clicked, gone = ui.listed("bookmarks", rows, with_key(words, viewpoint.add_bookmark))
-    if clicked is not None and viewer.state.extent is not None:
-        viewpoint.glide_to(viewer, viewpoint.bookmarked_view(bookmarks[clicked], viewer.state.extent))
+    if clicked is not None and viewer.state.open is not None:
+        viewpoint.glide_to(viewer, viewpoint.bookmarked_view(bookmarks[clicked], viewer.state.open.extent))
     if gone is not None:
         settings.take_off(viewer, "bookmarks", bookmarks[gone])

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Generic, Literal, TypeVar, cast
 
 import moderngl
@@ -42,10 +43,12 @@ from langsplat_core.raster.opengl.rasterizer import (
 )
 from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import Scene
+from langsplat_core.scene.gaussians import Merged
 from langsplat_viewer.rendering.request import (
     VISIBLE_ALPHA,
     Pane,
     RenderRequest,
+    Splats,
     image_formation,
     with_splats,
 )
@@ -65,19 +68,13 @@ class Inputs:
     """
 
     def __init__(self) -> None:
-        self._scene: tuple[tuple[object, ...], Scene] | None = None
+        self._scene = lru_cache(maxsize=1)(_projected_scene)
         self._of: tuple[object, ...] = ()  # whose channels are kept
         self._channels: dict[tuple[object, ...], Channel] = {}
 
     def scene(self, request: RenderRequest) -> Scene:
         """Return the Gaussians that are projected, as a scene."""
-        of = (request.scene.scene, request.splats, request.merged)
-        if self._scene is None or self._scene[0] != of:
-            scene = request.scene.scene
-            if request.merged is not None:
-                scene = replace(scene, gaussians=request.merged.gaussians, language=None, extras={})
-            self._scene = of, with_splats(scene, request.splats)
-        return self._scene[1]
+        return self._scene(request.scene.scene, request.splats, request.merged)
 
     def channels(self, request: RenderRequest) -> list[Channel]:
         """Return the further channel of each pane, then that of what is selected."""
@@ -94,6 +91,12 @@ class Inputs:
         if selected not in self._channels:
             self._channels[selected] = _merged(request, request.scene.selected)
         return [self._channels[key] for key in (*(key for _, key in wanted), selected)]
+
+
+def _projected_scene(scene: Scene, splats: Splats, merged: Merged | None) -> Scene:
+    if merged is not None:
+        scene = replace(scene, gaussians=merged.gaussians, language=None, extras={})
+    return with_splats(scene, splats)
 
 
 def _channel(request: RenderRequest, pane: Pane) -> Channel:
