@@ -443,18 +443,6 @@ SETTINGS = [
     for setting in numeric_settings(cls())
     if "." not in setting[0]  # those of configurations inside are met in their own class
 ]
-COMMANDS = (
-    "train d --out s.ply",
-    "train d --out s.ply --codec.kind linear",
-    "query s.ply cup",
-    "describe s.ply",
-    "select s.ply cup --out t.ply",
-    "scale s.ply",
-    "convert s.ply t.ply",
-    "convert s.npz t.ply --codec.kind=autoencoder",
-    "compact s.ply",
-    "bench raster",
-)
 
 
 def outside(own: Any, bound: config.Range, hint: Any) -> list[Any]:
@@ -486,13 +474,6 @@ def test_numbers_outside_their_range_are_refused_by_name(name: str, option: str,
         message = str(caught.value)
         assert message.startswith(f"{option} "), message
         assert len(message) < 200
-
-
-@pytest.mark.parametrize("line", COMMANDS)
-def test_every_number_of_every_command_has_a_range(line: str) -> None:
-    command = parse(line.split())
-    assert [option for option, _, hint in numeric_settings(command) if range_of(hint) is None] == []
-    check_settings(command)
 
 
 @pytest.mark.parametrize(

@@ -26,12 +26,14 @@ from langsplat_core import __version__
 from langsplat_core.cli.app import command_names, entry, load_command, parse
 from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Doctor
+from langsplat_core.config import check_settings, range_of
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline import encoder_check
 from langsplat_viewer.program import ViewerCommand
 from langsplat_viewer.program import entry as viewer_entry
 from langsplat_viewer.program import parse as viewer_parse
+from tests.support.fakes import numeric_settings
 from tests.support.processes import refusal, run
 from tests.support.scenes import DEMO
 from tests.support.tiny_models import tiny_clip
@@ -215,6 +217,15 @@ def corner(tmp_path_factory: pytest.TempPathFactory) -> Path:
         save_scene(folder / name, replace(made, path=None))
     (folder / "v.txt").write_text("gift\nwood\n")
     return folder
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_number_of_every_command_has_a_range(name):
+    words = LINES[name].replace("--", "", 1).split()
+    command = viewer_parse(words) if name == "viewer" else parse([*name.split(), *words])
+    without = {option for option, _, hint in numeric_settings(command) if range_of(hint) is None}
+    assert without <= {"--rotate", "--start"}  # refused where they are used
+    check_settings(command)
 
 
 def odd_places(name: str) -> Iterator[tuple[list[str], list[str], int]]:

@@ -305,10 +305,6 @@ def test_outlines_follow_the_stroke():
     assert len(outlines(behind)) < 12
 
 
-def names_in(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
-
-
 @pytest.fixture
 def pruned(opened):
     """The plant is deleted."""
@@ -429,8 +425,8 @@ def test_edited_scene_never_overwrites(pruned, tmp_path):
         saving.save_edited(pruned, tmp_path)
     saving.finish_writing(pruned)  # waits for both
     assert taken.read_text() == "precious"
-    written = [name for name in names_in(tmp_path) if name.endswith(".ply")]
-    assert written == ["blobs-edited-002.ply", "blobs-edited-003.ply"]
+    written = {path.name for path in tmp_path.glob("*.ply")}
+    assert written == {"blobs-edited-002.ply", "blobs-edited-003.ply"}
 
 
 def test_deletion_is_unsaved_until_exported(pruned, tmp_path):

@@ -429,7 +429,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     save_scene(tmp_path / "blobs.ply", blob_scene(phrasebook=True))
     write_flight(tmp_path / "path.json", flight())
     write_flight(tmp_path / "away.json", flight(1.0))
-    (tmp_path / "broken.json").write_text('{"langsplat_flight": 1}')
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -518,25 +517,3 @@ def test_film_of_nothing_is_refused(folder):
     seen_by = cameras_of(Flight(keys), extent_of(blob_scene()), 2.0, SIZE)
     lines = make_film(request(), seen_by, 2.0, folder / "a.mp4", "cpu")
     assert lines[1].endswith("of 5 pictures show nothing of the scene")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        (["--path", "path.json", "--turntable", "3", "--out", "a.mp4"], "choose one"),
-        (["--path", "path.json", "--orthographic", "2", "--out", "a.mp4"], "--orthographic is for one view"),
-        (["--path", "path.json"], "--out film.mp4"),
-        (["--path", "path.json", "--out", "a.png"], "a film is .mp4"),
-        (["--fps", "9", "--out", "a.png"], "--fps: is only used with --path or --turntable"),
-        (["--path", "broken.json", "--out", "a.mp4"], "broken.json"),
-        (["--turntable", "0", "--out", "a.mp4"], "--turntable 0"),
-        (["--turntable", "36000", "--fps", "240", "--out", "a.mp4"], "lower --fps"),
-        (["--turntable", "1", "--size", "33x24", "--out", "a.mp4"], "choose 32x24"),
-    ],
-)
-def test_impossible_options_are_one_line(program, folder, arguments, reason):
-    before = sorted(folder.rglob("*"))
-    code, out, err = program("blobs.ply", *arguments)
-    assert (code, out, len(err)) == (2, [], 1)
-    assert reason in err[0]
-    assert sorted(folder.rglob("*")) == before

@@ -16,15 +16,15 @@ import pytest
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.io.cameras import write_cameras
-from langsplat_core.io.scenes import companion_path, save_scene
-from langsplat_core.io.sidecar import SUFFIX as SIDECAR
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import options
 from langsplat_viewer.options import load_text_encoder, parse_size
+from langsplat_viewer.projects import write_flight
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.processes import Cast, play, python, surroundings
 from tests.support.scenes import with_tree
-from tests.support.windowless import picture
+from tests.support.windowless import flight, picture
 
 MUG, BOOK, PLANT = CENTRES
 
@@ -35,14 +35,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     save_scene(tmp_path / "blobs.ply", with_tree(blob_scene(phrasebook=True)))
     save_scene(tmp_path / "old.ply", blob_scene())
     save_scene(tmp_path / "plain.ply", blob_scene(field=False, with_cameras=False))
-    whole = (tmp_path / "plain.ply").read_bytes()
-    (tmp_path / "truncated.ply").write_bytes(whole[: len(whole) // 2])
-    moved = blob_scene()
-    gaussians = replace(moved.gaussians, means=moved.gaussians.means + 1)
-    save_scene(tmp_path / "edited.ply", Scene(gaussians))
-    sidecar = companion_path(tmp_path / "blobs.ply", SIDECAR)
-    companion_path(tmp_path / "edited.ply", SIDECAR).write_bytes(sidecar.read_bytes())
-    save_scene(tmp_path / "nothing.ply", Scene(gaussians.take(np.zeros(len(gaussians), bool))))
+    save_scene(tmp_path / "nothing.ply", blob_scene().take(np.arange(0)))
+    write_flight(tmp_path / "path.json", flight())
     (tmp_path / "broken.json").write_text('[{"width": 12')
     (tmp_path / "empty.json").write_text("[]")
     monkeypatch.chdir(tmp_path)
@@ -137,9 +131,7 @@ REFUSED = [  # words, and why
         ([*arguments, *IMAGE], reason)
         for arguments, reason in [
             (["nope.ply"], "nope.ply: no such file"),
-            (["truncated.ply"], "truncated.ply: truncated"),
             (["nothing.ply"], "the scene holds no Gaussians"),
-            (["edited.ply", "--query", "mug"], "edited.langsplat.safetensors"),
             (["blobs.ply", "--query", "sofa"], "'sofa'"),
             (["blobs.ply", "--camera", "3"], "cameras 0 to 2"),
             (["blobs.ply", "--camera", "nope.json"], "nope.json: no such file"),
@@ -165,6 +157,20 @@ REFUSED = [  # words, and why
             (["--headless", "--out", "folder.png"], "is a folder"),
             (["--out", "a.png"], "with --headless"),
             (["--transparent"], "with --headless"),
+            (["--headless", "--fps", "9", "--out", "a.png"], "--fps: is only used with --path or"),
+            (["--headless", "--path", "path.json"], "--out film.mp4"),
+            (["--headless", "--path", "path.json", "--out", "a.png"], "a film is .mp4"),
+        ]
+    ),
+    *(
+        (["blobs.ply", "--headless", *arguments, "--out", "a.mp4"], reason)
+        for arguments, reason in [
+            (["--path", "path.json", "--turntable", "3"], "choose one"),
+            (["--path", "path.json", "--orthographic", "2"], "--orthographic is for one view"),
+            (["--path", "broken.json"], "broken.json"),
+            (["--turntable", "0"], "--turntable 0"),
+            (["--turntable", "36000", "--fps", "240"], "lower --fps"),
+            (["--turntable", "1", "--size", "33x24"], "choose 32x24"),
         ]
     ),
 ]
@@ -173,11 +179,12 @@ REFUSED = [  # words, and why
 @pytest.mark.parametrize(("arguments", "reason"), REFUSED)
 def test_impossible_options_are_one_line(run_viewer, folder, arguments, reason):
     (folder / "folder.png").mkdir()
+    before = sorted(folder.rglob("*"))
     code, out, err = run_viewer(*arguments)
     assert (code, out, len(err)) == (2, [], 1)
     assert reason in err[0]
     assert err[0].startswith("langsplat-viewer: ")
-    assert not (folder / "a.png").exists()
+    assert sorted(folder.rglob("*")) == before
 
 
 def test_absent_encoder_is_one_line(run_viewer, monkeypatch, folder):
