@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from functools import reduce
 from operator import or_
 from pathlib import Path
+from shutil import copyfile
 from threading import Event, Timer
 
 import numpy as np
@@ -24,6 +25,7 @@ from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import BackendError
 from langsplat_core.io.scenes import load_scene
+from langsplat_core.pipeline.report import PREVIEW
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
@@ -373,6 +375,10 @@ def without_field(s: Session) -> None:
     s.ctx.yield_(3)
     assert not s.ctx.item_exists("//**/##name this")  # nor anything else of which each would be refused
 
+    copyfile(s.folder / "plain.ply", s.folder / PREVIEW)  # of a training that was stopped
+    s.drop(PREVIEW)
+    assert not s.ctx.item_exists("//**/Train one ...")  # but Train goes on
+    s.drop("plain.ply")
     s.drop("truncated.ply")
     assert s.state.messages[-1].is_error
     assert "truncated.ply" in s.state.messages[-1].text

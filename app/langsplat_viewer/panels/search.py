@@ -275,8 +275,8 @@ def why(viewer: Viewer) -> str:
 def draw(viewer: Viewer) -> None:
     """Draw the search box, the level and the list of queries."""
     state = viewer.state
-    if viewer.training is not None and disk.is_preview(state.path):
-        ui.small_wrapped("in training: the scene opens when its language field is done")
+    if disk.is_preview(state.path):
+        ui.small_wrapped("a training so far: the scene opens when Train has finished its language field")
         return
     if state.why_no_field:
         ui.small_wrapped(state.why_no_field)
