@@ -6,7 +6,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import TrainPreset
@@ -19,17 +19,9 @@ from langsplat_core.scene import NO_ORIGIN, Camera, Scene
 from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, hidden_nodes, middle_of_selected
+from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, hidden_nodes, selected_middle
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes, widget
 from langsplat_viewer.session import OF_PROJECT, Marked, Move, Note, Point, Preferences, Query, Session
-
-T = TypeVar("T")
-
-
-def last(make: Callable[..., T]) -> Callable[..., T]:
-    """Return a function that keeps the last result of `make`, as long as its arguments stay."""
-    return lru_cache(maxsize=1)(make)
-
 
 # Camera path and film: the panel "Record".
 
@@ -75,7 +67,7 @@ class QueryAnswer:
     pending: bool = False
     has_evidence: bool = False  # training kept its evidence
     like: QueryResult | None = None  # of a name that finds what was given it: all that is like that
-    with_cut: Callable[[QueryResult, float], QueryResult] = field(default_factory=lambda: last(recut))
+    with_cut: Callable[[QueryResult, float], QueryResult] = field(default_factory=lambda: lru_cache(1)(recut))
 
     def at(self, cut: float | None) -> QueryResult | None:
         """Return the result with another threshold; with its own one for None."""
@@ -122,7 +114,7 @@ class OutlineView:
     tree: Tree | None = None
     problem: str = ""  # why there is none, or none yet
     colours: dict[tuple[str, int, int], Point] = field(default_factory=dict)  # by display, level and node
-    hidden: Callable[[Tree, Marks], Array] = field(default_factory=lambda: last(hidden_nodes))
+    hidden: Callable[[Tree, Marks], Array] = field(default_factory=lambda: lru_cache(1)(hidden_nodes))
 
 
 @dataclass(frozen=True)
@@ -273,8 +265,11 @@ class SceneState:
     suggestions: Suggestions = field(default_factory=Suggestions)
     offered: tuple[str, tuple[str, tuple[str, ...]]] = ("", ("", ()))  # what was typed, and its offers
     suggestions_of: QueryEngine | None = None  # of the scene that they were looked for in
-    middle: Callable[[Scene, Marks], Array | None] = field(default_factory=lambda: last(middle_of_selected))
-    masks_of: Callable[[Marked, int], Marks] = field(default_factory=lambda: last(Marked.masks))
+    # Functions that keep their last result, as long as the scene is open.
+    middle: Callable[[Scene, Marks], Array | None] = field(
+        default_factory=lambda: lru_cache(1)(selected_middle)
+    )
+    masks_of: Callable[[Marked, int], Marks] = field(default_factory=lambda: lru_cache(1)(Marked.masks))
     _edited: EditedScene | None = None  # of the last request
 
     def visit(self, seen: OpenScene) -> Visit:

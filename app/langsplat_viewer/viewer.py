@@ -198,7 +198,6 @@ class Viewer:
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     describer: Describer | None = None  # of the same scene, once it was needed
     beside: "Viewer | None" = None  # of a second scene, seen and asked as this one is
-    mirrored: Session | None = None  # of the first scene, that this second one was given last
     surface: ShownImage | None = None
     training: Training | None = None  # under way
     clock: float = 0.0  # seconds, as of the last frame

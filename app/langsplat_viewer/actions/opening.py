@@ -180,11 +180,13 @@ def return_to(viewer: Viewer, visit: Visit | None) -> None:
 
 def take_session(viewer: Viewer, session: Session) -> None:
     """Adopt an earlier session, without what the scene that is shown no longer has."""
+    adopt(viewer, _fitting(viewer, session))
+
+
+def _fitting(viewer: Viewer, session: Session) -> Session:
     if viewer.engine is None or not viewer.state.has_field:
-        session = replace(_without_field(session), things=Things())
-    else:
-        session = replace(session, things=session.things.known(viewer.engine.tree.count))
-    adopt(viewer, session)
+        return replace(_without_field(session), things=Things())
+    return replace(session, things=session.things.known(viewer.engine.tree.count))
 
 
 def reload(viewer: Viewer) -> None:
@@ -473,10 +475,9 @@ def follow_beside(viewer: Viewer) -> None:
     if other.open is None or state.open is None:
         return
     other.look(state.open.view.moved(state.origin - other.origin))
-    session = _mirrored(state, other)
-    if session != beside.mirrored:
-        beside.mirrored = session
-        take_session(beside, session)
+    session = _fitting(beside, _mirrored(state, other))
+    if session != other.session:
+        adopt(beside, session)
 
 
 def _mirrored(state: ViewerState, other: ViewerState) -> Session:
