@@ -65,7 +65,7 @@ COMBINED: dict[Mode, Callable[[Array, Array], Array]] = {
 }
 
 
-def selected_middle(scene: Scene, marks: Marks) -> Array | None:
+def middle_of(scene: Scene, marks: Marks) -> Array | None:
     """Return the (3,) median of what is selected, world units; None where nothing is that can be drawn."""
     chosen = marks.selected & scene.gaussians.valid()
     return np.median(scene.gaussians.means[chosen].astype(np.float64), axis=0) if chosen.any() else None

@@ -75,17 +75,17 @@ def pack(mask: Array) -> Bits | None:
 
 
 @dataclass(frozen=True)
-class Marked:
+class MarkBits:
     """The masks of `Marks` as a session keeps them; None: nothing is marked."""
 
     selected: Bits | None = None
     hidden: Bits | None = None
     deleted: Bits | None = None
 
-    def of(self, marks: Marks) -> "Marked":
+    def of(self, marks: Marks) -> "MarkBits":
         """Return the bits of `marks`; those of this object where they are the same: histories share them."""
         pairs = ((getattr(self, name), pack(getattr(marks, name))) for name in MASKS)
-        return Marked(*(old if old == new else new for old, new in pairs))
+        return MarkBits(*(old if old == new else new for old, new in pairs))
 
     def masks(self, count: int) -> Marks:
         """Unpack these bits into masks, (count,) bool each."""
@@ -199,7 +199,7 @@ class Session:
     adds: bool = False  # a new answer is shown beside those that are, not in their place
 
     # what was selected, edited, named and noted
-    marks: Marked = field(default_factory=Marked)
+    marks: MarkBits = field(default_factory=MarkBits)
     moves: Annotated[tuple[Move, ...], Meta(max_length=100)] = ()  # transforms since the scene was opened
     things: Things = field(default_factory=Things)
     notes: Annotated[tuple[Note, ...], Meta(max_length=MOST_NOTES)] = ()
@@ -283,7 +283,7 @@ class Session:
         """
         kept: dict[str, Any] = {name: getattr(now, name) for name in OF_WINDOW}
         kept |= {"picture": replace(now.picture, display=self.picture.display)}
-        return replace(self, **kept | {"latent_level": self.latent_level}, marks=Marked(), moves=())
+        return replace(self, **kept | {"latent_level": self.latent_level}, marks=MarkBits(), moves=())
 
 
 # What led from a session to the next, for undo to name it.

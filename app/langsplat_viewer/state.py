@@ -19,9 +19,9 @@ from langsplat_core.scene import NO_ORIGIN, Camera, Scene
 from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, hidden_nodes, selected_middle
+from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, hidden_nodes, middle_of
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes, widget
-from langsplat_viewer.session import OF_PROJECT, Marked, Move, Note, Point, Preferences, Query, Session
+from langsplat_viewer.session import OF_PROJECT, MarkBits, Move, Note, Point, Preferences, Query, Session
 
 # Camera path and film: the panel "Record".
 
@@ -266,10 +266,8 @@ class SceneState:
     offered: tuple[str, tuple[str, tuple[str, ...]]] = ("", ("", ()))  # what was typed, and its offers
     suggestions_of: QueryEngine | None = None  # of the scene that they were looked for in
     # Functions that keep their last result, as long as the scene is open.
-    middle: Callable[[Scene, Marks], Array | None] = field(
-        default_factory=lambda: lru_cache(1)(selected_middle)
-    )
-    masks_of: Callable[[Marked, int], Marks] = field(default_factory=lambda: lru_cache(1)(Marked.masks))
+    middle: Callable[[Scene, Marks], Array | None] = field(default_factory=lambda: lru_cache(1)(middle_of))
+    masks_of: Callable[[MarkBits, int], Marks] = field(default_factory=lambda: lru_cache(1)(MarkBits.masks))
     _edited: EditedScene | None = None  # of the last request
 
     def visit(self, seen: OpenScene) -> Visit:

@@ -18,7 +18,7 @@ from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.marks import unmarked
 from langsplat_viewer.rendering.renderer import Backend, open_renderer
 from langsplat_viewer.rendering.request import Clip, RenderRequest, Splats
-from langsplat_viewer.session import Marked
+from langsplat_viewer.session import MarkBits
 from langsplat_viewer.state import GLIDE_SECONDS, OpenScene, ViewerState
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene
@@ -220,7 +220,7 @@ def put_scene(viewer: Viewer, scene: Scene) -> None:
 def put_marks(viewer: Viewer, **masks: np.ndarray) -> None:
     """Mark nothing but the (N,) `selected`, `hidden` and `deleted` that are given."""
     nothing = unmarked(viewer.state.count)
-    viewer.put(marks=Marked().of(replace(nothing, **masks)))
+    viewer.put(marks=MarkBits().of(replace(nothing, **masks)))
 
 
 def names(rows: np.ndarray) -> str:

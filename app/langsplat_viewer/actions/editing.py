@@ -174,7 +174,7 @@ def select_query(
 # Tools of the mouse: a stroke begins, goes on and ends; (u, v) are fractions of the scene's area.
 
 STEP = 0.002  # of the image: nearer places of a stroke are one
-LONGEST = 4000  # places of a stroke that are kept
+MOST_PLACES = 4000  # places of a stroke that are kept
 
 
 def set_tools(viewer: Viewer, **values: Any) -> None:
@@ -216,7 +216,7 @@ def extend_stroke(viewer: Viewer, u: float, v: float) -> None:
     if stroke is None:
         return
     (last_u, last_v), moved = stroke.path[-1], stroke.path
-    if max(abs(u - last_u), abs(v - last_v)) >= STEP and len(moved) < LONGEST:
+    if max(abs(u - last_u), abs(v - last_v)) >= STEP and len(moved) < MOST_PLACES:
         set_tools(viewer, stroke=replace(stroke, path=(*moved, (u, v))))
 
 

@@ -16,7 +16,7 @@ from langsplat_core.io.files import is_utf8, shown
 from langsplat_core.io.scenes import format_of, scene_files
 from langsplat_core.pipeline.report import PREVIEW, stated_warnings, work_folder
 from langsplat_core.progress import Progress
-from langsplat_core.query.engine import no_field
+from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.scene import Scene, surface
 from langsplat_viewer import disk
 from langsplat_viewer.actions import viewpoint
@@ -29,7 +29,7 @@ from langsplat_viewer.jobs import one_line
 from langsplat_viewer.output import free_name
 from langsplat_viewer.projects import PATHS, PROJECTS, Project, digest_of, read_project
 from langsplat_viewer.rendering.request import Split, why_undrawable
-from langsplat_viewer.session import OF_PROJECT, Marked, Query, Session, Things
+from langsplat_viewer.session import OF_PROJECT, MarkBits, Query, Session, Things
 from langsplat_viewer.state import FileChoice, OpenScene, Recording, Saved, SceneState, ViewerState, Visit
 from langsplat_viewer.viewer import History, Training, Viewer
 
@@ -120,7 +120,8 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     )
     state.opening = state.leaving = None
     state.tools, state.show_start = replace(state.tools, stroke=None), False
-    viewer.engine, viewer.describer = viewer.services.engine(scene), None
+    viewer.engine = engine = viewer.services.engine(scene)
+    viewer.describer = None
     viewer.watch.begin(() if disk.is_preview(path) else opened.read)  # which is followed
     viewer.history = History()
     if not disk.is_preview(path):
@@ -129,7 +130,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
         _say_opened(viewer, path, opened)
     if field is not None:
         viewer.run("preparing latent colours", lambda progress: field.colours)  # none is needed yet
-        _prepare_search(viewer)
+        _prepare_search(viewer, engine)
 
 
 def _without_field(session: Session) -> Session:
@@ -148,10 +149,8 @@ def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
         viewer.state.say(no_field(scene))
 
 
-def _prepare_search(viewer: Viewer) -> None:
+def _prepare_search(viewer: Viewer, engine: QueryEngine) -> None:
     """Have the worker prepare the first search while the user looks round."""
-    engine = viewer.engine
-    assert engine is not None
     if not is_compiled(surface.merge_patches):
         label = "compiling the search kernels, once per installation (half a minute)"
         viewer.run(label, lambda progress: engine.regions)
@@ -209,13 +208,13 @@ def reload(viewer: Viewer) -> None:
 
 # The list of scenes. One is in memory at a time; of the others only the visit is kept.
 
-MOST = 100  # scenes that are listed
+MOST_SCENES = 100  # scenes that are listed
 
 
 def add_scenes(viewer: Viewer, paths: Sequence[Path]) -> None:
     """List scenes, after those that are listed already."""
     listed = dict.fromkeys((*viewer.state.scenes, *(path.absolute() for path in paths)))
-    viewer.state.scenes = tuple(listed)[:MOST]
+    viewer.state.scenes = tuple(listed)[:MOST_SCENES]
 
 
 def switch_scene(viewer: Viewer, path: Path) -> None:
@@ -322,7 +321,7 @@ def _restore(viewer: Viewer, project: Project, path: Path, digest: str) -> None:
         viewer.say_error(reason)
     kept = session
     if state.count != project.gaussians:
-        kept = replace(session, marks=Marked(), moves=(), things=Things())
+        kept = replace(session, marks=MarkBits(), moves=(), things=Things())
         if kept != session:
             what = "what was selected, hidden, deleted, moved and named is left out"
             viewer.say_error(f"the scene has changed since: {what}")

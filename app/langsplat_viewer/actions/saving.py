@@ -218,7 +218,7 @@ OPTIONS: dict[str, tuple[str, float, tuple[float, float]]] = {  # label, default
     CELL: ("Metres of a cell", 0.05, (0.01, 0.5)),
     UNIT: ("Metres of a unit", 1.0, (0.001, 1000.0)),  # where the scene has none
 }
-SCENES = {
+SCENE_SIZES = {
     ".ply": (0, 56, 12), ".spz": (0, 14, 2), ".sog": (0, 20, 0.5), ".glb": (0, 52, 12), ".gltf": (0, 70, 16),
     ".splat": (0, 32, 0), ".usdc": (0, 44, 12),
 }  # fmt: skip
@@ -230,15 +230,15 @@ EXPORTS = {
     ),
     SCENE: ExportRow(
         "convert {scene} {out}", ".ply keeps everything; .spz and .sog are a fifth, and rounded; .splat is "
-        "without view dependence.", SCENES, beside=True,
+        "without view dependence.", SCENE_SIZES, beside=True,
     ),
     "cleaned copy": ExportRow(
         "clean {scene} {out}", "Without floaters: small regions that touch nothing, and veils in free space.",
-        SCENES, ("--max-psnr-loss",), at_most=True, beside=True,
+        SCENE_SIZES, ("--max-psnr-loss",), at_most=True, beside=True,
     ),
     "compacted copy": ExportRow(
         "compact {scene} --out {out}", "Without Gaussians and colours that the views do not need.",
-        SCENES, ("--max-psnr-loss",), at_most=True, beside=True,
+        SCENE_SIZES, ("--max-psnr-loss",), at_most=True, beside=True,
     ),
     "mesh": ExportRow(
         "mesh {scene} {out}", "Triangles with colours: .glb in metres with y up, .ply in the scene's units.",

@@ -117,7 +117,7 @@ def weighted_quantile(values: Array, weights: Array, share: float) -> float:
 MAX_ELEVATION = math.radians(88)  # closer to the pole a small drag would spin the image
 DEFAULT_FOV = 50.0  # degrees, of the image's shorter side
 FOV_RANGE = (10.0, 120.0)  # degrees
-FARTHEST = 12.0  # of the distance that shows the whole scene: it is still a visible spot
+MOST_DISTANCE = 12.0  # of the distance that shows the whole scene: it is still a visible spot
 NARROW = 1e4  # factor of the focal length by which a scene is framed without perspective
 SURROUNDINGS = 1.8  # size that a view of a thing shows, over the thing's
 
@@ -318,7 +318,7 @@ def extent_of(scene: Scene) -> Extent:
     sample = sample_of(scene.gaussians)
     distances = np.linalg.norm(sample.points - centre, axis=1)
     reach = max(weighted_quantile(distances, sample.weights, SHARE), radius)
-    return Extent(centre, radius, scene.up(), sample, FARTHEST * reach)
+    return Extent(centre, radius, scene.up(), sample, MOST_DISTANCE * reach)
 
 
 def joined(extent: Extent, other: Sample) -> Extent:

@@ -32,7 +32,7 @@ from langsplat_viewer.viewer import Viewer
 # The start page.
 
 CARD_EM, PICTURE_EM, DROP_EM = 14.5, 8.5, 4.0  # width of a card; heights
-MOST_WIDE, MOST_COLUMNS, TITLE = 0.95, 4, 1.8  # of the area; cards beside each other; of the letters' size
+MOST_WIDE, MOST_COLUMNS, TITLE_SIZE = 0.95, 4, 1.8  # of the area; cards beside each other; of letters
 
 
 class StartPage:
@@ -70,7 +70,7 @@ class StartPage:
         with theme.styled(window_padding=ImVec2(max(area.width - width, 0) / 2, 0)):
             imgui.begin("start", None, (ui.OVER | ui.FIXED) & ~imgui.WindowFlags_.no_scrollbar)
         imgui.dummy(ImVec2(0, 0.04 * area.height))
-        imgui.push_font(imgui.get_font(), TITLE * theme.FONT_SIZE)
+        imgui.push_font(imgui.get_font(), TITLE_SIZE * theme.FONT_SIZE)
         imgui.text_unformatted("LangSplat viewer")
         imgui.pop_font()
         ui.small_wrapped("Look around in 3D Gaussian scenes, and search them with words.")

@@ -308,9 +308,9 @@ def _axes(view: OrbitCamera, area: ui.Area) -> None:
     for (letter, colour), axis in zip(AXES, view.rotation.T, strict=True):
         way, half = axis[:2] / max(float(np.linalg.norm(axis[:2])), 1e-3), imgui.calc_text_size(letter) / 2
         end = np.array(middle) + 0.3 * side * axis[:2]
-        paint.add_line(ImVec2(*middle), ImVec2(*end), _faded(colour, 1.0), 2.0)
+        paint.add_line(ImVec2(*middle), ImVec2(*end), _packed(colour), 2.0)
         beyond = end + 1.2 * half.y * way  # the middle of the letter, off its line
-        paint.add_text(ImVec2(*beyond) - half, _faded(colour, 1.0), letter)
+        paint.add_text(ImVec2(*beyond) - half, _packed(colour), letter)
 
 
 def _ruler(ruler: Ruler, pen: Pen, metres: float | None) -> None:
@@ -449,7 +449,7 @@ def draw_bar(start: Any, width: float, height: float, colours: Array) -> None:
     paint = imgui.get_window_draw_list()
     for step, colour in enumerate(colours):
         left, right = (round(start.x + width * edge / STEPS) for edge in (step, step + 1))  # no seams
-        paint.add_rect_filled(ImVec2(left, start.y), ImVec2(right, start.y + height), _faded(colour, 1.0))
+        paint.add_rect_filled(ImVec2(left, start.y), ImVec2(right, start.y + height), _packed(colour))
 
 
 # The tooltip: what lies under the cursor.
@@ -489,9 +489,9 @@ def pointed_figures(hover: Hover, origin: Array = NO_ORIGIN) -> list[str]:
     return [*lines, f"at {place}, {length_text(hover.found.depth, least=2)} away"]
 
 
-def _faded(colour: Iterable[float], alpha: float) -> int:
+def _packed(colour: Iterable[float]) -> int:
     red, green, blue = map(float, colour)
-    return int(imgui.get_color_u32((red, green, blue, alpha)))
+    return int(imgui.get_color_u32((red, green, blue, 1.0)))
 
 
 # The panel "Notes".
