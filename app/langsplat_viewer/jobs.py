@@ -188,10 +188,8 @@ def one_line(error: BaseException) -> str:
     A class that no user causes is named, so that it can be reported.
     """
     text = " ".join(str(error).split())
-    if isinstance(error, LangSplatError):
-        return text
+    if isinstance(error, LangSplatError | OSError):
+        return text or type(error).__name__
     if isinstance(error, MemoryError):
         return "not enough memory; close other programs or use a smaller scene"
-    if isinstance(error, OSError):
-        return text or type(error).__name__
     return f"internal error: {type(error).__name__}: {text}"

@@ -115,8 +115,7 @@ class CommandProcess:
     def interrupt(self) -> None:
         """Ask the process to stop soon; what is finished is kept."""
         self.interrupted = True
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGTERM)
+        self.process.send_signal(signal.SIGTERM)  # nothing where it has ended
 
     def end(self, patience: float = 5.0) -> None:
         """End the process, killed after `patience` seconds: the window closes."""

@@ -387,6 +387,14 @@ def test_project_of_a_changed_scene_restores_only_queries(saved, viewer, monkeyp
     assert saved.with_name("blobs-001-other-001.langsplat").read_bytes() == before
 
 
+def test_project_is_kept_where_its_scene_returns_without_its_marks(saved, again):
+    before = saved.read_bytes()
+    act(opening.reload, again)
+    assert not again.state.marks.selected.any()
+    saving.save_project(again)
+    assert saved.with_name("blobs-001-other-001.langsplat").read_bytes() == before
+
+
 SAVED = Path(__file__).parent / "saved"  # files as version 1 wrote them
 
 

@@ -16,7 +16,7 @@ from langsplat_core.io.files import is_utf8, shown
 from langsplat_core.io.scenes import format_of, scene_files
 from langsplat_core.pipeline.report import PREVIEW, stated_warnings, work_folder
 from langsplat_core.progress import Progress
-from langsplat_core.query.engine import QueryEngine, no_field
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene, surface
 from langsplat_viewer import disk
 from langsplat_viewer.actions import viewpoint
@@ -145,8 +145,8 @@ def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
     viewer.state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
     for reason in (*(f"opened without what lies beside it: {why}" for why in scene.unread), *opened.warnings):
         viewer.say_error(reason)
-    if scene.language is None:
-        viewer.state.say(no_field(scene))
+    if viewer.state.why_no_field:
+        viewer.state.say(viewer.state.why_no_field)
 
 
 def _prepare_search(viewer: Viewer, engine: QueryEngine) -> None:
@@ -175,6 +175,9 @@ def return_to(viewer: Viewer, visit: Visit | None) -> None:
     kept = {name: getattr(saved.session.moved(offset), name) for name in OF_PROJECT}
     state.saved = replace(saved, session=replace(state.session, **kept))
     take_session(viewer, session if visit.count == state.count else replace(session, things=Things()))
+    parts = ("marks", "moves", "things", "queries")
+    if any(getattr(state.session, part) != getattr(visit.session, part) for part in parts):
+        state.saved = replace(state.saved, digest="")  # saving keeps the project as it was, too
 
 
 def take_session(viewer: Viewer, session: Session) -> None:
