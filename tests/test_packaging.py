@@ -52,10 +52,8 @@ def desktop_entry() -> dict[str, str]:
 def mime_globs() -> dict[str, list[str]]:
     made = subprocess.run([sys.executable, DESKTOP / "desktop_files.py"], capture_output=True, check=True)
     root = ElementTree.fromstring(made.stdout)
-    types = root.findall(f"{NAMESPACE}mime-type")
-    return {
-        kind.attrib["type"]: [g.attrib["pattern"] for g in kind.findall(f"{NAMESPACE}glob")] for kind in types
-    }
+    globs = {k.attrib["type"]: k.findall(f"{NAMESPACE}glob") for k in root.findall(f"{NAMESPACE}mime-type")}
+    return {kind: [glob.attrib["pattern"] for glob in its] for kind, its in globs.items()}
 
 
 def test_desktop_entry_starts_the_viewer_with_a_file():
@@ -263,8 +261,7 @@ def test_missing_package_ends_in_the_line_that_installs_it(light: Path, tmp_path
         Image.new("RGB", (32, 24), (number, 0, 0)).save(tmp_path / f"{number}.png")
     done = run(light, "langsplat", "train", tmp_path, "--out", tmp_path / "scene.ply")
     assert done.returncode == 2
-    found = re.fullmatch(
-        r'langsplat: this needs (\w+): pip install "langsplat-viewer\[(\w+)\]"', done.stderr.strip()
-    )
+    said = r'langsplat: this needs (\w+): pip install "langsplat-viewer\[(\w+)\]"'
+    found = re.fullmatch(said, done.stderr.strip())
     assert found is not None, done.stderr
     assert EXTRAS[found[1]] == found[2]

@@ -227,11 +227,8 @@ def window(case: Case) -> Found:
     view = default_view(scene, extent, (160, 120))
     camera, close = view.camera(160, 120), replace(view, distance=0.1 * view.distance).camera(160, 120)
     lines, _ = ground_grid(extent, extent.up, scene.metres_per_unit, scene.origin)
-    flight = Flight(
-        tuple(
-            Keyframe(2.0 * at, pose_of(from_camera(one, extent))) for at, one in enumerate(scene.cameras[:3])
-        )
-    )
+    poses = [pose_of(from_camera(one, extent)) for one in scene.cameras[:3]]
+    flight = Flight(tuple(Keyframe(2.0 * at, pose) for at, pose in enumerate(poses)))
     paths = {"flight": flight, "turntable": turntable(view, 4.0)}
     filmed = {name: cameras_of(motion, extent, 2.0, (64, 48)) for name, motion in paths.items()}
     drawn = {

@@ -70,9 +70,8 @@ def test_unaskable_phrases_are_named_before_searching(folder, monkeypatch, capsy
     out, err = capsys.readouterr()
     assert [answer["phrase"] for answer in json.loads(out)] == ["mug", "book"]
     plamt, the, sofa = err.splitlines()
-    assert plamt.startswith(
-        "langsplat: not asked: 'plamt': the encoder does not know 'plamt' (did you mean 'plant'?)"
-    )
+    why = "the encoder does not know 'plamt' (did you mean 'plant'?)"
+    assert plamt.startswith(f"langsplat: not asked: 'plamt': {why}")
     assert "'the' names nothing" in the
     assert "'book or sofa': the encoder does not know 'sofa';" in sofa
     monkeypatch.setattr(QueryEngine, "relevancy", lambda *_: pytest.fail("searched"))

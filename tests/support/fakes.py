@@ -88,9 +88,8 @@ def cameras(count: int = 3) -> tuple[Camera, ...]:
 
 
 def blob_scene(*, field: bool = True, with_cameras: bool = True, phrasebook: bool = False) -> Scene:
-    return Scene(
-        blobs(), language(phrasebook) if field else None, cameras() if with_cameras else (), Path("blobs.ply")
-    )
+    words = language(phrasebook) if field else None
+    return Scene(blobs(), words, cameras() if with_cameras else (), Path("blobs.ply"))
 
 
 class FakeEncoder:

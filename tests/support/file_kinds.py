@@ -207,9 +207,8 @@ def _half(inner: Mutation) -> Mutation:
 
 def _in(value: object) -> Iterator[tuple[Any, Any]]:
     """Yield every container in a JSON value with each of its keys."""
-    for key in (
-        range(len(value)) if isinstance(value, list) else list(value) if isinstance(value, dict) else ()
-    ):
+    keys = range(len(value)) if isinstance(value, list) else value if isinstance(value, dict) else ()
+    for key in list(keys):
         yield value, key
         yield from _in(value[key])
 
@@ -664,9 +663,7 @@ def colmap(part: str) -> FileKind:
         return [(write_colmap(folder, part.rpartition(".")[2]) / part).read_bytes()]
 
     def read(path: Path) -> float:
-        return _usable(
-            load_colmap(path.parent.parent.parent, path.parent, DatasetConfig(max_side=64), silent)
-        )
+        return _usable(load_colmap(path.parents[2], path.parent, DatasetConfig(max_side=64), silent))
 
     return FileKind(f"sparse/0/{part}", samples, read)
 

@@ -259,10 +259,8 @@ def _world_times(exponent: int) -> Case:
         matrix = camera.world_to_camera.copy()
         matrix[:3, 3] *= factor
         bigger = replace(g, means=g.means * factor, log_scales=g.log_scales + exponent * np.log(2.0))
-        settings = replace(INRIA, near=INRIA.near * factor)
-        other = seen.again(
-            gaussians=bigger, camera=replace(camera, world_to_camera=matrix), settings=settings
-        )
+        settings, farther = replace(INRIA, near=INRIA.near * factor), replace(camera, world_to_camera=matrix)
+        other = seen.again(gaussians=bigger, camera=farther, settings=settings)
         close(seen, other, 2e-5)  # the logarithms round to 1e-6
 
     return Case(
@@ -275,10 +273,8 @@ def _world_times(exponent: int) -> Case:
 def _far_away() -> Drawing:
     drawing = crowd(16)
     on_a_grid = np.round(drawing.gaussians.means * 16) / 16  # float32 holds these at 1e6
-    gaussians, camera = shifted(
-        replace(drawing.gaussians, means=on_a_grid), drawing.camera, np.array([1e6, -5e5, 2e5])
-    )
-    return Drawing(gaussians, camera)
+    gaussians = replace(drawing.gaussians, means=on_a_grid)
+    return Drawing(*shifted(gaussians, drawing.camera, np.array([1e6, -5e5, 2e5])))
 
 
 def _as_at_the_origin(seen: Seen) -> None:

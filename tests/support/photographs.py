@@ -55,10 +55,8 @@ def photograph(intrinsics: PhotoIntrinsics, world_to_camera: Array) -> Array:
     for index, (axis, _) in enumerate(planes):
         chosen = nearest == index
         uv = np.delete(hit[chosen], axis, axis=1).T * (TEXELS / ROOM)
-        for channel in range(3):
-            picture[chosen, channel] = map_coordinates(
-                TEXTURES[index][..., channel], uv, order=1, mode="grid-wrap"
-            )
+        for channel, texture in enumerate(np.moveaxis(TEXTURES[index], -1, 0)):
+            picture[chosen, channel] = map_coordinates(texture, uv, order=1, mode="grid-wrap")
     return np.rint(picture).astype(np.uint8).reshape(intrinsics.height, intrinsics.width, 3)
 
 
@@ -210,18 +208,15 @@ def lerf_frame(folder: Path, name: str, objects: Sequence[tuple[str, Polygon]]) 
     return path
 
 
-def ovs_view(
-    scene: Path, name: str, masks: Mapping[str, Array], photo: tuple[int, int] | None = SIZE
-) -> None:
+def ovs_view(scene: Path, name: str, masks: Mapping[str, Array], photo: tuple[int, int] = SIZE) -> None:
     """segmentations/`name`/<class>.png and images/`name`.jpg; classes.txt is extended by what is new."""
     for phrase, mask in masks.items():
         silhouette(scene / "segmentations" / name, phrase, mask)
     listed = scene / "segmentations" / "classes.txt"
     known = listed.read_text().splitlines() if listed.exists() else []
     listed.write_text("\n".join([*known, *(phrase for phrase in masks if phrase not in known)]) + "\n")
-    if photo is not None:
-        (scene / "images").mkdir(exist_ok=True)
-        Image.new("RGB", photo).save(scene / "images" / f"{name}.jpg")
+    (scene / "images").mkdir(exist_ok=True)
+    Image.new("RGB", photo).save(scene / "images" / f"{name}.jpg")
 
 
 def mask_map(folder: Path, phrase: str, mask: Array) -> None:

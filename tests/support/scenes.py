@@ -275,14 +275,12 @@ def box_room(seed: int = 0) -> Scene:
                 offset[axis] = sign * half[axis]
                 parts.append(_sheet(centre + offset, first, second, rng))
     points, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
-    turns = [
-        Rotation.align_vectors([normal], [[0, 0, 1]])[0].as_quat() for normal in np.unique(normals, axis=0)
-    ]
-    which = np.unique(normals, axis=0, return_inverse=True)[1].reshape(-1)
+    ways, which = np.unique(normals, axis=0, return_inverse=True)
+    turns = [Rotation.align_vectors([way], [[0, 0, 1]])[0].as_quat() for way in ways]
     gaussians = Gaussians(
         means=points,
         log_scales=np.tile(np.log([STEP, STEP, 0.003]), (len(points), 1)),
-        quats_wxyz=np.array(turns)[which][:, [3, 0, 1, 2]],
+        quats_wxyz=np.array(turns)[which.reshape(-1)][:, [3, 0, 1, 2]],
         opacity_logits=np.full(len(points), 4.0),
         sh=rng.normal(size=(len(points), 1, 3)),
     )

@@ -312,7 +312,6 @@ if __name__ == "__main__":
     if asked.what:
         deeds[asked.what](asked.scene)
     else:
-        seen = ride(
-            asked.scene, asked.count, asked.seconds, tuple(asked.size), 0.0 if asked.slow else MOVING_BUDGET
-        )
+        budget = 0.0 if asked.slow else MOVING_BUDGET
+        seen = ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), budget)
         print(json.dumps(asdict(seen)))

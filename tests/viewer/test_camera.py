@@ -351,12 +351,13 @@ def view_with_up(up) -> controls.OrbitCamera:
     return controls.OrbitCamera(np.eye(3), np.array([1.0, 2, 3]), 4.0, np.array(up, float), inner)
 
 
+SIDES = ("front", "back", "left", "right", "top", "bottom")
+
+
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0), (0.6, -0.8, 0)])
 def test_the_six_sides(up):
     view = view_with_up(up)
-    seen = {
-        side: controls.from_side(view, side) for side in ("front", "back", "left", "right", "top", "bottom")
-    }
+    seen = {side: controls.from_side(view, side) for side in SIDES}
     for side in seen.values():
         assert_allclose(side.rotation @ side.rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(side.rotation) == pytest.approx(1)
@@ -368,7 +369,7 @@ def test_the_six_sides(up):
         assert_allclose(ahead[side], wanted, atol=1e-12)
     # From the right one stands where the front view has its right; the horizon is level everywhere.
     assert_allclose(seen["right"].eye - view.target, 4 * seen["front"].rotation[0], atol=1e-12)
-    for name in ("front", "back", "left", "right"):
+    for name in SIDES[:4]:
         assert_allclose(seen[name].rotation[1], -up, atol=1e-12)
     # From above, what is away from the front is up in the picture; from below it is down.
     assert_allclose(-seen["top"].rotation[1], ahead["front"], atol=1e-12)
@@ -424,7 +425,7 @@ def test_orthographic_view_leaves_out_what_is_behind_the_eye():
     assert "behind the camera" in why_nothing(BLOBS.gaussians, beyond.camera(*FULL))
 
 
-@pytest.mark.parametrize("side", ["front", "back", "left", "right", "top", "bottom"])
+@pytest.mark.parametrize("side", SIDES)
 def test_framing_holds_the_scene_and_nothing_of_it_is_behind_the_eye(side):
     view = controls.frame_all(from_side(FLAT, side), EXTENT, FULL)
     pixels, z = exact(view, EXTENT.sample.points)

@@ -55,9 +55,8 @@ def key(seconds: float, position=(0, 0, 0), rotvec=(0, 0, 0), fov: float = 50.0)
 def random_flight(seed: int, count: int) -> Flight:
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.3, 2.0, count))
-    return Flight(
-        tuple(key(t, rng.normal(size=3), rng.normal(scale=1.0, size=3), rng.uniform(20, 110)) for t in times)
-    )
+    keys = (key(t, rng.normal(size=3), rng.normal(size=3), rng.uniform(20, 110)) for t in times)
+    return Flight(tuple(keys))
 
 
 def speeds(flight: Flight, at: float) -> np.ndarray:

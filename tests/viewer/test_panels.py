@@ -215,9 +215,8 @@ def plain_clip(camera, start, end):
             a = a + side(a) / (side(a) - side(b)) * (b - a)
         elif side(b) < 0:
             b = b + side(b) / (side(b) - side(a)) * (a - b)
-    return np.array(
-        [(p[0] / p[2] * camera.fx + camera.cx, p[1] / p[2] * camera.fy + camera.cy) for p in (a, b)]
-    )
+    focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    return np.array([p[:2] / p[2] * focal + middle for p in (a, b)])
 
 
 def test_segments_are_clipped_ahead_of_the_eye():

@@ -462,9 +462,8 @@ def lines_of(gl, code: str, driver: dict[str, str]) -> list[str]:
     """Two lines that a process prints with another driver."""
     if "MESA_GL_VERSION_OVERRIDE" in driver and "llvmpipe" not in gl.info["GL_RENDERER"]:
         pytest.skip("only Mesa can pretend to be an older OpenGL")
-    run = subprocess.run(
-        [sys.executable, "-c", DRIVERS + code], env=os.environ | driver, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", DRIVERS + code]
+    run = subprocess.run(command, env=os.environ | driver, capture_output=True, text=True)
     return (run.stdout.splitlines() or [run.stderr, ""])[:2]
 
 

@@ -42,6 +42,7 @@ from tests.viewer import scenarios
 
 MUG, BOOK, PLANT = CENTRES
 PATIENCE = 240.0  # seconds: other tests may have the cores
+Place = tuple[float, float]  # in the window
 
 
 class Session:
@@ -224,18 +225,14 @@ class Session:
         column, row = map(int, self.on_screen(point))
         return shot[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).mean(0)
 
-    def drag(
-        self, start: tuple[float, float], end: tuple[float, float], frames: int = 0, steps: int = 8
-    ) -> None:
+    def drag(self, start: Place, end: Place, frames: int = 0, steps: int = 8) -> None:
         """Drag from place to place, then `rest`."""
         with self.dragging(start, end, steps):
             pass
         self.rest(frames)
 
     @contextmanager
-    def dragging(
-        self, start: tuple[float, float], end: tuple[float, float], steps: int = 8
-    ) -> Iterator[None]:
+    def dragging(self, start: Place, end: Place, steps: int = 8) -> Iterator[None]:
         """The left button is held at the end of a way, in window units, that has a frame for each step."""
         self.ctx.mouse_teleport_to_pos(start)
         self.ctx.mouse_down(0)

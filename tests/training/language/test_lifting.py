@@ -321,9 +321,8 @@ def test_median_outvotes_a_wrong_mask_that_the_mean_follows():
 def test_views_without_masks_lift_nothing(gaussians):
     empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, LIFTED_DIM), np.float32))
     mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, [(random_camera(0, 8, 6), empty)])
-    vectors, confidence = lift.lift_sample(
-        mask_weights, lift.group_masks([empty.vectors]), np.arange(25), robust=True
-    )
+    groups = lift.group_masks([empty.vectors])
+    vectors, confidence = lift.lift_sample(mask_weights, groups, np.arange(25), robust=True)
     assert vectors.shape == (3, 25, LIFTED_DIM)
     assert not vectors.any()
     assert not confidence.any()

@@ -120,9 +120,8 @@ def test_halves_of_a_thing_merge_before_the_plane_they_stand_on():
     moments = moments_of(points, np.array([4.0, 0.1, 0.1]), np.full((3, 3), 1 / 3))
     nothing = sparse.csr_matrix((3, 1), dtype=np.float32), np.zeros(1, np.int32)
     eyes = np.array([[0, 0, 3.0]])
-    above, below = (
-        merge(Patches(*nothing, moments, side * eyes, pairs, np.ones((3, 3)))) for side in (1, -1)
-    )
+    colours = np.ones((3, 3))
+    above, below = (merge(Patches(*nothing, moments, side * eyes, pairs, colours)) for side in (1, -1))
     assert above[0][0].tolist() == [1, 2]
     assert above[1][1] > below[1][1] + 0.3
 

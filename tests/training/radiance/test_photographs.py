@@ -260,10 +260,8 @@ def test_sweep_scores_equal_the_reference() -> None:
     judged = 0
     for row, column, plane in ((20, 30, 40), (27, 36, 60), (33, 41, 5), (15, 52, 77)):
         rows, columns = range(row - RADIUS, row + RADIUS + 1), range(column - RADIUS, column + RADIUS + 1)
-        depth = 1 / planes[plane]
-        seen = np.array(
-            [[looked_up(greys[1].astype(float), one, two, depth, x, y) for x in columns] for y in rows]
-        )
+        sources = greys[1].astype(float), one, two, 1 / planes[plane]
+        seen = np.array([[looked_up(*sources, x, y) for x in columns] for y in rows])
         if np.isfinite(seen).all():
             judged += 1
             window = greys[0][rows.start : rows.stop, columns.start : columns.stop].astype(float)

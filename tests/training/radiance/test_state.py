@@ -113,9 +113,7 @@ def make_state(count: int = 200, seed: int = 0) -> TrainingState:
     )
     state = start(gaussians, seed, torch.device("cpu"))
     for name in PARAMETERS:
-        rows = torch.arange(1, count + 1, dtype=torch.float32).reshape(
-            -1, *[1] * (state.values[name].ndim - 1)
-        )
+        rows = torch.arange(1.0, count + 1).reshape(-1, *[1] * (state.values[name].ndim - 1))
         state.first[name] += rows
         state.second[name] += 2 * rows
     return state

@@ -242,9 +242,8 @@ def test_small_scores_compare_shrunk_images() -> None:
     for index, (score, columns) in enumerate(zip(scores, (320, 150), strict=True)):
         drawn = render(Scene(scene), photographs.cameras[index]).colours.clip(0, 1)
         pair = np.round(255 * drawn).astype(np.uint8), photographs.images[index]
-        small = [
-            np.asarray(Image.fromarray(one).resize((320, 320), Image.Resampling.LANCZOS)) for one in pair
-        ]
+        size, how = (320, 320), Image.Resampling.LANCZOS
+        small = [np.asarray(Image.fromarray(one).resize(size, how)) for one in pair]
         expected = psnr(*(one[:, :columns] / 255 for one in small))
         assert score.psnr_small == pytest.approx(expected, abs=0.01)
         assert expected > score.psnr + 1  # of noise
