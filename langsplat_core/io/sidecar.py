@@ -73,7 +73,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.errors import malformed, printable_line, quoted, report_losses, unread
+from langsplat_core.errors import expect, malformed, printable_line, quoted, report_losses, unread
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import FromFile, decode_json, open_for_reading
 from langsplat_core.scene import LEVELS, NO_NODE, NO_ORIGIN, Calibration, LanguageField, TaughtWord, Tree
@@ -353,6 +353,7 @@ class Words:
 
 def write_words(path: Path | str, words: Words) -> None:
     """Write taught words as a user's file, atomically."""
+    expect(words, Words, "say write_words(path, words)")
     taught, stated = _taught_parts(words.words)
     _save(path, WORDS, {"canonical": words.canonical, **taught}, {"encoder": words.encoder_id, **stated})
 

@@ -55,7 +55,7 @@ def train_scene(  # noqa: PLR0913  what the command has as options
     dataset: Path | str,
     out: Path | str,
     config: TrainConfig,
-    work: Path | None = None,
+    work: Path | str | None = None,
     progress: Progress = silent,
     masks_of: Callable[[Capture], MaskSource] | None = None,
     processes: ProcessGroup | None = None,
@@ -77,7 +77,7 @@ def train_scene(  # noqa: PLR0913  what the command has as options
     if out.suffix.lower() != ".ply":
         example = out.with_suffix(".ply") if out.name else out / "scene.ply"  # "." has no name
         raise InputError(f"{out}: the scene must be named *.ply, for example --out {example}")
-    work = work or reports.work_folder(out)
+    work = reports.work_folder(out) if work is None else Path(work)
     check_writable(out)
     check_output_folder(work)
     # First: a scene that cannot be read should not cost an hour.

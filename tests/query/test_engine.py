@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array, sigmoid, unit
+from langsplat_core.config import ClipConfig, TrainConfig
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.io.sidecar import write_words
 from langsplat_core.pipeline.notebook import draw
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.query.compose import check_phrase, run_phrase
@@ -164,6 +166,11 @@ def test_wrong_kinds_are_named_and_arrays_are_not_printed():
         (lambda: draw(scene, answer="mug"), "expected a QueryResult, got str; run_phrase"),
         (lambda: run_phrase(engine, "mug left of book", viewpoint=0), "Camera.*, got int"),
         (lambda: train_scene("p", "a.ply", {}), "expected settings such as TrainConfig.*, got dict"),
+        (lambda: write_words({}, "a.safetensors"), "got str; say write_words"),
+        (
+            lambda: train_scene("absent", "a.ply", TrainConfig(clip=ClipConfig(DEMO)), "w"),
+            "absent does not exist",
+        ),
         (lambda: train_scene("p", "a.ply", {}, until="masks"), "until 'masks': no stage .*'language"),
     ):
         with pytest.raises(InputError, match=said):
