@@ -23,7 +23,7 @@ from langsplat_core.scene import Gaussians
 MOST_OFFERED = 1000
 
 
-def completions(typed: str, folder: Path, suffixes: tuple[str, ...] = ()) -> list[str]:
+def path_completions(typed: str, folder: Path, suffixes: tuple[str, ...] = ()) -> list[str]:
     """Return the folder above, and the first folders, and files with these suffixes, that begin as typed."""
     begun = os.path.join(folder, os.path.expanduser(typed))
     above, found = os.path.dirname(os.path.normpath(begun)), glob(f"{escape(begun)}*")  # no hidden ones

@@ -67,7 +67,7 @@ def program() -> list[str]:
     return [sys.executable, "-m", "langsplat_core"]
 
 
-def command(form: TrainingForm) -> list[str]:
+def training_words(form: TrainingForm) -> list[str]:
     """Return the command line of a training."""
     return [
         *(*program(), "train", form.dataset, "--out", form.out),
@@ -130,7 +130,7 @@ class Training(CommandProcess):
     """Training in a process of its own."""
 
     def __init__(self, form: TrainingForm, wake: Callable[[], None]) -> None:
-        super().__init__(command(form), wake)
+        super().__init__(training_words(form), wake)
         self.out = Path(form.out)
         self.previewed: Stamps = ()  # the checkpoint that is looked at
 

@@ -12,7 +12,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.disk import completions
+from langsplat_viewer.disk import path_completions
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, result, settle
@@ -164,13 +164,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_typed_path_is_completed_by_folders_and_scenes(folder):
     kinds = (".ply", ".spz")
-    above, *offered = completions("", folder, kinds)
+    above, *offered = path_completions("", folder, kinds)
     assert (above, offered) == (f"{folder.parent}/", [f"{folder}/{n}" for n in ("A.SPZ", "a.ply", "all/")])
-    assert completions("all/../a.", folder, kinds)[1:] == [f"{folder}/all/../a.ply"]
-    assert completions(f"{folder}/al", Path("/gone"), kinds) == [f"{folder}/", f"{folder}/all/"]
-    assert completions("/", folder, kinds)[0] == "/"
+    assert path_completions("all/../a.", folder, kinds)[1:] == [f"{folder}/all/../a.ply"]
+    assert path_completions(f"{folder}/al", Path("/gone"), kinds) == [f"{folder}/", f"{folder}/all/"]
+    assert path_completions("/", folder, kinds)[0] == "/"
     for typed in ("b", "gone/", "a.ply/", "[a]", "x" * 5000):
-        assert completions(typed, folder, kinds)[1:] == []
+        assert path_completions(typed, folder, kinds)[1:] == []
 
 
 @pytest.mark.parametrize("typed", [" blobs.ply ", "all/../blobs.ply"])

@@ -20,7 +20,7 @@ from langsplat_viewer import viewer as training_process
 from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.disk import IN_TRAINING, write_preview
 from langsplat_viewer.state import TrainingForm
-from langsplat_viewer.viewer import PREVIEW_EVERY, ProcessProgress, command
+from langsplat_viewer.viewer import PREVIEW_EVERY, ProcessProgress, training_words
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
 from tests.support.windowless import SCENES, act, errors, open_scene, settle
@@ -141,7 +141,7 @@ def test_folder_without_photographs_is_refused(viewer, tmp_path, monkeypatch, da
 
 
 def test_training_command_is_parsed_and_what_it_says_is_heard():
-    words = command(TrainingForm("photos", "trained.ply", "s.ply", "demo", "quick"))
+    words = training_words(TrainingForm("photos", "trained.ply", "s.ply", "demo", "quick"))
     assert words[1:3] == ["-m", "langsplat_core"]
     parsed = parse(words[3:])
     assert (parsed.dataset, parsed.out) == ((Path("photos"),), Path("s.ply"))

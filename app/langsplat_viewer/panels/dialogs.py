@@ -22,7 +22,7 @@ from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import formats
 from langsplat_core.progress import Progress
 from langsplat_viewer.actions import editing, opening, saving, settings
-from langsplat_viewer.disk import completions
+from langsplat_viewer.disk import path_completions
 from langsplat_viewer.jobs import Worker
 from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.projects import BUNDLED, PATHS, PROJECTS, thumbnail_of
@@ -277,7 +277,7 @@ def _path_box(viewer: Viewer, choice: FileChoice) -> None:
     if (typed := ui.kept_box(viewer, "##path", hint, "Save" if saves else "Open")) is not None:
         settings.choose(viewer, typed)
         drafts["##path"] = typed
-    offers = completions(drafts.get("##path", ""), folder, _offered(choice))
+    offers = path_completions(drafts.get("##path", ""), folder, _offered(choice))
     below = imgui.get_main_viewport().size.y - imgui.get_cursor_screen_pos().y
     rows = below / imgui.get_frame_height_with_spacing() - 2  # the last row is that of Cancel
     if ui.begin_list("offers", max(min(MOST_ROWS, rows), 2)):
