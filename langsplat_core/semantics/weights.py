@@ -88,7 +88,7 @@ def weights_path(model: str, option: str) -> Path:
             )
         return path
     if not re.fullmatch(r"[^./~][^/]*/[^/]+(?<!\.safetensors)(?<!\.bin)(?<!\.pt)(?<!\.pth)", model):
-        raise EncoderError(f"{said}: no such file or folder; pass `{option}` one, or a hub id (owner/name)")
+        raise EncoderError(f"{said}: no such file, no such folder; pass `{option} FOLDER`, a file, a hub id")
     return _from_hub(model, option)
 
 
