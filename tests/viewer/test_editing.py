@@ -402,6 +402,9 @@ def test_failed_export_of_a_command_says_why(opened, tmp_path, monkeypatch):
     saving.run_export(opened, opened.state.path, form_of(opened, "scene"))
     recorded(opened)
     assert "would replace the original scene" in errors(opened)[-1]
+    saving.run_export(opened, opened.state.path / "a.html", form_of(opened, "web page"))
+    recorded(opened)
+    assert errors(opened)[-1].endswith("is a file, not a folder; choose another name")
 
 
 def test_exported_selection_has_its_field(pruned, tmp_path):

@@ -21,7 +21,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.cameras import write_cameras
-from langsplat_core.io.files import write_whole
+from langsplat_core.io.files import check_output_file, write_whole
 from langsplat_core.io.scenes import check_keeps, save_scene, scene_files
 from langsplat_core.pipeline.webpage import make_page
 from langsplat_core.progress import Progress
@@ -316,6 +316,7 @@ def run_export(viewer: Viewer, seen: OpenScene, out: Path, form: ExportForm) -> 
         if is_new and out.exists():
             raise InputError(f"{out}: was written by an earlier export; choose another name")
         if form.title == PAGE:
+            check_output_file(out)
             return out, write_page_of(out, scene.take(rows), progress)
         with TemporaryDirectory(prefix="langsplat-") as folder:
             source = path.absolute() if is_own else Path(folder) / f"{path.stem}.ply"
