@@ -199,7 +199,7 @@ class PhraseEncoder:
 
 
 class Encoder(PhraseEncoder):
-    """Both halves of a model; it satisfies `features.ImageEncoder` too."""
+    """Both halves of a model."""
 
     def __init__(self, weights: Weights, text: TextTower, images: ImageTower, batch: int) -> None:
         super().__init__(weights, text)

@@ -23,6 +23,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_npz
 from langsplat_core.progress import Progress, silent
+from langsplat_core.semantics.encoders import Encoder
 from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps, within
 
 VERSION = 1  # of the stored features
@@ -135,16 +136,6 @@ class OnDemand(Sequence[T]):
 # Crops of regions for CLIP, and the features of whole captures.
 
 
-class ImageEncoder(Protocol):
-    """The image half of a CLIP model, with its name."""
-
-    id: str  # hub id or folder
-    image_size: int  # side of the images it takes, px
-
-    def encode_images(self, crops: Array) -> Array:
-        """Return (M, D) float32 unit vectors of (M, S, S, 3) uint8 images."""
-
-
 def masked_crop(image: Array, mask: Array, size: int) -> Array:
     """Return one region cropped to its bounding box, black outside the mask, centred on a black square.
 
@@ -169,14 +160,14 @@ def masked_crop(image: Array, mask: Array, size: int) -> Array:
 
 
 @runtime_checkable
-class RegionEncoder(ImageEncoder, Protocol):
+class RegionEncoder(Protocol):
     """An encoder that computes vectors of regions without crops."""
 
     def encode_regions(self, image: Array, label_maps: Array) -> Array:
         """See `embed_regions`."""
 
 
-def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Array:
+def embed_regions(image: Array, label_maps: Array, encoder: Encoder) -> Array:
     """Return (M, D) float32 unit vectors of the M regions that `label_maps` numbers.
 
     image: (H, W, 3) uint8; label_maps: (3, H, W) int32 as of `masks.label_maps`. A crop shows the visible
@@ -195,7 +186,7 @@ def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Arr
     return encoder.encode_images(crops[first])[of] if of else encoder.encode_images(crops)
 
 
-def fingerprint(encoder: ImageEncoder) -> str:
+def fingerprint(encoder: Encoder) -> str:
     """Return a text that identifies an encoder: its id, image size and vector of a ramp, as JSON."""
     side = encoder.image_size
     ramp = np.linspace(0, 255, side * side * 3).reshape(1, side, side, 3).astype(np.uint8)
@@ -214,7 +205,7 @@ def describe_capture(
     images: Sequence[Array],
     names: Sequence[str],
     mask_source: MaskSource,
-    encoder: ImageEncoder | None,
+    encoder: Encoder | None,
     store: FeatureStore,
     progress: Progress = silent,
     counted: Sequence[Array | None] = (),
