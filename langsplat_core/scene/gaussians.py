@@ -48,8 +48,7 @@ class Gaussians:
             raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients, got {self.sh.shape[1]}")
         if given.dtype == np.float64 and len(self):
             some = slice(None, None, len(self) // 4096 + 1)
-            step = np.spacing(np.median(np.abs(self.means[some]).max(1)))
-            if np.log(step) > np.median(self.log_scales[some].max(1)):
+            if step := coarse_step(self.log_scales[some], np.median(np.abs(self.means[some]).max(1))):
                 report_loss("positions so far from zero are rounded to %g units: give Scene an origin", step)
 
     def __repr__(self) -> str:
@@ -103,6 +102,12 @@ class Gaussians:
                     each = sound[number - 1].reshape(len(faults[rows]), -1).all(1)
                     faults[rows][~each] = number
         return faults
+
+
+def coarse_step(log_scales: Array, far: float) -> float:
+    """Return the step of float32 so `far` from zero; 0 unless it exceeds the size of most Gaussians."""
+    step = float(np.spacing(np.float32(far)))
+    return step if np.log(step) > np.median(log_scales.max(axis=1)) else 0.0
 
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:

@@ -18,7 +18,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, LanguageField, Scene, Tree
 from langsplat_core.scene.codec import MOST_CODEWORDS, CodebookCodec, Codec, principal_colours
-from langsplat_core.scene.gaussians import join_gaussians
+from langsplat_core.scene.gaussians import coarse_step, join_gaussians
 from langsplat_core.scene.language import NO_NODE
 from langsplat_core.scene.surface import surface_areas
 from langsplat_core.scene.transform import place_scene, rotating, similarity
@@ -174,9 +174,7 @@ def merge(first: Scene, second: Scene) -> Scene:
             "is right for both; train one of them again"
         )
     far = np.abs(second.in_world(second.bounds()[0]) - first.origin).max()
-    if len(second.gaussians) and np.log(np.spacing(np.float32(far))) > np.median(
-        second.gaussians.log_scales.max(axis=1)
-    ):
+    if len(second.gaussians) and coarse_step(second.gaussians.log_scales, far):
         hint = "`langsplat register` finds what moves one to the other"
         raise InputError(f"the scenes lie {far:.2g} units apart, too far for float32 positions; {hint}")
     second = place_scene(second, origin=first.origin)
