@@ -58,9 +58,7 @@ def test_digest_changes_with_views_and_world(indices: list[int]):
 def test_read_at_gives_what_reading_at_that_size_gives(tmp_path: Path, lens: dict[str, float]) -> None:
     write_nerfstudio(tmp_path, **lens)
     write_picture(tmp_path / "masks/a.png", seed=1)
-    large, small = (
-        load_capture(tmp_path, DatasetConfig(max_side=side), tmp_path / "work") for side in (40, 24)
-    )
+    large, small = (load_capture(tmp_path, DatasetConfig(max_side=n), tmp_path / "work") for n in (40, 24))
     large = replace(large, points=small.points, colours=small.colours)  # random ones
     again = large.read_at([0], 24)
     assert again.digest([0]) == small.digest([0]) != large.shrunk([0], 24).digest([0])
@@ -207,9 +205,7 @@ def photo(tmp_path: Path) -> Path:
 def test_the_place_of_a_photograph(photo: Path) -> None:
     there = exif_facts(tagged(photo, parts(33.9), parts(18.4), ("S", "W"))).place
     np.testing.assert_allclose(there, (-33.9, -18.4), atol=1e-7)
-    np.testing.assert_allclose(
-        exif_facts(tagged(photo, parts(HERE[0]), parts(HERE[1]))).place, HERE, atol=1e-7
-    )
+    np.testing.assert_allclose(exif_facts(tagged(photo, *map(parts, HERE))).place, HERE, atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -242,10 +238,9 @@ def test_a_capture_gets_its_scale_from_its_photographs(tmp_path: Path) -> None:
     assert (capture.metres_per_unit, capture.taken) == (None, "")
     eyes = np.array([camera.position for camera in capture.cameras])
     level = np.linalg.svd(eyes - eyes.mean(0))[2][:2]  # the plane that they lie in
-    for photo, (latitude, longitude) in zip(
-        capture.photos, places_at(20 * (eyes - eyes[0]) @ level.T), strict=True
-    ):
-        tagged(photo.path, parts(latitude), parts(longitude))
+    places = places_at(20 * (eyes - eyes[0]) @ level.T)
+    for photo, place in zip(capture.photos, places, strict=True):
+        tagged(photo.path, *map(parts, place))
     assert loaded(config) == pytest.approx(20, rel=0.01)
     tagged(capture.photos[3].path, parts(90.0), parts(0.0), ("N", "N"), "2026:05:04 09:00:00")  # no place
     taken = load_capture(tmp_path, config, tmp_path / "work").taken

@@ -354,9 +354,7 @@ def test_a_photograph_of_which_nothing_counts_is_left_out(tmp_path, caplog):
 
 def test_masked_pixels_neither_train_nor_count() -> None:
     rng = np.random.default_rng(3)
-    cameras = [
-        look_at(np.array([x, 0, -3.0]), np.zeros(3), np.array([0, -1.0, 0]), (32, 24)) for x in (-1, 0, 1)
-    ]
+    cameras = [look_at(np.array([x, 0, -3.0]), np.zeros(3), [0, -1, 0], (32, 24)) for x in (-1, 0, 1)]
     named = tuple(replace(camera, name=f"{k}") for k, camera in enumerate(cameras))
     points, colours = rng.uniform(-1, 1, (200, 3)), rng.integers(0, 256, (200, 3), np.uint8)
     mask = np.ones((24, 32), bool)

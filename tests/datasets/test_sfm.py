@@ -173,11 +173,9 @@ def test_cameras_are_found_where_they_were(located) -> None:  # type: ignore[no-
 
 def known(count: int = VIEWS, size: tuple[int, int] = (320, 240)) -> Capture:
     """The room through pinholes at the true poses, without points."""
-    intrinsics = PhotoIntrinsics(*size, 300.0, 300.0, size[0] / 2, size[1] / 2)
-    cameras = [
-        Camera(*size, 300, 300, intrinsics.cx, intrinsics.cy, m, f"v{i}") for i, m in enumerate(poses(count))
-    ]
-    images = [photograph(intrinsics, camera.world_to_camera) for camera in cameras]
+    lens = PhotoIntrinsics(*size, 300.0, 300.0, size[0] / 2, size[1] / 2)
+    cameras = [Camera(*size, 300, 300, lens.cx, lens.cy, m, f"v{i}") for i, m in enumerate(poses(count))]
+    images = [photograph(lens, camera.world_to_camera) for camera in cameras]
     return Capture(tuple(cameras), tuple(images), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
@@ -353,9 +351,8 @@ def test_best_model_has_most_well_held_photographs_then_least_error() -> None:
 def test_models_with_implausible_focal_lengths_are_astray(prior, focal, lost, tmp_path):
     model = synthetic(4, 100)
     ((number, camera),) = model.cameras.items()
-    before = pycolmap.Camera.create_from_model_id(
-        number, pycolmap.CameraModelId.SIMPLE_RADIAL, 600.0, 800, 600
-    )
+    kind = pycolmap.CameraModelId.SIMPLE_RADIAL
+    before = pycolmap.Camera.create_from_model_id(number, kind, 600.0, 800, 600)
     before.has_prior_focal_length = prior
     with pycolmap.Database.open(tmp_path / "database.db") as database:
         database.write_camera(before, use_camera_id=True)
@@ -463,9 +460,7 @@ MAY = ExifFacts(datetime(2026, 5, 3), camera="K")
     (ExifFacts(), "a", ""),
 ])  # fmt: skip
 @pytest.mark.parametrize("matched", [True, False])
-def test_two_captures_in_one_folder_are_told_apart(
-    second: ExifFacts, folder: str, told: str, matched: bool
-) -> None:
+def test_two_captures_in_one_folder_are_told_apart(second, folder, told, matched) -> None:
     matches = graph(7, chain(range(4)) + chain(range(4, 7)) * matched, range(4))
     names = tuple(f"{'a' if row < 4 else folder}/{row}.jpg" for row in range(7))
     matches = replace(matches, names=names, exif=(MAY,) * 4 + (second,) * 3)

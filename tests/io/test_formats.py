@@ -327,9 +327,8 @@ def test_malformed_files_are_refused_in_a_line(put, bounded, name, number):
 def test_a_sog_says_antialiased(tmp_path):
     plain = [{}, {"model": "2dgs"}, {"model": ["antialiased"]}, {"antialias": False}, {"antialias": "no"}]
     for entry in (*plain, {"model": "antialiased"}, {"antialias": True}):
-        assert load_scene(write_folder(tmp_path / "a", meta_with(**entry))).antialiased is (
-            entry not in plain
-        )
+        scene = load_scene(write_folder(tmp_path / "a", meta_with(**entry)))
+        assert scene.antialiased is (entry not in plain)
 
 
 def written(tmp_path, gaussians: Gaussians) -> Gaussians:
@@ -460,9 +459,8 @@ def test_a_scene_comes_back_about_its_own_axes_unless_moved(tmp_path):
     assert (got.metres_per_unit, got.antialiased) == (0.25, True)
     content, binary = parts((tmp_path / "a.glb").read_bytes())
     node = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T
-    np.testing.assert_allclose(
-        node @ [*np.diag(HALF_TURN.rotation) * scene.up(), 1], [0, 0.25, 0, 1], atol=1e-9
-    )
+    up = [*np.diag(HALF_TURN.rotation) * scene.up(), 1]
+    np.testing.assert_allclose(node @ up, [0, 0.25, 0, 1], atol=1e-9)
     content["nodes"][0]["matrix"][12] += 3.0
     (tmp_path / "b.glb").write_bytes(glb(content, binary))
     moved = HALF_TURN.then(similarity(node)).then(moving(np.array([3.0, 0, 0]))).then(HALF_TURN)

@@ -205,9 +205,8 @@ def test_any_exception_of_a_decoder_is_one_error(tmp_path: Path, error: type[Exc
     (tmp_path / "a.png").write_bytes(saved("PNG"))
     with pytest.raises(PictureError) as caught, opened(tmp_path / "a.png"):
         raise error("inside\nPillow")
-    assert str(caught.value).startswith(
-        f"{tmp_path / 'a.png'}: not a readable picture (damaged: inside Pillow); "
-    )
+    said = f"{tmp_path / 'a.png'}: not a readable picture (damaged: inside Pillow); "
+    assert str(caught.value).startswith(said)
     assert caught.value.reason == "damaged: inside Pillow"
 
 
@@ -283,9 +282,7 @@ def spz_4_of_zeros(count: int, claimed: int, path: Path) -> None:
     frames, sizes = [], [9, 1, 3, 3, 4]
     for width in sizes:
         packer = zstandard.ZstdCompressor().compressobj()  # without the size in its header
-        frames.append(
-            b"".join(packer.compress(part) for part in zeros(count * width + 1048575)) + packer.flush()
-        )
+        frames.append(b"".join(map(packer.compress, zeros(count * width + 1048575))) + packer.flush())
     table = [struct.pack("<QQ", len(f), claimed * w) for f, w in zip(frames, sizes, strict=True)]
     header = b"NGSP" + struct.pack("<IIBBBBI12x", 4, claimed, 0, 12, 0, 5, 32)
     path.write_bytes(header + b"".join(table) + b"".join(frames))
@@ -317,9 +314,8 @@ def flat_sog(count: int, side: int, degree: int = 0) -> bytes:
     Image.new("RGBA", (side, side), (0, 0, 0, 255)).save(buffer, "WEBP", lossless=True)
     palette = {"shN_centroids.webp": files.get("shN_centroids.webp", b"")}
     meta = json.loads(files["meta.json"]) | {"count": count}
-    return zipped(
-        {name: buffer.getvalue() for name in files} | palette | {"meta.json": json.dumps(meta).encode()}
-    )
+    plain = dict.fromkeys(files, buffer.getvalue())
+    return zipped(plain | palette | {"meta.json": json.dumps(meta).encode()})
 
 
 def flat_spz(count: int) -> bytes:
@@ -399,9 +395,7 @@ test_a_few_mutants_are_read_or_refused, test_many_mutants_are_read_or_refused = 
 
 
 def test_every_scene_format_is_among_the_kinds() -> None:
-    assert {row.suffix for row in formats() if row.write} <= {
-        Path(kind.file).suffix for kind in KINDS.values()
-    }
+    assert {row.suffix for row in formats() if row.write} <= {Path(k.file).suffix for k in KINDS.values()}
 
 
 @pytest.mark.long

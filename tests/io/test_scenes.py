@@ -94,9 +94,7 @@ def test_a_scene_keeps_what_its_format_holds_and_says_the_rest(tmp_path, row, de
     assert got.path == path
     lost = spoilt(got, want)
     assert lost == set(row.loses) - {"origin"}
-    said = {
-        what for what in (*LOSSES, "metres per unit") for message in caplog.messages if f" {what}" in message
-    }
+    said = {what for what in (*LOSSES, "metres per unit") for line in caplog.messages if f" {what}" in line}
     assert said == (lost - {"precision"}) | ({"metres per unit"} if "origin" in row.loses else set())
     assert len(caplog.messages) == len(said)
     assert got.metres_per_unit == want.metres_per_unit
@@ -192,9 +190,7 @@ def test_companions_lie_beside_every_kind_of_scene(tmp_path):
         assert_same_field(loaded.language, random_field(N))
     (tmp_path / "link").symlink_to(folder)
     assert load_scene(tmp_path / "link").language is not None
-    write_language(
-        tmp_path / "link.langsplat.safetensors", random_field(N, seed=1), load_gaussians(folder).means
-    )
+    write_language(tmp_path / f"link{SIDECAR}", random_field(N, seed=1), load_gaussians(folder).means)
     assert_same_field(load_scene(tmp_path / "link").language, random_field(N, seed=1))
 
 

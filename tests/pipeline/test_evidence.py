@@ -29,7 +29,6 @@ from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.semantics.relevancy import relevancy_of
 from tests.support.fakes import (
     CENTRES,
-    DIM,
     NAMES,
     PER_BLOB,
     WORDS,
@@ -153,9 +152,8 @@ def test_evidence_of_several_is_of_the_best_region(engine, features):
 @pytest.mark.parametrize("wrong", ["size", "numbers"])
 def test_features_of_another_scene_are_refused(engine, features, wrong):
     labels, vectors = features[0].labels, features[0].vectors
-    other = ImageFeatures(
-        labels[..., :-1] if wrong == "size" else labels, vectors[:, : DIM - (wrong != "size")]
-    )
+    changed = {"size": (labels[..., :-1], vectors), "numbers": (labels, vectors[:, 1:])}
+    other = ImageFeatures(*changed[wrong])
     with pytest.raises(FormatError, match="another scene"):
         find_evidence(engine, engine.run("mug"), ["mug"], [other] * VIEWS)
 

@@ -142,12 +142,10 @@ def report(held_out: Sequence[str], **fields: object) -> TrainReport:
 def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path) -> None:
     names = [f"{number}{HOSTILE}" for number in range(8)]
     matches = Matches(tuple(names), (900,) * 8, ((0, 1, 80), (1, 2, 20), (5, 6, 3)), frozenset(range(7)))
-    warned = report(
-        names[2:4], warnings=("it is dim: add <light>",), psnr_small=22.7, held_out_rule="one in 4"
-    )
+    made = report(names[2:4], warnings=("it is dim: add <light>",), psnr_small=22.7, held_out_rule="one in 4")
     others = [ViewScore(name, 30.0, 0.9, 0.9) for name in names if name not in names[2:4]]
-    write_reports(tmp_path, warned, capture(names, matches=matches), random_gaussians(50), others)
-    assert read_report(tmp_path) == warned
+    write_reports(tmp_path, made, capture(names, matches=matches), random_gaussians(50), others)
+    assert read_report(tmp_path) == made
     page = Read(tmp_path / PAGE)
     assert not {"link", "iframe", "light"} & {tag for tag, _ in page.tags}
     assert page.of("script") == [{}]  # the page's own

@@ -52,9 +52,8 @@ def test_stored_arrays_that_changed_are_refused(tmp_path: Path) -> None:
 
 def test_lock_names_its_owner_and_expires_with_it(tmp_path: Path) -> None:
     work = tmp_path / "scene.work"
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(work)], stdout=subprocess.PIPE, text=True
-    ) as other:
+    command = [sys.executable, "-c", HOLD, str(work)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout.readline() == "held\n"
         with pytest.raises(InputError, match=f"process {other.pid} on .*--work"), sole_use(work):
             pass
@@ -225,10 +224,8 @@ def test_training_stopped_in_every_stage_ends_with_the_same_bytes(how, kind, tmp
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background
         asked.append(signal.SIGINT)
     # The last stage also when it is over: then the scene is written.
-    for stage, fraction in [
-        *((stage, choose.random() / 2) for stage in whole.stages),
-        (whole.stages[-1], 1.0),
-    ]:
+    moments = [(stage, choose.random() / 2) for stage in whole.stages]
+    for stage, fraction in [*moments, (whole.stages[-1], 1.0)]:
         number = choose.choice(asked) if how == "signals" else signal.SIGKILL
         ended = train_until(data, encoder, tmp_path / "stopped", (stage, fraction), number)
         expected = -number if how == "killed" else 128 + number

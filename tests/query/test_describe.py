@@ -107,9 +107,7 @@ def test_pixel_words_follow_the_rows_of_w(codebook, backend):
     assert look_at_pixel(load_lifting_rasterizer(backend), asked, camera, (0, 0)) is None
 
 
-@pytest.mark.parametrize(
-    ("nodes", "step"), [(3000, 1), pytest.param(2_000_000, 5000, marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize(("nodes", "step"), [(3000, 1), pytest.param(2**21, 5000, marks=pytest.mark.long)])
 @pytest.mark.parametrize("wide", [False, True])
 def test_trees_of_any_depth_have_an_outline(nodes, step, wide):
     scene = named_scene()

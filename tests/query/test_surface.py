@@ -196,9 +196,8 @@ HALVES, SIDES = np.repeat([0, 1], 40), np.repeat([5, 3, 6], [20, 40, 20])
 def test_borders_of_regions_on_a_line(meaning, known, things, finer, whole):
     field, gaussians = random_field(80, "codebook"), line(80)
     surface = build_surface(gaussians)
-    latents, confidence, things = (
-        None if row is None else np.broadcast_to(row, 80) for row in (meaning, known, things)
-    )
+    rows = meaning, known, things
+    latents, confidence, things = (None if row is None else np.broadcast_to(row, 80) for row in rows)
     field = replace(
         field,
         latents=np.tile(latents.astype(np.uint16)[:, None], (3, 1, 1)),
@@ -372,9 +371,8 @@ def plainly_from_segment(x: float, y: float, start, end) -> float:
 
 def from_line(seen: selection.Projected, line) -> np.ndarray:
     """Return (N,) distances from the line, pixels, by a loop."""
-    return np.array(
-        [min(plainly_from_segment(x, y, a, b) for a, b in pairwise(line.tolist())) for x, y in seen.pixels]
-    )
+    ends = [*pairwise(line.tolist())]
+    return np.array([min(plainly_from_segment(x, y, *pair) for pair in ends) for x, y in seen.pixels])
 
 
 def within(seen: selection.Projected) -> np.ndarray:
@@ -393,9 +391,8 @@ def test_polygon_holds_points_by_the_even_odd_rule(seen):
             selection.in_rectangle(seen, box[1], box[3]) & ~selection.in_rectangle(seen, hole[3], hole[1]),
         ),
     ):
-        sure = (
-            from_line(seen, np.concatenate([outline, outline[:1]])) > 1.5
-        )  # on the edge a pixel counts whole
+        # on the edge a pixel counts whole
+        sure = from_line(seen, np.concatenate([outline, outline[:1]])) > 1.5
         assert wanted[sure].sum() > 20
         np.testing.assert_array_equal(selection.in_polygon(seen, outline, SIZE)[sure], wanted[sure])
     for few in (np.zeros((0, 2)), np.array([[0.0, 0.0], [80.0, 60.0]])):
@@ -468,7 +465,7 @@ def test_every_ball_is_an_instance_with_its_figures():
     members[5] = False
     found = find_instances(surface, gaussians, members, relevancy)
     assert [instance.count for instance in found] == [200, 90, 59]
-    smooth = smoothed(surface, relevancy)
+    smooth, shares = smoothed(surface, relevancy), extents(gaussians)
     for instance, ball in zip(found, (1, 2, 0), strict=True):
         own = np.flatnonzero((number == ball) & members)
         assert instance.members.tolist() == own.tolist()
@@ -479,9 +476,7 @@ def test_every_ball_is_an_instance_with_its_figures():
         assert instance.mean == pytest.approx(weights @ relevancy[surface.rows[there]], abs=1e-6)
         np.testing.assert_allclose(instance.centre, weights @ points, atol=1e-6)
         np.testing.assert_allclose(instance.box, np.quantile(points, [0.02, 0.98], axis=0), atol=1e-12)
-        assert instance.share == pytest.approx(
-            extents(gaussians)[own].sum() / extents(gaussians)[members].sum()
-        )
+        assert instance.share == pytest.approx(shares[own].sum() / shares[members].sum())
     assert [i.count for i in find_instances(surface, gaussians, members, relevancy, at_most=2)] == [200, 90]
 
 
@@ -507,11 +502,8 @@ def test_wholes_are_found_without_a_surface():
     gaussians, number = balls([60, 200, 90, 4])
     gaussians.opacity_logits[::10] = -6.0  # faint
     gaussians.means[7, 0] = np.nan
-    even, wholes, members = (
-        np.array([0.7, 0.9, 0.8, 0.8])[number],
-        np.array([4, 2, 9, 5])[number],
-        number > -1,
-    )
+    even, wholes = np.array([0.7, 0.9, 0.8, 0.8])[number], np.array([4, 2, 9, 5])[number]
+    members = number > -1
     members[70:80] = False
     wanted = find_instances(build_surface(gaussians), gaussians, members, even, None, wholes, True)
     found = find_wholes(gaussians, members, even, wholes)

@@ -252,9 +252,8 @@ def assert_gradients(gaussians, camera, settings=INRIA, channels=3, rows=None):
     image_grad[band], alpha_grad[band] = 0, 0
     got = CPU.view(gaussians, camera, settings).backward(x, image_grad, alpha_grad)
     rows = rng.permutation(len(gaussians))[:6] if rows is None else rows
-    for name, want in reference_gradients(
-        gaussians, camera, settings, x, image_grad, alpha_grad, rows
-    ).items():
+    wanted = reference_gradients(gaussians, camera, settings, x, image_grad, alpha_grad, rows)
+    for name, want in wanted.items():
         assert_gradient(name, getattr(got, name)[rows], want, largest=np.abs(getattr(got, name)).max())
     return got
 

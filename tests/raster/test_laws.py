@@ -62,9 +62,8 @@ def cases(draw: st.DrawFn) -> Drawn:
 
 def over_random_cases(law: Callable[[Drawn], None], slow: bool, few: int = 25) -> None:
     """Run `law` on as many cases as the tier has."""
-    examples = settings(
-        max_examples=1000 if slow else few, derandomize=True, suppress_health_check=list(HealthCheck)
-    )
+    count = 1000 if slow else few
+    examples = settings(max_examples=count, derandomize=True, suppress_health_check=list(HealthCheck))
     examples(given(cases())(law))()
 
 

@@ -165,9 +165,8 @@ def test_render_projects_colours_and_splats(backend: str) -> None:
 @either
 def test_larger_images_show_what_photographs_showed(backend: str) -> None:
     """Gaussians thinner than a pixel are all dilation: an image four times as large has as much of it."""
-    thin = replace(
-        G, log_scales=np.full_like(G.log_scales, -9.0), sh=G.sh[:, :1], opacity_logits=G.opacity_logits + 9
-    )
+    points = np.full_like(G.log_scales, -9.0)
+    thin = replace(G, log_scales=points, sh=G.sh[:, :1], opacity_logits=G.opacity_logits + 9)
     large = CAMERA.resized(4 * CAMERA.width, 4 * CAMERA.height)
     fitted = Scene(thin, cameras=(CAMERA, CAMERA, CAMERA.resized(20, 15)))
     assert fitted.raster_settings().focal == pytest.approx(np.sqrt(CAMERA.fx * CAMERA.fy))

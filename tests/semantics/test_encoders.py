@@ -218,10 +218,10 @@ def by_transformers(folder: Path, phrases: list[str]) -> np.ndarray:
     return unit(torch.stack(rows).numpy())
 
 
-def text_setting(**settings: object) -> Callable[[Path], None]:
-    return lambda folder: change_json(
-        folder / "config.json", lambda stated: stated["text_config"].update(settings)
-    )
+def setting(folder: Path, part: str, name: str, value: object) -> str:
+    """The folder, with a number of a part of its configuration changed."""
+    change_json(folder / "config.json", lambda stated: stated[part].update({name: value}))
+    return str(folder)
 
 
 def teach(folder: Path, *words: str) -> None:
@@ -262,9 +262,9 @@ def test_random_weights_agree_with_float64(tmp_path: Path, half: bool) -> None:
 NOT_PLAIN: dict[str, Callable[[Path], object]] = {
     "no tokenizer": lambda folder: (folder / "tokenizer.json").unlink(),
     "tokens that have no vector": tokenizer_of(lambda stated: stated["model"]["vocab"].update(rare=10**6)),
-    "longer phrases than positions": text_setting(max_position_embeddings=10**6),
-    "another activation": text_setting(hidden_act="gelu"),
-    "fewer layers": text_setting(num_hidden_layers=1),
+    "long phrases": lambda folder: setting(folder, "text_config", "max_position_embeddings", 10**6),
+    "another activation": lambda folder: setting(folder, "text_config", "hidden_act", "gelu"),
+    "fewer layers": lambda folder: setting(folder, "text_config", "num_hidden_layers", 1),
     "open words": lambda folder: (folder / "vocabulary.txt").unlink(),
     "words of other letters": lambda folder: teach(folder, "mug", "café"),
     "cut weights": lambda folder: os.truncate(folder / "model.safetensors", 2000),
@@ -359,9 +359,7 @@ def test_a_pickle_with_code_is_refused_and_not_run(write, make, load, tmp_path: 
     assert not recwarn.list
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"\x80", b"not weights", bytes(8) + b"{}", b"PK\x03\x04" + bytes(40)]
-)
+@pytest.mark.parametrize("content", [b"", b"\x80", b"words", bytes(8) + b"{}", b"PK\x03\x04" + bytes(40)])
 @pytest.mark.parametrize(("name", "size"), [(PLAIN, 0), (WEIGHTS, 0), (PLAIN, 1 << 20), (WEIGHTS, 1 << 20)])
 def test_bytes_that_are_no_weights_are_refused(content: bytes, name: str, size: int, tmp_path: Path) -> None:
     tiny_clip(tmp_path)
@@ -369,12 +367,6 @@ def test_bytes_that_are_no_weights_are_refused(content: bytes, name: str, size: 
     (tmp_path / name).write_bytes(content + bytes(size))
     with pytest.raises(EncoderError, match="weights"):
         load_text_encoder(str(tmp_path))
-
-
-def setting(folder: Path, part: str, name: str, value: object) -> str:
-    """The folder, with a number of a part of its configuration changed."""
-    change_json(folder / "config.json", lambda stated: stated[part].update({name: value}))
-    return str(folder)
 
 
 FOLDERS: dict[str, tuple[Callable[[Path], object], Callable[[str], Any]]] = {

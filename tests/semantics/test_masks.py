@@ -414,9 +414,7 @@ def test_sam_decoder_norms_have_the_published_epsilon(tmp_path: Path) -> None:
     answers = []
     for epsilon in (1e-6, 0.5):
         own = {"layer_norm_eps": epsilon}
-        change_json(
-            tmp_path / "config.json", lambda stated, own=own: stated["mask_decoder_config"].update(own)
-        )
+        change_json(tmp_path / "config.json", lambda top, own=own: top["mask_decoder_config"].update(own))
         with torch.inference_mode():
             encoded = load_segmenter(str(tmp_path), "cpu").encode(photograph())
             answers.append(encoded.masks_at(sam.grid_points(2, (48, 80))))

@@ -314,10 +314,8 @@ def test_an_empty_label_is_left_out_not_scored(tmp_path):
     ovs_view(tmp_path / "s", "00", {"cup": block(0, 0, 9, 9), "wall": np.zeros((30, 40), bool)})
     silhouette(tmp_path / "maps" / "00", "cup", block(0, 0, 9, 9))
     silhouette(tmp_path / "maps" / "00", "wall", np.zeros((30, 40), bool))
-    subject = Evaluated(maps=tmp_path / "maps")
-    report = run_benchmark(
-        read_3d_ovs(tmp_path / "s"), profiles.OVS_PROFILES["direct-3d"], subject, no_encoder
-    )
+    maps = Evaluated(maps=tmp_path / "maps")
+    report = run_benchmark(read_3d_ovs(tmp_path / "s"), profiles.OVS_PROFILES["direct-3d"], maps, no_encoder)
     assert [query.phrase for query in report.queries] == ["cup"]
     assert "1 labels left out: 00: wall (empty mask)" in table(report)
 

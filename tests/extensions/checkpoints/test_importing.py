@@ -429,9 +429,7 @@ def langsplat_levels(folder: Path) -> tuple[list[Path], Array, torch.nn.Module]:
     with torch.no_grad():
         latents = np.stack([network.encode(torch.from_numpy(FEATURES[CHOICE[i]])).numpy() for i in range(3)])
     latents = np.where(SEEN[:, None], latents * 0.4, 0).astype(np.float32)  # not normalised, as trained
-    paths = [
-        save_model(folder / f"a_{i + 1}" / "chkpnt30000.pth", GAUSSIANS, tensor(latents[i])) for i in range(3)
-    ]
+    paths = [save_model(folder / f"a_{i + 1}" / "c.pth", GAUSSIANS, tensor(latents[i])) for i in range(3)]
     torch.save(network.state_dict(), folder / "best_ckpt.pth")
     return [*paths, folder / "best_ckpt.pth"], latents, network
 

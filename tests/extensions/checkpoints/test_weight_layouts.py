@@ -66,23 +66,15 @@ def clip_model(
 
     vision: width of the half that sees; heads: of images and of text; quick: OpenAI's GELU.
     """
-    half = {
-        "intermediate_size": inner,
-        "num_hidden_layers": layers,
-        "hidden_act": "quick_gelu" if quick else "gelu",
-    }
+    act = "quick_gelu" if quick else "gelu"
+    half = {"intermediate_size": inner, "num_hidden_layers": layers, "hidden_act": act}
     text = {"hidden_size": 128, "num_attention_heads": heads[1], "vocab_size": len(TOKENS)}
-    text |= {
-        "max_position_embeddings": CONTEXT,
-        "bos_token_id": BEGIN,
-        "eos_token_id": END,
-        "pad_token_id": END,
-    }
+    text |= {"bos_token_id": BEGIN, "eos_token_id": END, "pad_token_id": END}
+    text |= {"max_position_embeddings": CONTEXT}
     seeing = {"hidden_size": vision, "num_attention_heads": heads[0], "image_size": SIDE, "patch_size": PATCH}
     torch.manual_seed(5)
-    model = CLIPModel(
-        CLIPConfig(text_config=half | text, vision_config=half | seeing, projection_dim=SIZE)
-    ).eval()
+    config = CLIPConfig(text_config=half | text, vision_config=half | seeing, projection_dim=SIZE)
+    model = CLIPModel(config).eval()
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(torch.randn_like(parameter) * 0.1)
@@ -215,10 +207,8 @@ def hub_folder(folder: Path, tensors: Tensors) -> Case:
 
 
 def hub_folder_of_safetensors(folder: Path, tensors: Tensors) -> Case:
-    save_file(
-        {name: tensor.contiguous() for name, tensor in tensors.items()},
-        folder / "open_clip_model.safetensors",
-    )
+    whole = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    save_file(whole, folder / "open_clip_model.safetensors")
     return folder, 2, 4, True, with_config(folder, 4, 64, quick=True)
 
 
@@ -229,9 +219,7 @@ def worldwide(folder: Path, tensors: Tensors) -> Case:
 
 
 def text_apart(folder: Path, tensors: Tensors) -> Case:
-    halves = {
-        name if name.startswith(("visual", "logit")) else f"text.{name}": t for name, t in tensors.items()
-    }
+    halves = {k if k.startswith(("visual", "logit")) else f"text.{k}": t for k, t in tensors.items()}
     torch.save(halves, folder / "open_clip_pytorch_model.bin")
     config = with_config(folder, 4, 64, quick=False)
     config["model_cfg"] |= {"custom_text": True}
@@ -280,9 +268,8 @@ def compare(case: Case, tmp_path: Path, **sizes: int) -> None:
         other = load_encoder(str(folder), "cpu")
         texts.append(other.encode_texts(PHRASES))
         if act == quick:
-            np.testing.assert_allclose(
-                encoder.encode_images(crops()), other.encode_images(crops()), atol=1e-5
-            )
+            seen = (one.encode_images(crops()) for one in (encoder, other))
+            np.testing.assert_allclose(*seen, atol=1e-5)
     np.testing.assert_allclose(encoder.encode_texts(PHRASES), texts[0], atol=1e-5)
     assert abs(texts[0] - texts[1]).max() > 2e-4  # so the kind of GELU was seen
 

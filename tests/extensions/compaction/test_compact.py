@@ -141,12 +141,11 @@ def test_compact_refuses_unwritable_outputs(source, tmp_path, capsys, loss, out,
 
 
 def test_strict_refuses_a_loss_before_the_work(scene, tmp_path, monkeypatch):
-    save_scene(tmp_path / "a.ply", replace(scene, metres_per_unit=0.5))
+    path = tmp_path / "a.ply"
+    save_scene(path, replace(scene, metres_per_unit=0.5))
     monkeypatch.setattr(STRICTNESS, "on", True)
     with pytest.raises(InputError, match="no room for"):
-        compact.compact_scene(
-            tmp_path / "a.ply", tmp_path / "b.spz", CONFIG, None, lambda *_: pytest.fail("worked")
-        )
+        compact.compact_scene(path, tmp_path / "b.spz", CONFIG, None, lambda *_: pytest.fail("worked"))
 
 
 def test_unforeseen_loss_leaves_the_old_file(source, tmp_path, monkeypatch):
