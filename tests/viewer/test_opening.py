@@ -370,6 +370,10 @@ def test_second_scene_without_field_shows_colours_or_says_why(two):
             assert (two.beside.state.session.picture.display, two.beside.state.session.queries) == ("rgb", ())
     assert "broken.ply" in errors(two)[-1]
     assert two.state.open is not None
+    two.beside = None  # as where a project is opened that compared them
+    meet(two)
+    assert two.state.session.split.mode == "off"
+    assert "choose it in Compare with" in two.state.messages[-1].text
 
 
 @pytest.mark.parametrize("away", [(-90, 0, 0), (90, 0, 0)])

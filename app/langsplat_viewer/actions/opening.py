@@ -462,7 +462,8 @@ def follow_beside(viewer: Viewer) -> None:
     state, beside = viewer.state, viewer.beside
     is_wanted = state.session.split.mode == "scenes"
     if beside is None or not is_wanted:
-        if is_wanted:  # undone
+        if is_wanted:  # undone, or of a project
+            state.say("the compared scene is not open any more: choose it in Compare with")
             viewer.put(split=replace(state.session.split, mode="off"))
         elif beside is not None:
             beside.worker.close()

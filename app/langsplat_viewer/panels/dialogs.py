@@ -371,9 +371,7 @@ def _ask(viewer: Viewer, to: str) -> None:
     state = viewer.state
     if state.is_unsaved:
         count = int(state.marks.deleted.sum())
-        edits = [f"{count:,} deleted"] if count else []
-        if state.session.moves:
-            edits.append("some transformed")
+        edits = [f"{count:,} deleted"] * (count > 0) + ["some transformed"] * bool(state.session.moves)
         said = " and ".join(edits) or "as once opened"
         imgui.text_wrapped(f"Gaussians: {said}. The scene is not saved so.")
     for other in viewer.unsaved():
