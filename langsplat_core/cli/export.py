@@ -58,6 +58,8 @@ class Export:
             write_whole(self.out, text)
         what = "any words of the scene's encoder" if report.free_text else f"{report.phrases:,} phrases"
         asked = f"nothing can be searched: {report.why_not}" if report.why_not else f"{what} can be searched"
+        if scene.language is not None and not (report.why_not or report.free_text or report.phrases):
+            asked += f": its encoder {scene.language.encoder_id} is not here; name it with --encoder"
         print(f"{self.out}: {report.gaussians:,} Gaussians, {report.bytes / 1e6:.2f} MB; {asked}")
 
 

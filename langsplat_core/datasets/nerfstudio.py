@@ -41,6 +41,8 @@ def load_nerfstudio(file: Path, config: DatasetConfig, progress: Progress) -> Ca
     transforms_val.json for want of it, are held out from the training on those of transforms_train.json.
     """
     top = _content(file)
+    if os.path.islink(file) and _photo_file(finder(file.parent), top["frames"][0]["file_path"]) is None:
+        file = Path(os.path.realpath(file))  # its photographs are beside the file itself
     photos = _photos(file, top, held_out=False)
     others = (file.with_name(file.name.replace("_train", f"_{word}")) for word in ("test", "val"))
     held_out = next((other for other in others if other != file and other.is_file()), None)
@@ -79,12 +81,11 @@ def _photos(file: Path, top: Json, held_out: bool) -> dict[str, Photo]:
     for number, frame in enumerate(top["frames"]):
         where = f"{file}: frame {number}"
         label = frame["file_path"]
-        try:
-            path = _photo_file(find, label)
-            size = picture_size(path)
-        except FileNotFoundError:
+        if (path := _photo_file(find, label)) is None:
             missing.append(label)
             continue
+        try:
+            size = picture_size(path)
         except PictureError as error:
             missing.append(f"{label} ({error.reason})")
             continue
@@ -141,13 +142,13 @@ def _guesses(values: Json) -> Iterator[str]:
         yield "camera_model not given: OPENCV is taken"
 
 
-def _photo_file(find: Callable[[str], Path], label: str) -> Path:
-    """Return the photograph called `label`; some datasets leave its suffix away. FileNotFoundError."""
+def _photo_file(find: Callable[[str], Path], label: str) -> Path | None:
+    """Return the photograph called `label`, None for none; some datasets leave its suffix away."""
     for suffix in ("", *PHOTO_SUFFIXES):
         # Unlike Path.is_file, also no for names that no file system could hold.
         if os.path.isfile(candidate := find(f"{label}{suffix}")):
             return candidate
-    raise FileNotFoundError(label)
+    return None
 
 
 def _mask_file(find: Callable[[str], Path], frame: Json) -> Path | None:

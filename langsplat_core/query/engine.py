@@ -20,17 +20,9 @@ from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.sidecar import SUFFIX, Words
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query import answers
 from langsplat_core.query import taught as taught_words
-from langsplat_core.query.answers import (
-    AnswerRule,
-    QueryResult,
-    Regions,
-    build_regions,
-    by_peak,
-    by_regions,
-    chance_in,
-    touching_wholes,
-)
+from langsplat_core.query.answers import AnswerRule, QueryResult, Regions
 from langsplat_core.query.grammar import STOP_WORDS, check_names, named, only, thing_and_part
 from langsplat_core.query.instances import Instance, find_instances, find_wholes
 from langsplat_core.query.lookup import Lookup, Relevancy, through_cells
@@ -145,15 +137,15 @@ class QueryEngine:
         texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
         vectors = self.text_vectors(texts, progress)  # first, so that a refused phrase leaves nothing cached
         relevancies = self._lookup.relevancies(vectors) if texts else iter(())
-        others, answers = self._fits_of_names(texts), []
+        others, found = self._fits_of_names(texts), []
         for phrase in phrases:
             progress(f"searching '{tidy(phrase)}'", 0.5)
             if self.is_taught(phrase):
-                answers.append(self._by_examples(self.taught[phrase_key(phrase)], level))
+                found.append(self._by_examples(self.taught[phrase_key(phrase)], level))
             else:
-                answers.append(self._answer(tidy(phrase), next(relevancies), level, others))
-            vars(answers[-1])["engine"] = self  # `replace` would compute its deferred arrays
-        return answers
+                found.append(self._answer(tidy(phrase), next(relevancies), level, others))
+            vars(found[-1])["engine"] = self  # `replace` would compute its deferred arrays
+        return found
 
     def relevancy(self, vector: Array) -> Array:
         """Return (3, N) float32 relevancy per level and Gaussian of a (D,) unit text vector."""
@@ -182,7 +174,9 @@ class QueryEngine:
     ) -> QueryResult:
         means = self.scene.gaussians.means
         if self.bars is None:
-            return by_peak(phrase, relevancy(), means, self.surface, self.scale, self.field.found, level)
+            return answers.by_peak(
+                phrase, relevancy(), means, self.surface, self.scale, self.field.found, level
+            )
         thing, part = map(others.get, thing_and_part(phrase))
         fits, on = [self._own_fits(relevancy)], None
         if thing is not None:
@@ -191,7 +185,7 @@ class QueryEngine:
         sought = named(phrase)
         judged = self.bars, scaling_of(self.calibration, sought, phrase), on
         decision = decide(self.regions.table, fits, sought, level, *judged)
-        return by_regions(phrase, relevancy, decision, means, self.regions)
+        return answers.by_regions(phrase, relevancy, decision, means, self.regions)
 
     def run_inside(
         self, names: Sequence[str], members: Array, level: LevelChoice, calibration: Calibration | None
@@ -207,7 +201,7 @@ class QueryEngine:
         fits, on, table = list(map(self._own_fits, asked)), self.regions.mostly(members), self.regions.table
         bars = self.bars if calibration else bars_of(table, self.chance, on)
         decision = decide(table, fits, "inside", level, bars, scaling_of(calibration, "inside", names[0]), on)
-        return by_regions(names[0], relevancy, decision, self.scene.gaussians.means, self.regions)
+        return answers.by_regions(names[0], relevancy, decision, self.scene.gaussians.means, self.regions)
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """Return the instances among the members of an answer, best first, at most `at_most`."""
@@ -273,22 +267,26 @@ class QueryEngine:
     @cached_property
     def regions(self) -> Regions:
         """The tree's nodes at each level."""
-        return build_regions(self.tree, surface_weights(self.scene.gaussians))
+        return answers.build_regions(self.tree, surface_weights(self.scene.gaussians))
 
     @cached_property
     def touching(self) -> Array:
         """The (P, 2) pairs of wholes that may be pieces of one thing, see `touching_wholes`."""
+        return self.touching_in(SAMPLE)
+
+    def touching_in(self, sample: int) -> Array:
+        """Return what `touching` has, by the surface of about `sample` of the Gaussians."""
         gaussians = self.scene.gaussians
-        some = np.arange(0, len(gaussians), len(gaussians) // SAMPLE + 1)
+        some = np.arange(0, len(gaussians), len(gaussians) // sample + 1)
         surface = self.surface if len(some) == len(gaussians) else build_surface(gaussians.take(some))
-        return touching_wholes(self.regions, surface.ends, some[surface.rows])
+        return answers.touching_wholes(self.regions, surface.ends, some[surface.rows])
 
     @cached_property
     def chance(self) -> Array | None:
         """The (R, V) fits of everyday phrases in the regions of all levels; None without such phrases."""
         if self.rule == "peak":
             return None
-        return chance_in(self.regions.table, self._mixtures, self._lookup, self.scale)
+        return answers.chance_in(self.regions.table, self._mixtures, self._lookup, self.scale)
 
     @cached_property
     def bars(self) -> Bars | None:

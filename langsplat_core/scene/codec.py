@@ -34,6 +34,9 @@ class Codec(ABC):
     blends: ClassVar[bool] = True  # a weighted mean of latents is a latent
     unit_latents: ClassVar[bool] = False  # latents have length 1: those of 3 numbers lie on a sphere
 
+    def __repr__(self) -> str:
+        return f"<{self.kind} codec of {self.size}, for vectors of {self.vector_dim} numbers>"
+
     @property
     @abstractmethod
     def dims(self) -> tuple[int, int]:
@@ -120,7 +123,7 @@ def _directions(latents: Array) -> tuple[Array, Array]:
     return (latents / np.where(known, length, 1)[:, None]).astype(np.float32), known
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LinearCodec(Codec):
     """An orthonormal basis of the scene's CLIP vectors: decoding is one matrix product."""
 
@@ -147,7 +150,7 @@ class LinearCodec(Codec):
         return np.where(known[:, None], towards @ (vectors @ self.basis.T).T, 0).astype(np.float32)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class AutoencoderCodec(Codec):
     """LangSplat's autoencoder (section 3.2 of the paper): linear layers with ReLU between; unit latents."""
 
@@ -237,7 +240,7 @@ def _layers(tensors: dict[str, Array], part: str) -> Layers:
     return tuple((tensors[f"{part}.{i}.weight"], tensors[f"{part}.{i}.bias"]) for i in range(count))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CodebookCodec(Codec):
     """K codewords, unit vectors in CLIP space; a latent is the index of one, so latents cannot be blended."""
 

@@ -75,7 +75,7 @@ LEVELS: tuple[Level, Level, Level] = ("subpart", "part", "whole")
 NO_NODE = -1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Tree:
     """K nodes, each a set of Gaussians within its parent's. Children come before their parents."""
 

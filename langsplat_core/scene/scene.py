@@ -67,7 +67,7 @@ class Camera(Intrinsics):
 
     width: int  # pixels, >= 1
     height: int
-    world_to_camera: Array  # (4, 4) float64, rigid
+    world_to_camera: Array = field(repr=False)  # (4, 4) float64, rigid
     name: str = ""  # file stem of the photograph it belongs to, if any
     orthographic: bool = False
     __eq__, __hash__ = object.__eq__, object.__hash__  # by identity, not by intrinsics

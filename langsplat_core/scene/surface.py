@@ -22,7 +22,7 @@ AT_ONCE = 1 << 18  # Gaussians whose distances are held at a time: all of five m
 REACH = 4.0  # times the median distance of a Gaussian's neighbours: what is farther is another surface
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Surface:
     """Graph of the M visible Gaussians and their k nearest neighbours; close ones have close numbers."""
 

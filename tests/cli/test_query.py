@@ -257,6 +257,13 @@ def test_outline_and_inventory_are_printed_as_text_and_json(described, capsys):
         np.testing.assert_allclose(spot["centre"], CENTRES[NAMES.index(entry["phrase"])], atol=0.1)
 
 
+def test_export_says_why_nothing_can_be_asked(folder, capsys):
+    field = replace(SCENE.language, phrasebook={}, encoder_id="./absent")
+    save_scene("b.ply", replace(SCENE, language=field))
+    (said,) = lines(capsys, "export", "b.ply", "b.html")
+    assert said.endswith(" can be searched: its encoder ./absent is not here; name it with --encoder")
+
+
 # `langsplat teach`, and `query` for what was taught.
 
 
@@ -352,6 +359,7 @@ def test_words_taught_at_once_are_all_kept(described, into):
         ("inspect --jsn", "scene is missing; is there an unknown option"),
         ("inspect a.ply --jsn", "--jsn; did you mean --json?"),
         ("query a.ply mug --instances 1e3", "--instances: expected a whole number, got '1e3'"),
+        ("transform a.ply b.ply --rotate q 3", "--rotate: expected one of 'x', 'y', 'z' and a number"),
         ("train loop --out b.ply --clip.model demo", "loop does not exist"),
         ("convert b.ply", "name what to read"),
         ("convert a.ply out --to nothing", "choose one of scene"),

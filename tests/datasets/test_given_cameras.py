@@ -266,6 +266,9 @@ def test_paths_are_read_leniently_and_missing_frames_reported_once(tmp_path, cap
     data["frames"][1]["file_path"] = "images\\view_1.png"
     rewrite(tmp_path, data)
     assert len(load(tmp_path)) == 3
+    (tmp_path / "apart").mkdir()
+    (tmp_path / "apart/transforms.json").symlink_to(tmp_path / "transforms.json")
+    assert len(load(tmp_path / "apart")) == 3  # beside the link's target
     (tmp_path / "images/view_1.png").unlink()
     (tmp_path / "images/view_2.png").write_bytes(b"")
     assert [camera.name for camera in load(tmp_path).cameras] == ["view_0"]

@@ -339,6 +339,16 @@ def test_touching_wholes_share_a_fifth_of_their_borders():
     assert touching_wholes(regions, surface.ends, surface.rows).tolist() == [[1, 0], [2, 1]]
 
 
+def test_a_sample_finds_the_same_touching_wholes_as_all():
+    at = np.random.default_rng(0).uniform(0, 24, (6_000, 2))
+    things = np.select([at[:, 0] < 1, at[:, 0] < 4, at[:, 0] < 12, at[:, 0] > 18], [0, 1, 2, 3], NO_NODE)
+    gaussians = unturned_gaussians(np.pad(at, ((0, 0), (0, 1))).astype(np.float32), -1.0, 5.0)
+    field = replace(random_field(6_000, "codebook"), tree=tree_of_wholes(things))
+    engine = QueryEngine(Scene(gaussians, field))
+    assert engine.touching.tolist() == [[0, 1], [1, 2]]
+    assert engine.touching_in(1_500).tolist() == [[0, 1], [1, 2]]
+
+
 def test_part_is_chosen_by_its_phrase_and_its_own_word():
     phrase, word = np.array([1.5, 1.0, 0.0, 0.0, 0.5, 0.5]), np.array([0.0, 2.0, 0.0, 0.0, 0.5, 0.5])
     asked = decide(TWO, [phrase, word], "part of a thing", "auto", BARS, None, np.ones(6, bool))

@@ -92,11 +92,11 @@ class WriteMesh:
                 share = 100 * area / max(float(mesh.areas().sum()), 1e-300)
                 made = f" closed; made up: {area * unit.length**2:.3g} {unit.name}^2 ({share:.0f} %)"
                 if hollows := mesh.hollows():
-                    made += f"; {hollows} hollow pieces, which what is solid surrounds, as walls do a room"
+                    made += f"; pieces hollow as rooms, which what is solid surrounds: {hollows}"
             write_mesh(self.out, mesh, scene, self.phrase or self.scene.stem)
         print(
             f"{self.out}: {len(mesh.triangles)} triangles, {len(mesh.vertices)} vertices, voxels of "
-            f"{side * unit.length:.3g} {unit.name}; {holes} holes{made}"
+            f"{side * unit.length:.3g} {unit.name}; {holes} hole{'s' * (holes != 1)}{made}"
         )
 
 
