@@ -325,7 +325,7 @@ def smaller(case: Case) -> Found:
 def surfaces(case: Case) -> Found:
     pytest.importorskip("open3d")
     from langsplat_core.extensions.geometry.mesh import close_holes, fuse
-    from langsplat_core.extensions.geometry.planes import find_room
+    from langsplat_core.extensions.geometry.occupancy import find_room
 
     mesh, side = fuse(case.scene, 0.02 * case.scene.bounds()[1])
     closed, _ = close_holes(mesh, side)

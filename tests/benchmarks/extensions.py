@@ -25,8 +25,7 @@ from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.extensions.compaction.clean import CleanConfig, clean, find_floaters
 from langsplat_core.extensions.compaction.compact import Views, choose_views, mean_psnr
 from langsplat_core.extensions.geometry.mesh import fuse
-from langsplat_core.extensions.geometry.occupancy import find_occupancy, floor_map, map_axes
-from langsplat_core.extensions.geometry.planes import find_room
+from langsplat_core.extensions.geometry.occupancy import find_occupancy, find_room, floor_map, map_axes
 from langsplat_core.extensions.library.changes import Change, changes
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import join_gaussians

@@ -96,8 +96,6 @@ def read_grey(path: Path) -> Array:
 
 def resized(mask: Array, size: Size) -> Array:
     """Return (H, W) bool mask on a grid of `size`, by the nearest pixel."""
-    if mask.shape == (size[1], size[0]):
-        return mask
     image = Image.fromarray(mask.astype(np.uint8))
     return np.asarray(image.resize(size, Image.Resampling.NEAREST)) > 0
 

@@ -168,8 +168,6 @@ def peak_pixels(maps: Array, rule: MapRule) -> Array:
 
 def mean_filtered(values: Array, window: int, border: Border) -> Array:
     """Return (H, W) means over `window`^2 pixels; an even window extends further up and left, as in cv2."""
-    if window <= 1:
-        return values
     if border == "mirror":
         return uniform_filter(values, window, mode="mirror")
     total = uniform_filter(values, window, mode="constant")
@@ -178,7 +176,7 @@ def mean_filtered(values: Array, window: int, border: Border) -> Array:
 
 def voted(mask: Array, vote: Vote, window: int) -> Array:
     """Return the (H, W) bool majority of `window`^2 pixels, ties False; "clipped": no last row and column."""
-    if vote == "none" or window <= 1:
+    if vote == "none":
         return mask
     counted = np.ones(mask.shape)
     if vote == "clipped":

@@ -126,7 +126,7 @@ def scored_size(size: Size, max_rows: int) -> Size:
 
 def inside_any_box(peaks: Array, boxes: Array | None, size: Size, grid: Size) -> bool:
     """Return True if a peak (P, 2) on `grid` is in a box (B, 4) of the label's `size`, borders included."""
-    if boxes is None or not len(peaks):
+    if boxes is None:
         return False
     scaled = boxes * np.tile(np.divide(grid, size), 2)
     low, high = np.minimum(scaled[:, :2], scaled[:, 2:]), np.maximum(scaled[:, :2], scaled[:, 2:])

@@ -21,11 +21,11 @@ from langsplat_core.extensions.geometry.occupancy import (
     collider,
     find_goal,
     find_occupancy,
+    find_room,
     floor_map,
     map_axes,
     reachable,
 )
-from langsplat_core.extensions.geometry.planes import find_room
 from langsplat_core.extensions.geometry.registration import NEAR, TRUSTED, Registration, merge, once, register
 from langsplat_core.io.files import atomic_path, write_json, write_whole
 from langsplat_core.io.hostile import read_json_file

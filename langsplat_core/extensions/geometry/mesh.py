@@ -19,8 +19,7 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, linear_light, rotation_matrices, unit
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.geometry.planes import cloud
-from langsplat_core.extensions.geometry.registration import some_cameras
+from langsplat_core.extensions.geometry.registration import cloud, some_cameras
 from langsplat_core.io.gltf import SIGNS, GltfWriter, node_of
 from langsplat_core.io.ply import CHANNELS, POSITION, write_table
 from langsplat_core.io.quantised import to_bytes
@@ -178,7 +177,7 @@ def _taken(mesh: "object") -> Mesh:
 def _cleaned(mesh: Mesh) -> Mesh:
     """Return the mesh without pieces of fewer than `SPECK` triangles. InputError if nothing is left."""
     piece = mesh.pieces()
-    kept = mesh.triangles[np.bincount(piece)[piece] >= SPECK] if len(piece) else mesh.triangles
+    kept = mesh.triangles[np.bincount(piece)[piece] >= SPECK]
     if len(kept) == 0:
         raise InputError("too few views show the same surface; take fewer --views, or a coarser --resolution")
     used, triangles = np.unique(kept, return_inverse=True)

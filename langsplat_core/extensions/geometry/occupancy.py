@@ -1,5 +1,6 @@
-"""Maps for robots: voxels, a map of the floor, and free poses in front of instances.
+"""Maps for robots: the floor, voxels, a map of the floor, and free poses in front of instances.
 
+The floor is a plane of points sampled evenly from the surface, found by RANSAC (Open3D).
 Space along a ray of a training camera is free up to the depth of half transmittance and occupied there. Space
 that no ray reaches is unknown.
 """
@@ -14,7 +15,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.geometry.mesh import watertight
-from langsplat_core.extensions.geometry.planes import Room
+from langsplat_core.extensions.geometry.registration import cloud, sample_surface
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import NO_ORIGIN, Scene
@@ -28,6 +29,48 @@ MARGIN = 5  # voxels around the seen surface
 MOST_LOOKS = 20_000  # positions, at most, that are tested for a free line to an instance
 MOST_PAIRS = 4_000_000  # distances, at most, between positions and cells of an instance
 STAGE = "measuring what is free"
+# Of the floor.
+SAMPLES = 30_000  # points of the surface
+NEAR = 0.02  # largest distance of a plane's points, as a share of the scene's radius
+LEAST = 0.02  # least share of the surface in a plane of a room
+MOST = 8  # planes that are tried
+LEVEL = 0.9  # least cosine of a floor's normals with up
+BELOW = 0.05  # largest share of the surface below the floor: reflections and floaters
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Up direction and floor of a scene."""
+
+    up: Array  # (3,) unit: the floor's normal; the scene's own up without a floor
+    ground: float  # height of the floor along `up`, world units; without one, of nearly the lowest surface
+    has_floor: bool
+
+
+def find_room(scene: Scene) -> Room:
+    """Return up and floor: the largest level plane with little below it; InputError without a surface.
+
+    Planes are found one by one, each among the level points that are in none of the planes before it.
+    """
+    import open3d
+
+    points, normals = sample_surface(scene.gaussians, SAMPLES)
+    up, near, least = scene.up(), NEAR * scene.bounds()[1], max(LEAST * len(points), 3)
+    left = points[np.abs(normals @ up) >= LEVEL]
+    open3d.utility.random.seed(0)
+    for _ in range(MOST):
+        if len(left) < least:
+            break
+        (*direction, offset), inside = cloud(left).segment_plane(near, 3, 1_000, 1.0)
+        if len(inside) < least:
+            break
+        normal, length = np.array(direction), np.linalg.norm(direction)
+        sign = 1 if normal @ up >= 0 else -1
+        normal, ground = sign * normal / length, -sign * float(offset / length)
+        if (points @ normal - ground < -2 * near).mean() <= BELOW:
+            return Room(normal, ground, has_floor=True)
+        left = np.delete(left, inside, axis=0)
+    return Room(up, float(np.quantile(points @ up, BELOW)), has_floor=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +242,6 @@ def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -
     points: (P, 2) metres, of the instance seen from above, P >= 1; least: least distance to it, metres.
     """
     cells = np.argwhere(where)
-    if len(cells) == 0:
-        return None
     centres = plan.centres(cells)
     thing = np.unique(np.floor((points - plan.origin) / plan.resolution).astype(int), axis=0)
     spots = plan.centres(thing)

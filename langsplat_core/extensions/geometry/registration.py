@@ -6,23 +6,24 @@ transform.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, rotation_matrices, unit
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.geometry.planes import cloud, sample_surface
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
-from langsplat_core.scene import LEVELS, Camera, LanguageField, Scene, Tree
+from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene, Tree
 from langsplat_core.scene.codec import MOST_CODEWORDS, CodebookCodec, Codec, principal_colours
 from langsplat_core.scene.gaussians import coarse_step, join_gaussians
 from langsplat_core.scene.language import NO_NODE
-from langsplat_core.scene.surface import surface_areas
+from langsplat_core.scene.surface import surface_areas, surface_weights
 from langsplat_core.scene.transform import place_scene, rotating, similarity
 
+FEWEST = 100  # least opaque Gaussians of a scene with a surface
 SAMPLES = 40_000  # points of each surface
 ROUGH, FINE = 0.06, 0.03  # spacing of points for features and for ICP, as shares of the fixed scene's radius
 TRIES = 50_000  # of RANSAC
@@ -36,6 +37,37 @@ NEAR = 0.02  # largest distance of surfaces of one instance, as a share of the f
 SAME = 0.4  # least share of the surfaces of two equal instances that are near each other
 
 STAGE = "registering"
+
+
+def sample_surface(gaussians: Gaussians, count: int) -> tuple[Array, Array]:
+    """Return (count, 3) float64 points on the surface, of equal density by area, and their unit normals.
+
+    Normals, (count, 3), are of either sign. A Gaussian is a disc across its shortest axis, with the density
+    of its two longest ones. Raises InputError for fewer than `FEWEST` opaque Gaussians.
+    """
+    rows = np.flatnonzero(surface_weights(gaussians) > 0)
+    areas = surface_areas(gaussians)[rows]
+    if len(rows) < FEWEST or not areas.sum() > 0:
+        raise InputError(f"{len(rows)} opaque Gaussians have no surface; at least {FEWEST} are needed")
+    rng = np.random.default_rng(0)
+    chosen = rows[rng.choice(len(rows), count, p=areas / areas.sum())]
+    axes = rotation_matrices(gaussians.quats_wxyz[chosen].astype(np.float64))  # columns
+    lengths = np.exp(gaussians.log_scales[chosen].astype(np.float64).clip(max=np.log(np.sqrt(areas.max()))))
+    shortest = lengths.argmin(1)
+    steps = lengths * rng.normal(size=(count, 3))
+    steps[np.arange(count), shortest] = 0
+    points = gaussians.means[chosen] + np.einsum("nij,nj->ni", axes, steps)
+    return points, unit(axes[np.arange(count), :, shortest])
+
+
+def cloud(points: Array, normals: Array | None = None) -> Any:
+    """Return (P, 3) points, with (P, 3) normals if given, as a point cloud of Open3D."""
+    import open3d
+
+    made = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    if normals is not None:
+        made.normals = open3d.utility.Vector3dVector(normals)
+    return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,17 +95,17 @@ def register(moving: Scene, fixed: Scene, scaled: bool = False, progress: Progre
     Without `scaled` both have the same unit, unless their metres per unit differ. Raises InputError for a
     scene without a surface. The result is only a guess unless it is `trusted`.
     """
-    unit = 1.0
+    ratio = 1.0  # of a unit of the moving scene to one of the fixed scene
     if moving.metres_per_unit is not None and fixed.metres_per_unit is not None:
-        unit, scaled = moving.metres_per_unit / fixed.metres_per_unit, False
+        ratio, scaled = moving.metres_per_unit / fixed.metres_per_unit, False
     elif scaled:
-        unit = fixed.bounds()[1] / moving.bounds()[1]
+        ratio = fixed.bounds()[1] / moving.bounds()[1]
     centre, radius = fixed.bounds()
     # Rooms look similar after quarter turns.
     turns = [rotating(fixed.up(), -90.0 * quarter).about(centre).matrix for quarter in range(4)]
     mine, theirs = (sample_surface(scene.gaussians, SAMPLES)[0] for scene in (moving, fixed))
     best: Registration | None = None
-    sizes = [unit * factor for factor in SIZES] if scaled else [unit] * AGAIN
+    sizes = [ratio * factor for factor in SIZES] if scaled else [ratio] * AGAIN
     for start, size in enumerate(sizes):
         progress(STAGE, start / len(sizes))
         matrix, rmse = _aligned(size * mine, theirs, turns, radius, scaled, seed=start)

@@ -214,19 +214,19 @@ def colour_term(lab: Array) -> str:
 def _pieces(engine: QueryEngine, evidence: Array, into: Array) -> list[_Piece]:
     """Return the changed pieces; those that meet, with similar features and changes, are merged."""
     tree, members = engine.tree, engine.tree.gaussians()
-    inside = np.zeros(tree.count, bool)
     features = _codewords_seen(engine)
     made: list[_Piece] = []
-    sums, images, leaves = members.sums(evidence[:, :3]), np.zeros(tree.count), tree.leaves >= 0
+    images, leaves = np.zeros(tree.count), tree.leaves >= 0
     np.maximum.at(images, tree.leaves[leaves], evidence[leaves, 3])
-    for node in range(tree.count):
-        if tree.parents[node] >= 0:
-            images[tree.parents[node]] = max(images[tree.parents[node]], images[node])
+    for node, parent in enumerate(tree.parents):
+        if parent >= 0:
+            images[parent] = max(images[parent], images[node])
+    changed = _changed(members.sizes, members.sums(evidence[:, :3]), images)
     for node in range(tree.count - 1, -1, -1):  # parents first
         parent = tree.parents[node]
-        within = parent >= 0 and bool(inside[parent])
-        inside[node] = within or _has_changed(members.sizes[node], sums[node], images[node])
-        if inside[node] and not within:
+        if parent >= 0 and changed[parent]:
+            changed[node] = True
+        elif changed[node]:
             made.append(_piece(engine, evidence, into, members[node], features))
     kept: list[_Piece] = []
     for piece in sorted(made, key=lambda piece: -len(piece.rows)):
@@ -241,11 +241,12 @@ def _pieces(engine: QueryEngine, evidence: Array, into: Array) -> list[_Piece]:
     return kept
 
 
-def _has_changed(size: int, sums: Array, images: float) -> bool:
-    gone, kept, coloured = sums
-    enough = size >= LEAST and gone + kept >= LEAST_PIXELS * max(images, 1)
-    least = MOST_GONE if gone >= ABSENT * (gone + kept) else MOST_COLOURED
-    return bool(enough and gone + coloured >= least * (gone + kept))
+def _changed(sizes: Array, sums: Array, images: Array) -> Array:
+    """Return (K,) bool: the nodes that changed, by their Gaussians, pixels and images."""
+    gone, kept, coloured = sums.T
+    enough = (sizes >= LEAST) & (gone + kept >= LEAST_PIXELS * np.maximum(images, 1))
+    least = np.where(gone >= ABSENT * (gone + kept), MOST_GONE, MOST_COLOURED)
+    return np.asarray(enough & (gone + coloured >= least * (gone + kept)))
 
 
 def _codewords_seen(engine: QueryEngine) -> tuple[Array, Array, Array]:

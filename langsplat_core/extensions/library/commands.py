@@ -81,11 +81,10 @@ def _name(hit: Hit, library: Library) -> str:
 
 
 def _heading(answered: Answers) -> str:
-    counts = f"found in {answered.count('found')} of {len(answered.hits)} scenes"
-    weak = answered.count("weak match")
-    return f"{answered.phrase} ({answered.encoder_id}): " + (
-        answered.problem or counts + (f", a weak match in {weak}" if weak else "")
-    )
+    said = answered.problem or f"found in {answered.count('found')} of {len(answered.hits)} scenes"
+    if weak := answered.count("weak match"):
+        said += f", a weak match in {weak}"
+    return f"{answered.phrase} ({answered.encoder_id}): {said}"
 
 
 def _fields(answered: Answers, hits: Sequence[Hit], library: Library) -> dict[str, Any]:

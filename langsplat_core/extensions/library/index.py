@@ -154,16 +154,11 @@ def scenes_in(folder: Path) -> list[Path]:
             log.warning("not searched: %s: its name is not UTF-8; rename it", shown(Path(root, name)))
         files[:] = filter(is_utf8, files)
         folders[:] = sorted(name for name in folders if is_utf8(name) and not name.startswith("."))
-        fields = {name.removesuffix(SUFFIX) for name in files if name.endswith(SUFFIX)}
-        if not fields:
-            continue
-        taken = set[str]()
-        for name in sorted([*files, *folders]):
-            stem = name if name in fields else Path(name).stem
-            path = Path(root, name)
-            own = stem in fields - taken and format_of(path) is not None
-            if own and companion_path(path, SUFFIX).name == stem + SUFFIX:
-                taken.add(stem)
+        fields = {name for name in files if name.endswith(SUFFIX)}
+        for path in sorted(Path(root, name) for name in (*files, *folders)) if fields else ():
+            field = companion_path(path, SUFFIX).name if format_of(path) is not None else ""
+            if field in fields:
+                fields.remove(field)
                 found.append(path)
     return found
 

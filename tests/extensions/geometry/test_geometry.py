@@ -34,16 +34,17 @@ from langsplat_core.extensions.geometry.mesh import (
 from langsplat_core.extensions.geometry.occupancy import (
     FloorMap,
     Occupancy,
+    Room,
     collider,
     find_goal,
     find_occupancy,
+    find_room,
     floor_map,
     map_axes,
     reachable,
     trace,
 )
-from langsplat_core.extensions.geometry.planes import FEWEST, Room, find_room
-from langsplat_core.extensions.geometry.registration import agreement, merge, once, register
+from langsplat_core.extensions.geometry.registration import FEWEST, agreement, merge, once, register
 from langsplat_core.io import apart
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
