@@ -333,6 +333,7 @@ def test_words_taught_at_once_are_all_kept(described, into):
         ("teach named.ply --name vase --remove --camera 1", "--camera: is only used with --at"),
         ("eval lerf-ovs . --maps . --encoder demo", "--encoder: is only used with a scene"),
         ("compact a.ply --photos . --assumed-psnr 30", "--assumed-psnr: the loss is measured"),
+        ("clean a.ply b.ply --photos . --assumed-psnr 30", "--assumed-psnr: the loss is measured"),
         ("convert a.ply b.spz --phrases mug", "are for checkpoints"),
         ("select a.ply spoon", "does not know 'spoon'"),
         ("select a.ply mug --instance 2", "--instance 2: there are 1, numbered from 1"),

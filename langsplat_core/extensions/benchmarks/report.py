@@ -14,6 +14,7 @@ from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import InputError, shortened
+from langsplat_core.extensions.benchmarks import profiles
 from langsplat_core.extensions.benchmarks.labels import (
     Benchmark,
     LabelledScene,
@@ -21,16 +22,7 @@ from langsplat_core.extensions.benchmarks.labels import (
     check_same_image,
     without_suffix,
 )
-from langsplat_core.extensions.benchmarks.profiles import (
-    MapRule,
-    MapSource,
-    OwnRule,
-    Prediction,
-    Profile,
-    SceneSource,
-    SilhouetteRule,
-    Source,
-)
+from langsplat_core.extensions.benchmarks.profiles import Profile
 from langsplat_core.io.files import write_json, write_whole
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import AnswerRule
@@ -77,7 +69,7 @@ class QueryScore:
 
 
 def score_scene(
-    labelled: LabelledScene, source: Source, profile: Profile, progress: Progress = silent
+    labelled: LabelledScene, source: profiles.Source, profile: Profile, progress: Progress = silent
 ) -> tuple[list[QueryScore], list[str]]:
     """Return the scores of all queries of a scene, and the labels that cannot be scored, with the reason.
 
@@ -92,14 +84,14 @@ def score_scene(
         for label in frame.labels:
             answer, unanswered = answers[label.phrase], ""
             if isinstance(answer, str):  # counts as an empty answer that is wrong
-                unanswered, answer = answer, Prediction(np.zeros(frame.size[::-1], bool))
+                unanswered, answer = answer, profiles.Prediction(np.zeros(frame.size[::-1], bool))
             size = answer.mask.shape[1], answer.mask.shape[0]
             check_same_image(frame.name, size, frame.size)
             truth = label.truth(size)
             if label.targets != 0 and not truth.any():
                 left_out.append(f"{frame.name}: {label.phrase} (empty mask)")
                 continue
-            placed = label.boxes is not None and not isinstance(profile.rule, SilhouetteRule)
+            placed = label.boxes is not None and not isinstance(profile.rule, profiles.SilhouetteRule)
             score = QueryScore(
                 scene=labelled.name,
                 frame=frame.name,
@@ -316,30 +308,30 @@ def _scene_source(
     subject: Evaluated,
     load_encoder: LoadEncoder,
     progress: Progress,
-) -> SceneSource:
+) -> profiles.SceneSource:
     assert subject.scene is not None
     path = subject.scene / f"{labelled.name}.ply" if subject.scene.is_dir() else subject.scene
     if not path.exists():
         raise InputError(f"{path}: no such scene; name another folder, or that of one labelled scene")
     # Rules for maps need relevancies as published.
-    rule: AnswerRule = "peak" if isinstance(profile.rule, MapRule) else "regions"
+    rule: AnswerRule = "peak" if isinstance(profile.rule, profiles.MapRule) else "regions"
     engine = QueryEngine(searchable(path), load_encoder, encoder_id=subject.encoder, rule=rule)
     own = {without_suffix(camera.name): camera for camera in engine.scene.cameras}
     others = _other_cameras(own, labelled, progress)
     # Without a common name the scene has other names for views, and training views are unknown.
     related = not own.keys().isdisjoint([*others, *(frame.name for frame in labelled.frames)])
     trained = frozenset(own) if related else None
-    return SceneSource(engine, {**others, **own}, trained, profile)
+    return profiles.SceneSource(engine, {**others, **own}, trained, profile)
 
 
-def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Path) -> MapSource:
-    if isinstance(profile.rule, OwnRule):
+def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Path) -> profiles.MapSource:
+    if isinstance(profile.rule, profiles.OwnRule):
         raise InputError("--protocol ours reads a scene's own answer; score maps by another protocol")
     candidates = (maps / labelled.name, maps) if count == 1 else (maps / labelled.name,)
     names = [frame.name for frame in labelled.frames]
     for folder in candidates:
         if any((folder / name).is_dir() for name in names):
-            return MapSource(folder, profile.rule)
+            return profiles.MapSource(folder, profile.rule)
     raise InputError(
         f"{candidates[0]}: no folder is named after a labelled frame ({shortened(names, 3)}); "
         "expected <view>/<phrase>.npy or .png in it"

@@ -314,20 +314,19 @@ def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[i
         )
     if asked:
         return [LEVELS.index(name) for name in asked], "as asked"
-    guess = ""
     numbers = [_numbered(carrier.path) for carrier in carriers]
     chosen = [number - 1 for number in numbers if number is not None]
     if len(set(chosen)) == len(carriers):
         return chosen, "by the names of files and folders"
     if len(carriers) == len(LEVELS) and len(set(numbers)) == 1:
         chosen, guess = list(range(len(LEVELS))), "by their order"
-    if numbers == [None]:
+    elif numbers == [None]:
         chosen, guess = [len(LEVELS) - 1], "one alone is taken for the whole"
-    if guess:
-        report_loss("%s: its level is a guess; --levels says which it is", carriers[0].path)
-        return chosen, guess
-    paths = ", ".join(str(carrier.path) for carrier in carriers)
-    raise InputError(f"{paths}: of which levels? Say them, as --levels {' '.join(LEVELS[: len(carriers)])}")
+    else:
+        paths, names = ", ".join(str(carrier.path) for carrier in carriers), " ".join(LEVELS[: len(carriers)])
+        raise InputError(f"{paths}: of which levels? Say them, as --levels {names}")
+    report_loss("%s: its level is a guess; --levels says which it is", carriers[0].path)
+    return chosen, guess
 
 
 def _numbered(path: Path) -> int | None:

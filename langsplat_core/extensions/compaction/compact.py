@@ -133,6 +133,8 @@ def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progre
 
 
 def _photographed(scene: Scene, photos: Path, config: BudgetConfig, progress: Progress) -> Views:
+    if config.assumed_psnr != BudgetConfig().assumed_psnr:
+        raise InputError("--assumed-psnr: the loss is measured on photographs; leave it out, or --photos")
     with tempfile.TemporaryDirectory() as work:  # for structure from motion, if it is needed
         settings = DatasetConfig(max_side=config.max_side, allow_few_cameras=True)  # nothing is trained
         capture = load_capture(photos, settings, Path(work), progress)
@@ -251,16 +253,11 @@ class Loss:
     @property
     def lines(self) -> list[str]:
         """The losses as lines of text."""
-        how = (
-            "measured on photographs"
-            if self.assumed_psnr is None
-            else f"derived from the change, if the scene has {self.assumed_psnr:g} dB"
-        )
+        how = "measured on photographs"
+        if self.assumed_psnr is not None:
+            how = f"derived from the change, if the scene has {self.assumed_psnr:g} dB"
         loss = f"{self.loss:.3f} dB of {self.budget:g} allowed, worst view {self.worst_loss:.2f} dB"
-        return [
-            f"loss: {loss} ({how})",
-            f"views: {self.measuring_views} measured; {self.views_from}",
-        ]
+        return [f"loss: {loss} ({how})", f"views: {self.measuring_views} measured; {self.views_from}"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,8 +278,6 @@ def compact_scene(
     InputError, and leaves `out` as it was, if the budget cannot be kept or nothing can be dropped.
     """
     scene = scene_for(out, source)
-    if photos is not None and config.assumed_psnr != type(config)().assumed_psnr:
-        raise InputError("--assumed-psnr: the loss is measured on photographs; leave it out, or --photos")
     views = choose_views(scene, photos, config, progress)
     measured = views.measured(scene)
     before, before_bytes = _stored(scene, out)

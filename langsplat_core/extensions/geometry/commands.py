@@ -14,18 +14,8 @@ from langsplat_core.cli.arguments import AnyScene, EncoderOption, Needs, OutFile
 from langsplat_core.cli.query import Unit, found_answer
 from langsplat_core.config import Count, LevelChoice, Positive
 from langsplat_core.errors import EncoderError, InputError, malformed, optional_imports, printable_line
+from langsplat_core.extensions.geometry import occupancy
 from langsplat_core.extensions.geometry.mesh import check_suffix, close_holes, fuse, write_mesh
-from langsplat_core.extensions.geometry.occupancy import (
-    FloorMap,
-    Occupancy,
-    collider,
-    find_goal,
-    find_occupancy,
-    find_room,
-    floor_map,
-    map_axes,
-    reachable,
-)
 from langsplat_core.extensions.geometry.registration import NEAR, TRUSTED, Registration, merge, once, register
 from langsplat_core.io.files import atomic_path, write_json, write_whole
 from langsplat_core.io.hostile import read_json_file
@@ -121,13 +111,13 @@ class Register:
         scene, fixed = load_scene(self.moving), load_scene(self.fixed)
         with TerminalProgress() as progress:
             found = registered(scene, fixed, self.scaled, progress)
-        matrix = between_worlds(similarity(found.transform), scene.origin, fixed.origin).matrix
+        matrix = between_worlds(found.transform, scene.origin, fixed.origin).matrix
         if self.out is not None:
             write_json(self.out, {"matrix": matrix.tolist()})
         rows = "  ".join(" ".join(f"{number:.15g}" for number in row) for row in matrix)
         print(
             f"{100 * found.agreement:.0f} % of the surfaces agree, {found.rmse:.3g} units apart; scale "
-            f"{found.scale:.4g}; --matrix {rows}"
+            f"{found.transform.scale:.4g}; --matrix {rows}"
         )
 
 
@@ -166,7 +156,7 @@ class Merge:
         elif not self.as_is:
             with TerminalProgress() as progress:
                 found = registered(second, first, self.scaled, progress)
-            second = replace(transform_scene(second, similarity(found.transform)), origin=first.origin)
+            second = replace(transform_scene(second, found.transform), origin=first.origin)
             said = f"registered, {100 * found.agreement:.0f} % of the surfaces agree"
         scene = merge(first, second)
         if not self.keep_both:
@@ -249,13 +239,14 @@ class Map:
             for phrase in self.goal:
                 check_phrase(engine, phrase, scene.cameras[0] if scene.cameras else None)
         with TerminalProgress() as progress:
-            room = find_room(scene)
-            occupancy = find_occupancy(scene, map_axes(room, metres, scene.origin), self.resolution, progress)
-            plan = floor_map(occupancy, self.step, self.robot_height)
+            room = occupancy.find_room(scene)
+            axes = occupancy.map_axes(room, metres, scene.origin)
+            voxels = occupancy.find_occupancy(scene, axes, self.resolution, progress)
+            plan = occupancy.floor_map(voxels, self.step, self.robot_height)
             self.out.mkdir(parents=True, exist_ok=True)
             write_grid(self.out, plan)
-            write_collider(self.out / "collider.obj", occupancy)
-            write_voxels(self.out / "voxels.npz", occupancy, scene, engine, progress)
+            write_collider(self.out / "collider.obj", voxels)
+            write_voxels(self.out / "voxels.npz", voxels, scene, engine, progress)
         floor = "" if room.has_floor else " (no floor was found: the ground is nearly the lowest surface)"
         print(
             f"{self.out}: {plan.free.shape[0]} x {plan.free.shape[1]} cells of {self.resolution:g} m, "
@@ -263,20 +254,22 @@ class Map:
             f"{metres:g} m per unit{floor}"
         )
         if engine is not None and self.goal:
-            self._write_goals(plan, occupancy, engine)
+            self._write_goals(plan, voxels, engine)
 
-    def _write_goals(self, plan: FloorMap, occupancy: Occupancy, engine: QueryEngine) -> None:
+    def _write_goals(
+        self, plan: occupancy.FloorMap, voxels: occupancy.Occupancy, engine: QueryEngine
+    ) -> None:
         answers, missing = [], []
         (self.out / "goals.json").unlink(missing_ok=True)
-        where = reachable(plan, self.robot_radius, self.start)
+        where = occupancy.reachable(plan, self.robot_radius, self.start)
         scene = engine.scene
         solid = surface_weights(scene.gaussians) > 0
         for phrase in self.goal:
             result = run_phrase(engine, phrase, viewpoint=scene.cameras[0]).answer
-            points = occupancy.to_map.points(scene.gaussians.means[result.members & solid])
+            points = voxels.to_map.points(scene.gaussians.means[result.members & solid])
             goal = None
             if result.found and len(points):
-                goal = find_goal(plan, where, points[:, :2], self.robot_radius + self.resolution)
+                goal = occupancy.find_goal(plan, where, points[:, :2], self.robot_radius + self.resolution)
             if goal is None:
                 missing.append(f"'{phrase}': {'no free pose' if result.found else result.verdict}")
                 continue
@@ -288,7 +281,7 @@ class Map:
             raise InputError(f"no goal for {'; '.join(missing)}")
 
 
-def write_grid(folder: Path, plan: FloorMap) -> None:
+def write_grid(folder: Path, plan: occupancy.FloorMap) -> None:
     """Write `map.pgm`, whose first row has the largest y, and `map.yaml`."""
     grey = np.where(plan.occupied, OCCUPIED, np.where(plan.free, FREE, UNKNOWN)).astype(np.uint8)
     with atomic_path(folder / "map.pgm") as path:
@@ -300,22 +293,22 @@ def write_grid(folder: Path, plan: FloorMap) -> None:
     write_whole(folder / "map.yaml", "\n".join(lines) + "\n")
 
 
-def write_collider(path: Path, occupancy: Occupancy) -> None:
+def write_collider(path: Path, voxels: occupancy.Occupancy) -> None:
     """Write everything that is occupied as watertight triangles, a Wavefront OBJ in metres."""
-    corners, triangles = collider(occupancy)
+    corners, triangles = occupancy.collider(voxels)
     with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
         np.savetxt(file, corners, "v %.9g %.9g %.9g")
         np.savetxt(file, triangles + 1, "f %d %d %d")
 
 
 def write_voxels(
-    path: Path, occupancy: Occupancy, scene: Scene, engine: QueryEngine | None, progress: Progress
+    path: Path, voxels: occupancy.Occupancy, scene: Scene, engine: QueryEngine | None, progress: Progress
 ) -> None:
     """Write the occupied voxels, each with its whole of the tree and the word for it."""
-    cells = np.argwhere(occupancy.occupied)
+    cells = np.argwhere(voxels.occupied)
     nodes, words = np.full(len(cells), NO_NODE), {}
     if engine is not None:
-        nodes = _nodes(occupancy, scene, engine, cells)
+        nodes = _nodes(voxels, scene, engine, cells)
         try:
             outline = scene_outline(Describer(engine, None, progress))
         except EncoderError as error:  # goals may be in the phrasebook, but names need an encoder
@@ -326,19 +319,19 @@ def write_voxels(
     with atomic_path(path) as temporary:
         np.savez_compressed(
             temporary, cells=cells.astype(np.int32), nodes=nodes.astype(np.int32), words=names,
-            origin=occupancy.origin, resolution=occupancy.resolution,
-            to_map=moving(-scene.origin).then(occupancy.to_map).matrix,
-            hits=occupancy.hits[tuple(cells.T)], passes=occupancy.passes[tuple(cells.T)],
+            origin=voxels.origin, resolution=voxels.resolution,
+            to_map=moving(-scene.origin).then(voxels.to_map).matrix,
+            hits=voxels.hits[tuple(cells.T)], passes=voxels.passes[tuple(cells.T)],
         )  # fmt: skip
 
 
-def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array) -> Array:
+def _nodes(voxels: occupancy.Occupancy, scene: Scene, engine: QueryEngine, cells: Array) -> Array:
     """Return the (V,) whole of the Gaussian nearest to each voxel, NO_NODE far from any."""
     whole = engine.tree.at(LEVELS.index("whole"))
     rows = np.flatnonzero((surface_weights(scene.gaussians) > 0) & (whole != NO_NODE))
     if len(rows) == 0:
         return np.full(len(cells), NO_NODE)
-    means = occupancy.to_map.points(scene.gaussians.means[rows])
-    centres = occupancy.origin + (cells + 0.5) * occupancy.resolution
-    gaps, nearest = cKDTree(means).query(centres, distance_upper_bound=4 * occupancy.resolution, workers=-1)
+    means = voxels.to_map.points(scene.gaussians.means[rows])
+    centres = voxels.origin + (cells + 0.5) * voxels.resolution
+    gaps, nearest = cKDTree(means).query(centres, distance_upper_bound=4 * voxels.resolution, workers=-1)
     return np.append(whole[rows], NO_NODE)[np.where(np.isfinite(gaps), nearest, len(rows))]

@@ -21,7 +21,7 @@ from langsplat_core.scene.codec import MOST_CODEWORDS, CodebookCodec, Codec, pri
 from langsplat_core.scene.gaussians import coarse_step, join_gaussians
 from langsplat_core.scene.language import NO_NODE
 from langsplat_core.scene.surface import surface_areas, surface_weights
-from langsplat_core.scene.transform import place_scene, rotating, similarity
+from langsplat_core.scene.transform import Similarity, place_scene, rotating, similarity
 
 FEWEST = 100  # least opaque Gaussians of a scene with a surface
 SAMPLES = 40_000  # points of each surface
@@ -74,14 +74,9 @@ def cloud(points: Array, normals: Array | None = None) -> Any:
 class Registration:
     """The transform from a scene to another one of the same place."""
 
-    transform: Array  # (4, 4) float64 similarity, from the moving scene to the fixed one
+    transform: Similarity  # from the moving scene to the fixed one
     rmse: float  # of matched points, units of the fixed scene
     agreement: float  # share of equal depths of the pixels that both scenes fill, in views of both
-
-    @property
-    def scale(self) -> float:
-        """Length of one unit of the moving scene, in units of the fixed one."""
-        return float(np.cbrt(np.linalg.det(self.transform[:3, :3])))
 
     @property
     def trusted(self) -> bool:
@@ -109,8 +104,8 @@ def register(moving: Scene, fixed: Scene, scaled: bool = False, progress: Progre
     for start, size in enumerate(sizes):
         progress(STAGE, start / len(sizes))
         matrix, rmse = _aligned(size * mine, theirs, turns, radius, scaled, seed=start)
-        found = Registration(matrix @ np.diag([size, size, size, 1.0]), rmse, 0.0)
-        found = replace(found, agreement=agreement(moving, fixed, found.transform))
+        there = similarity(matrix @ np.diag([size, size, size, 1.0]))
+        found = Registration(there, rmse, agreement(moving, fixed, there))
         if best is None or found.agreement > best.agreement:
             best = found
         if best.trusted:
@@ -161,9 +156,8 @@ def _aligned(
     return np.asarray(best.transformation, np.float64), float(best.inlier_rmse)
 
 
-def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:
+def agreement(moving: Scene, fixed: Scene, there: Similarity) -> float:
     """Return the share of equal depths of pixels that both scenes fill, in views of both; 0: no overlap."""
-    there = similarity(transform)
     mine, theirs = (
         some_cameras(scene.cameras or (scene.framing_camera((SIDE, SIDE)),), VIEWS, SIDE)
         for scene in (moving, fixed)

@@ -155,7 +155,7 @@ class Changes:
             except EncoderError as error:
                 report_loss("without names: %s", error)
             if self.register:
-                placed = registered(scenes[1], scenes[0], scaled=unsure, progress=progress).transform
+                placed = registered(scenes[1], scenes[0], scaled=unsure, progress=progress).transform.matrix
             found = changes(first, second, placed, describers, progress)
         if self.json:
             listed = [{name: getattr(change, name) for name in STATED} for change in found]

@@ -133,7 +133,7 @@ class Library:
     folder: Path
     groups: tuple[EncoderGroup, ...]
     unread: tuple[Indexed, ...] = ()  # scenes that cannot be opened
-    thumbnails: Mapping[str, Array] | None = None  # by path: (H, W, 3) uint8
+    thumbnails: Mapping[str, Array] = field(default_factory=dict)  # by path: (H, W, 3) uint8
 
     @property
     def scenes(self) -> tuple[Indexed, ...]:
@@ -198,9 +198,9 @@ def read_entry(path: Path, name: str, load_encoder: LoadEncoder | None) -> Entry
     taught = tuple(word.key for word in field.taught)
     listed = replace(listed, taught=taught, phrases=len(field.phrasebook))
     made = Entry(listed, field.encoder_id, field.canonical, None, picture)
-    if field.codec.blends or engine.bars is None or not field.known.any():
-        return made
     bars = engine.bars
+    if field.codec.blends or bars is None or not field.known.any():
+        return made
     if not np.isfinite([(bar.median, bar.spread) for bar in bars]).all():
         return made
     columns, regions = _columns(engine), engine.regions.table.counts[0]
@@ -211,7 +211,7 @@ def read_entry(path: Path, name: str, load_encoder: LoadEncoder | None) -> Entry
         mixtures=len(columns.shares),
         regions=(subparts, parts, wholes),
         bars=bars,
-        calibration=engine.field.calibration,
+        calibration=field.calibration,
     )
     return replace(made, listed=listed, columns=columns)
 
@@ -295,7 +295,6 @@ def _kept(
 
 def _entries(library: Library) -> Iterator[Entry]:
     """Yield the entry of every scene of a library, as views of its arrays."""
-    pictures = library.thumbnails or {}
     for group in library.groups:
         starts = group.starts
         for row, scene in enumerate(group.scenes):
@@ -303,7 +302,7 @@ def _entries(library: Library) -> Iterator[Entry]:
             columns = Columns(*(
                 values[ends[0][of] : ends[1][of]] for values, of in zip(group.columns, ROWS, strict=True)
             ))  # fmt: skip
-            yield Entry(scene, group.encoder_id, group.canonical, columns, pictures[scene.path])
+            yield Entry(scene, group.encoder_id, group.canonical, columns, library.thumbnails[scene.path])
     yield from map(Entry, library.unread)
 
 
@@ -315,17 +314,21 @@ class _Stated:
     unread: tuple[Indexed, ...]
 
 
+def _one_encoder(first: Entry, second: Entry) -> bool:
+    if first.canonical is None or second.canonical is None or first.encoder_id != second.encoder_id:
+        return False
+    return same_vectors(first.canonical, second.canonical)
+
+
 def write_library(index: Path, entries: Sequence[Entry]) -> None:
     """Write an index, atomically."""
     groups: list[list[Entry]] = []
     for each in entries:
-        if each.canonical is not None:
-            alike = [
-                members for members in groups if members[0].encoder_id == each.encoder_id
-                and same_vectors(np.asarray(members[0].canonical), each.canonical)
-            ]  # fmt: skip
-            groups += [] if alike else [[]]
-            (alike or groups)[-1].append(each)
+        alike = [members for members in groups if _one_encoder(members[0], each)]
+        if alike:
+            alike[0].append(each)
+        elif each.canonical is not None:
+            groups.append([each])
     tensors = dict[str, Array]()
     for number, members in enumerate(groups):
         canonical = np.asarray(members[0].canonical, "<f4")

@@ -86,9 +86,9 @@ def ask_library(viewer: Viewer, phrase: str) -> None:
 
 
 def _show_hits(viewer: Viewer, view: LibraryView, hits: Sequence[Hit]) -> None:
-    listed, pictures = tuple(hits[:MOST_HITS]), view.library.thumbnails or {}
+    listed = tuple(hits[:MOST_HITS])
     names = [hit.path.relative_to(view.library.folder).as_posix() for hit in listed]
-    image = np.concatenate([pictures[name] for name in names]) if names else None
+    image = np.concatenate([view.library.thumbnails[name] for name in names]) if names else None
     viewer.state.extension_panels[TITLE] = replace(view, hits=listed, thumbnails=image)
 
 

@@ -237,18 +237,18 @@ def test_a_capture_is_laid_onto_another(scale, scaled, metres, unit):
     found = register(transform_scene(fixed, there), fixed, scaled)
     assert found.trusted
     assert found.agreement > 0.9
-    off = (found.transform @ there.matrix - np.eye(4)) / [1, 1, 1, unit]
+    off = (found.transform.matrix @ there.matrix - np.eye(4)) / [1, 1, 1, unit]
     assert np.linalg.norm(off) < 0.03
-    assert found.scale == pytest.approx(1 / scale, rel=0.01)
+    assert found.transform.scale == pytest.approx(1 / scale, rel=0.01)
 
 
 def test_agreement_tells_a_place_from_another():
     there = similarity((0.4, -0.3, 1.2), (2.0, 1.0, -3.0), 2.0)
     fixed = box_room(3)
     elsewhere, back = transform_scene(fixed, there), there.inverse()
-    assert agreement(elsewhere, fixed, back.matrix) > 0.95
-    assert agreement(elsewhere, fixed, similarity((0, 0, 0.3), (0.6, 0, 0.4)).then(back).matrix) < 0.7
-    assert agreement(elsewhere, fixed, np.eye(4)) < 0.7
+    assert agreement(elsewhere, fixed, back) > 0.95
+    assert agreement(elsewhere, fixed, similarity((0, 0, 0.3), (0.6, 0, 0.4)).then(back)) < 0.7
+    assert agreement(elsewhere, fixed, IDENTITY) < 0.7
 
 
 # Two scenes as one.
