@@ -80,10 +80,7 @@ def served_scenes(place: Path) -> dict[str, Path]:
     """Return searchable scenes by name; those of a folder by their path in it. InputError for none."""
     if not place.is_dir() or format_of(place) is not None:
         return {place.name: place}
-    found = {path.relative_to(place).as_posix(): path for path in scenes_in(place)}
-    if not found:
-        raise InputError(f"{place}: no scene with a language field in it; `langsplat train` makes one")
-    return found
+    return scenes_in(place)
 
 
 class SceneTools:

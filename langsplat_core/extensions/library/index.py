@@ -144,11 +144,14 @@ class Library:
 # Scenes of a folder, and their entries.
 
 
-def scenes_in(folder: Path) -> list[Path]:
-    """Return the scenes with a field below a folder, one per field, without hidden folders; InputError."""
+def scenes_in(folder: Path) -> dict[str, Path]:
+    """Return the scenes with a field below a folder by their paths in it, "/" between names.
+
+    There is one per field; hidden folders are left out. Raises InputError without a scene.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; name one with scenes in it")
-    found: list[Path] = []
+    found: dict[str, Path] = {}
     for root, folders, files in os.walk(folder):
         for name in filterfalse(is_utf8, (*folders, *files)):
             log.warning("not searched: %s: its name is not UTF-8; rename it", shown(Path(root, name)))
@@ -159,7 +162,9 @@ def scenes_in(folder: Path) -> list[Path]:
             field = companion_path(path, SUFFIX).name if format_of(path) is not None else ""
             if field in fields:
                 fields.remove(field)
-                found.append(path)
+                found[path.relative_to(folder).as_posix()] = path
+    if not found:
+        raise InputError(f"{folder}: no scene with a language field in it; `langsplat train` makes one")
     return found
 
 
@@ -251,9 +256,7 @@ def update_library(
     index is reported and made again. Raises InputError without scenes.
     """
     index = index_of(folder)
-    paths = {path.relative_to(folder).as_posix(): path for path in scenes_in(folder)}
-    if not paths:
-        raise InputError(f"{folder}: no scene with a language field in it; `langsplat train` makes them")
+    paths = scenes_in(folder)
     stamps = {name: stamp_of(path) for name, path in paths.items()}
     before = index if os.path.exists(index) else folder / INDEX
     kept, listed = _kept(before, folder, stamps)
