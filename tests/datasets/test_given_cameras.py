@@ -501,8 +501,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_decimal_commas_are_refused_by_name(tmp_path: Path) -> None:
-    file = write_colmap(tmp_path, "txt") / "cameras.txt"
-    file.write_text("1 PINHOLE 40 30 50,5 50 20 15\n")
+    (write_colmap(tmp_path, "txt") / "cameras.txt").write_text("1 PINHOLE 40 30 50,5 50 20 15\n")
     message = refuse(tmp_path, tmp_path / "work")
     assert "'50,5'" in message
     assert "decimal point" in message

@@ -255,8 +255,7 @@ def test_transparency_is_a_mask_or_an_empty_background(tmp_path, inside, alpha, 
         image = Image.open(path)
         image.putalpha(Image.fromarray(shades))
         image.save(path)
-    config = replace(CONFIG, alpha=alpha)
-    capture = load_photographs(tmp_path, config, tmp_path / "work")
+    capture = load_photographs(tmp_path, replace(CONFIG, alpha=alpha), tmp_path / "work")
     assert capture.cut_out == (not inside if alpha == "auto" else alpha == "background")
     counted = capture.mask(0)
     assert bool(counted[15, 20]) != inside

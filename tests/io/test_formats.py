@@ -179,8 +179,7 @@ def test_spz_along_other_axes_is_turned(put, axes, version):
 @pytest.mark.parametrize("up", ["-y", "z"])
 def test_spz_that_looks_upside_down_is_told(tmp_path, caplog, up):
     """A floor with a little above it, without a record, as Niantic's library has it and splat-transform."""
-    rng = np.random.default_rng(0)
-    means = rng.uniform(-2, 2, (1500, 3))
+    means = np.random.default_rng(0).uniform(-2, 2, (1500, 3))
     means[:1000, 1] = 2.0  # y down
     shape = np.tile(np.log([0.1, 0.002, 0.1]), (1500, 1))
     gaussians = Gaussians(means, shape, np.tile([1.0, 0, 0, 0], (1500, 1)), np.zeros(1500), means[:, None])
@@ -481,8 +480,7 @@ def one_mesh(attributes: dict[str, int], extension: dict, size: int, **buffer: s
 
 @pytest.mark.parametrize("name", PACKED)
 def test_an_spz_inside_is_read(tmp_path, name):
-    scene = random_gaussians(60, sh_degree=2)
-    write_spz(tmp_path / "a.spz", Scene(scene))
+    write_spz(tmp_path / "a.spz", Scene(random_gaussians(60, sh_degree=2)))
     data = (tmp_path / "a.spz").read_bytes()
     inside = {"extensions": {name: {"bufferView": 0}}}
     content = one_mesh({"POSITION": 0}, inside, len(data)) | {

@@ -307,8 +307,7 @@ def describer(scene: Scene) -> Describer:
 
 
 def test_labels_are_those_of_the_tree_and_its_words(tmp_path):
-    scene = labelled_scene()
-    beside = export_labels(describer(scene), tmp_path / "out.ply")
+    beside = export_labels(describer(labelled_scene()), tmp_path / "out.ply")
     assert beside == tmp_path / "out.labels.json"
     got, said = load_scene(tmp_path / "out.ply"), json.loads(beside.read_text())
     assert set(got.extras) == {"instance", "part", "class", "time"}

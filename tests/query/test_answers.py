@@ -95,8 +95,7 @@ def by_rule(relevancy, regions: Regions, means: Array, scale: Scale, sought: Nam
 @pytest.mark.parametrize("level", ["auto", *LEVELS])
 def test_answers_are_finite_and_repeatable_for_every_codec(kind, rule, level):
     gaussians, field = random_gaussians(300), random_field(300, kind)
-    engine = QueryEngine(Scene(gaussians, field), rule=rule)
-    result = engine.run("red mug", level)
+    result = QueryEngine(Scene(gaussians, field), rule=rule).run("red mug", level)
     again = QueryEngine(Scene(gaussians, field), rule=rule).run("red mug", level)
     for name in ("relevancy", "even", "members", "place", "box"):
         np.testing.assert_array_equal(getattr(result, name), getattr(again, name))
@@ -206,8 +205,7 @@ def test_chance_equals_fits_of_everyday_phrases(kind):
 
 
 def test_bars_are_quantiles_of_the_best_fits():
-    rng = np.random.default_rng(0)
-    fits, solid = rng.normal(size=(3, 9, 101)), np.arange(27) % 9 != 4
+    fits, solid = np.random.default_rng(0).normal(size=(3, 9, 101)), np.arange(27) % 9 != 4
     fits[:, 4] += 9  # crumbs, which do not count
     table = RegionTable(np.full((1, 3), 9), np.full(27, -1), solid)
     bars = bars_of(table, fits.reshape(27, 101))

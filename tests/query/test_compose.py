@@ -240,8 +240,7 @@ EYE = viewpoint(look_at(np.array([0.0, -8, 1]), np.zeros(3), UP, (160, 120)), FR
 
 def box(centre: tuple[float, float, float], half: tuple[float, float, float], hollow: bool = False) -> Body:
     """2000 points in a box, or of an open vessel: its floor and sides."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-1, 1, (2000, 3))
+    points = np.random.default_rng(0).uniform(-1, 1, (2000, 3))
     if hollow:
         points = points[(np.abs(points[:, :2]).max(1) > 0.9) | (points[:, 2] < -0.9)]
     return body(points * half + np.array(centre), FRAME)

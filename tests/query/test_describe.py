@@ -156,8 +156,7 @@ def test_words_that_claim_the_same_are_grouped():
     mug = np.array([0.5, 0.5, 0, 0])
     cup = np.array([0.45, 0.4, 0.1, 0])
     vague = np.array([0.05, 0.1, 0.9, 0.4])  # everywhere a little: a name for neither
-    names = np.stack([vague, mug, cup], 1)
-    assert synonym_groups(names, surface) == [[0], [1, 2]]
+    assert synonym_groups(np.stack([vague, mug, cup], 1), surface) == [[0], [1, 2]]
     assert synonym_groups(np.zeros((0, 0)), np.zeros(0)) == []
 
 

@@ -143,8 +143,7 @@ def test_encoder_is_loaded_once_when_needed(encoder_id, asked_for):
 def test_answers_reach_other_processes_and_say_where_in_the_world():
     scene = replace(blob_scene(), origin=np.array([5e5, 5.4e6, 0]))
     answer = QueryEngine(scene, FakeEncoder()).run("mug")  # what loads an encoder, or one
-    again = pickle.loads(pickle.dumps(answer))
-    np.testing.assert_array_equal(again.members, answer.members)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(answer)).members, answer.members)
     assert repr(answer).endswith(f"near {scene.in_world(answer.place)}>")
 
 

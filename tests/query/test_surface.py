@@ -306,8 +306,7 @@ def test_spheres_and_boxes_include_their_faces():
 
 @pytest.mark.parametrize("distance", [0.0, 0.15, 0.4, 100.0])
 def test_growing_follows_shortest_paths(distance):
-    gaussians = random_gaussians(300)
-    surface = build_surface(gaussians)
+    surface = build_surface(random_gaussians(300))
     selected = random_selection(300, share=0.03)
     lengths = walked(surface, selected[surface.rows])
     grown = selection.grow(surface, selected, distance)
@@ -339,8 +338,7 @@ def test_at_point_selects_the_nearest_region():
     regions = regions_of(scene, surface)
     for number, point in ((0, CENTRES[0]), (2, CENTRES[2] + [9.0, 0, 0])):
         assert selection.at_point(surface, regions, 2, point).tolist() == (blob == number).tolist()
-    nothing = scene.take(np.zeros(len(scene.gaussians), bool))
-    surface = build_surface(nothing.gaussians)
+    surface = build_surface(scene.take(np.zeros(len(scene.gaussians), bool)).gaussians)
     assert len(selection.at_point(surface, regions, 2, np.zeros(3))) == 0
 
 
@@ -599,8 +597,7 @@ def test_oriented_box_recovers_a_turned_box(sides, seed, measured):
     box = oriented_box(filled(sides, seed=seed) @ rotation.T + shift)
     check(box)
     np.testing.assert_allclose(box.centre, shift, atol=0.03 * max(sides))
-    found = 2 * box.half_extents
-    error = np.abs(found - INSIDE * np.array(sides)).max() / max(sides)
+    error = np.abs(2 * box.half_extents - INSIDE * np.array(sides)).max() / max(sides)
     measured(f"oriented box of {sides}", "error of a side, share of the longest", error)
     assert error < 0.08
 

@@ -219,8 +219,7 @@ def put_scene(viewer: Viewer, scene: Scene) -> None:
 
 def put_marks(viewer: Viewer, **masks: np.ndarray) -> None:
     """Mark nothing but the (N,) `selected`, `hidden` and `deleted` that are given."""
-    nothing = unmarked(viewer.state.count)
-    viewer.put(marks=MarkBits().of(replace(nothing, **masks)))
+    viewer.put(marks=MarkBits().of(replace(unmarked(viewer.state.count), **masks)))
 
 
 def names(rows: np.ndarray) -> str:

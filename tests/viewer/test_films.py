@@ -157,8 +157,7 @@ def test_keyframes_are_stretched_and_tangents_those_of_a_parabola():
 
 
 def test_a_turntable_goes_once_around_as_a_drag_does():
-    extent = extent_of(blob_scene())
-    view = from_camera(blob_scene().cameras[0], extent)
+    view = from_camera(blob_scene().cameras[0], extent_of(blob_scene()))
     turn = turntable(view, 8.0)
     for t in (0.0, 1.0, 5.5):
         expected = pose_of(orbit(view, 2 * math.pi * t / 8, 0))

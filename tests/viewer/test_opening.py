@@ -280,8 +280,7 @@ def test_reload_keeps_camera_queries_and_settings(shown):
 
 def test_reload_with_other_gaussians_asks_anew(shown):
     ask(shown, "plant")
-    half = np.arange(0, 360, 2)
-    save_scene(shown.state.path, replace(blob_scene().take(half), path=None))
+    save_scene(shown.state.path, replace(blob_scene().take(np.arange(0, 360, 2)), path=None))
     act(opening.reload, shown)
     assert result(shown).members.shape == (180,)
     assert shown.state.marks.selected.shape == (180,)

@@ -57,16 +57,14 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     settings.resize(viewer, 160, 120)
     go(viewpoint.look_from, viewer, "left")
     ask(viewer, "mug", "plant")
-    marks = Marks(blob("book") & odd, blob("mug") & odd, blob("plant") & odd)
-    mark(viewer, marks)
+    mark(viewer, Marks(blob("book") & odd, blob("mug") & odd, blob("plant") & odd))
     viewer.change(splats=Splats(0.8, 0))
     settings.set_clip(viewer, Clip(0.5, 6.5))
     heat = {"heat_opacity": 0.6, "dim": 0.5, "heat": "own", "threshold": 0.3, "heat_scale": (0.1, 0.8)}
     settings.set_picture(viewer, PictureConfig(**heat, alpha_gate=0.2, background=(0.1, 0.6, 0.3)))
     settings.set_picture(viewer, replace(viewer.state.session.picture, colour_map="viridis"))
     settings.set_display(viewer, "relevancy", 1)
-    split = Split(mode, second="segmentation", second_level=0, at=0.4)
-    viewer.change(split=split)
+    viewer.change(split=Split(mode, second="segmentation", second_level=0, at=0.4))
 
 
 @pytest.mark.parametrize("mode", ["wipe", "levels"])

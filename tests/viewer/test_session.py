@@ -376,8 +376,7 @@ def test_project_without_scene_or_window_is_refused(saved, opened, run_viewer):
 
 
 def test_project_of_a_changed_scene_restores_only_queries(saved, viewer, monkeypatch):
-    smaller = SCENES["blobs.ply"].take(np.arange(240))
-    monkeypatch.setitem(SCENES, "blobs.ply", smaller)
+    monkeypatch.setitem(SCENES, "blobs.ply", SCENES["blobs.ply"].take(np.arange(240)))
     act(opening.open_project, viewer, saved)
     assert len(viewer.state.session.queries) == 4
     assert not viewer.state.marks.selected.any()

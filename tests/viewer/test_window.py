@@ -300,8 +300,7 @@ def drive(scenario: str, cast: Cast, scenes: Path) -> None:
     assert said.rstrip().endswith("PASSED"), said[-4000:]
 
 
-ROOT = Path(__file__).parents[2]
-DEMO = ROOT / "assets" / "demo" / "scene.ply"
+DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"
 
 
 def run(display: str, folder: Path, *arguments: str) -> str:

@@ -185,17 +185,17 @@ class Session:
         self.window.drop([str(self.folder / name) for name in names])
         self.settle()
 
-    def enter(self, text: str, frames: int = 0) -> None:
+    def enter(self, text: str) -> None:
         """Type characters and Enter, then `rest`."""
         self.ctx.key_chars_append_enter(text)
-        self.rest(frames)
+        self.rest()
 
-    def click_at(self, place: tuple[float, float], frames: int = 0) -> None:
+    def click_at(self, place: Place) -> None:
         """Click a place, in window units, then `rest`."""
         self.ctx.mouse_teleport_to_pos(place)
         self.ctx.yield_(2)
         self.ctx.mouse_click(0)
-        self.rest(frames)
+        self.rest()
 
     def open_panel(self, title: str, frames: int = 0) -> None:
         """Open a panel, then `rest`."""

@@ -502,8 +502,7 @@ def test_window_is_the_whole_reference_and_tells_errors_from_flips():
 def test_a_tiny_run_writes_two_sane_files(tmp_path):
     sizes = ["--counts", "60", "120", "--size", "40", "30", "--channels", "3"]
     parse(["bench", "raster", *sizes, "--out", str(tmp_path)]).run()
-    record = json.loads((tmp_path / "raster.json").read_text())
-    rows = record["measurements"]
+    rows = json.loads((tmp_path / "raster.json").read_text())["measurements"]
     assert {(r["gaussians"], r["width"]) for r in rows} == {(60, 40), (120, 40)}
     cpu = {r["operation"] for r in rows if r["backend"] == "cpu"}
     assert {"project", "frame", "splat", "gather", "backward"} <= cpu
@@ -512,5 +511,4 @@ def test_a_tiny_run_writes_two_sane_files(tmp_path):
     # float32 blending of values in [0, 1].
     assert all(r["error"]["off_cuts"] < 2e-5 for r in exact if r["error"] is not None)
     assert all(r["error"] is not None for r in exact if r["operation"] == "backward")
-    text = (tmp_path / "raster.md").read_text()
-    assert "# Rasterizers" in text
+    assert "# Rasterizers" in (tmp_path / "raster.md").read_text()

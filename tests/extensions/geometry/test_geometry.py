@@ -287,8 +287,7 @@ def test_merge_keeps_what_both_scenes_have():
 def test_a_scene_without_a_field_gets_no_meaning():
     named, plain = blob_scene(), replace(blob_scene(field=False), cameras=())
     plain = transform_scene(plain, moving(np.array([30.0, 0, 0])))
-    both = merge(named, plain)
-    found = QueryEngine(both, lambda _: FakeEncoder()).run("mug")
+    found = QueryEngine(merge(named, plain), lambda _: FakeEncoder()).run("mug")
     assert found.members.any()
     assert not found.members[len(named.gaussians) :].any()
     assert merge(plain, plain).language is None
@@ -415,8 +414,7 @@ def reference_trace(eye: Array, ends: Array, shape: tuple[int, int, int]) -> tup
 
 @pytest.mark.parametrize("eye", [(3.3, 4.2, 5.1), (-4.6, 2.2, 3.7)], ids=["inside", "outside"])
 def test_rays_pass_the_voxels_that_small_steps_pass(eye):
-    rng = np.random.default_rng(1)
-    ends, shape = rng.uniform(-1, 9, (40, 3)), (8, 8, 8)
+    ends, shape = np.random.default_rng(1).uniform(-1, 9, (40, 3)), (8, 8, 8)
     hits, passes = (np.zeros(shape, np.uint16) for _ in range(2))
     trace(np.array(eye), ends, hits, passes)
     want_hits, want_passes = reference_trace(np.array(eye), ends, shape)

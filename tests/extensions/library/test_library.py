@@ -12,7 +12,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from langsplat_core.arrays import Array, affine
+from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.extensions.library import commands as library_commands
 from langsplat_core.extensions.library.changes import Change, changes, colour_term, to_lab
@@ -33,7 +33,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import named
 from langsplat_core.query.rule import judge, scaling_of, triple
 from langsplat_core.scene import Calibration, Gaussians, PlattScaling, Scene
-from langsplat_core.scene.transform import place_scene, rotating, transform_scene
+from langsplat_core.scene.transform import moving, place_scene, rotating, scaling, transform_scene
 from langsplat_core.semantics.encoders import keep_calibration, load_text_encoder
 from langsplat_core.semantics.relevancy import bundled_vocabulary
 from tests.support.fakes import CENTRES, NAMES, PER_BLOB, FakeEncoder, axis, named_scene
@@ -305,12 +305,8 @@ def test_a_move_is_one_change_and_has_its_length(scene):
 
 def test_another_frame_and_scale_change_nothing(scene):
     """The second scene is the first one turned by 90 degrees, moved, and twice as large."""
-    turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-    g = scene.gaussians
-    means, quats = 2 * g.means @ turn.T + (3.0, -1, 2), np.tile(np.sqrt([0.5, 0, 0.5, 0]), (len(g), 1))
-    turned = with_gaussians(scene, means=means, log_scales=g.log_scales + np.log(2), quats_wxyz=quats)
-    into = affine(turn.T / 2, -turn.T @ (3.0, -1, 2) / 2)
-    second = replace(turned, cameras=())  # those of the first are enough
+    there = rotating(np.array([0.0, 1, 0]), 90.0).then(scaling(2.0)).then(moving(np.array([3.0, -1, 2])))
+    second, into = replace(transform_scene(scene, there), cameras=()), there.inverse().matrix
     assert compared(scene, second, into) == ()
     (change,) = compared(scene, without(second, MUG), into)
     np.testing.assert_allclose(change.centre, CENTRES[0], atol=0.1)

@@ -187,8 +187,7 @@ def test_tree_finds_instances_despite_wrong_masks(wrong):
 
 
 def test_cuts_at_rising_costs_are_nested():
-    patches = random_patches(1)
-    children, costs = merge(patches)
+    children, costs = merge(random_patches(1))
     tree = MergeTree(np.arange(24, dtype=np.int32), children, costs)
     assert tree.cut(-1.0).tolist() == list(range(24))
     assert len(np.unique(tree.cut(np.inf))) == 24 - len(children)
@@ -198,8 +197,7 @@ def test_cuts_at_rising_costs_are_nested():
 
 
 def test_valued_cut_has_the_largest_sum_of_all_partitions():
-    patches = random_patches(2, count=10)
-    children, costs = merge(patches)
+    children, costs = merge(random_patches(2, count=10))
     tree = MergeTree(np.arange(10, dtype=np.int32), children, costs)
     low, high = np.quantile(tree.highest[10:], [0.3, 0.9])
     members = tree.totals(np.eye(10, dtype=bool))

@@ -82,8 +82,7 @@ def test_compiled_loss_equals_the_formula(shape: tuple[int, int, int], weight: f
 
 
 def test_exposure_is_a_ridge_regression() -> None:
-    rng = np.random.default_rng(4)
-    image = torch.tensor(rng.random((30, 40, 3)), dtype=torch.float32)
+    image = torch.tensor(np.random.default_rng(4).random((30, 40, 3)), dtype=torch.float32)
     change = torch.tensor([[1.2, 0.0, 0.1], [0.0, 0.8, 0.0], [0.0, 0.1, 1.0], [0.05, -0.02, 0.0]])
     target = with_exposure(image, change)
     found = fit_exposure([(image[:10], target[:10]), (image[10:], target[10:])], ridge=0.0)
@@ -162,8 +161,7 @@ def test_transients_are_connected_patches() -> None:
 
 def test_patches_that_other_views_contradict_are_transient() -> None:
     """A patch moves while its view alone differs there, beyond an exposure; once all differ it counts."""
-    rng = np.random.default_rng(2)
-    colours = rng.uniform(0.2, 0.8, (GRID, GRID, 3)).astype(np.float32)
+    colours = np.random.default_rng(2).uniform(0.2, 0.8, (GRID, GRID, 3)).astype(np.float32)
     apart, masked = 0.8 * colours + np.float32(0.05), colours.copy()
     apart[12:18, 12:18, 0] += 0.3
     masked[20] = np.nan
@@ -227,8 +225,7 @@ def picture(camera: Camera) -> Array:
 
 @cache
 def capture() -> Capture:
-    rng = np.random.default_rng(0)
-    across = rng.uniform(-1, 1, (200, 2))
+    across = np.random.default_rng(0).uniform(-1, 1, (200, 2))
     points = np.stack([across[:, 0], across[:, 1], TILT * across[:, 0]], -1)
     images = [picture(camera) for camera in row_of_cameras()]
     return Capture(tuple(row_of_cameras()), tuple(images), points, np.zeros((200, 3), np.uint8))
@@ -286,8 +283,7 @@ def test_depths_lie_on_the_true_surface() -> None:
 
 def test_space_before_a_surface_is_free() -> None:
     maps = find_depths(capture(), range(4))
-    rng = np.random.default_rng(1)
-    across = rng.uniform(-0.5, 0.5, (100, 2))
+    across = np.random.default_rng(1).uniform(-0.5, 0.5, (100, 2))
     surface = np.stack([across[:, 0], across[:, 1], TILT * across[:, 0]], -1)
     assert in_free_space(surface - (0, 0, 1.0), maps).mean() > 0.9
     assert in_free_space(surface, maps).mean() < 0.02
@@ -299,8 +295,7 @@ def test_space_before_a_surface_is_free() -> None:
 def test_masked_pixels_have_no_depth() -> None:
     mask = np.ones(SIDES[::-1], bool)
     mask[:, :30] = False
-    masked = replace(capture(), masks=(mask, None, None, None, None))
-    first = find_depths(masked, range(4))[0]
+    first = find_depths(replace(capture(), masks=(mask, None, None, None, None)), range(4))[0]
     assert not np.isfinite(first.depth[:, :30]).any()
     assert np.isfinite(first.depth[:, 30:]).any()
 
