@@ -188,14 +188,14 @@ class Session:
     def enter(self, text: str) -> None:
         """Type characters and Enter, then `rest`."""
         self.ctx.key_chars_append_enter(text)
-        self.rest()
+        self.rest(0)
 
     def click_at(self, place: Place) -> None:
         """Click a place, in window units, then `rest`."""
         self.ctx.mouse_teleport_to_pos(place)
         self.ctx.yield_(2)
         self.ctx.mouse_click(0)
-        self.rest()
+        self.rest(0)
 
     def open_panel(self, title: str, frames: int = 0) -> None:
         """Open a panel, then `rest`."""
