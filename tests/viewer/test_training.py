@@ -50,7 +50,9 @@ def begin(viewer, folder, monkeypatch) -> Callable[..., None]:
     """Begins a training that does what a script says, for a file beside the photographs."""
 
     def start(script: str, out: str = "photos.ply") -> None:
-        monkeypatch.setattr(training_process, "command", lambda request: [sys.executable, "-c", script])
+        monkeypatch.setattr(
+            training_process, "training_words", lambda request: [sys.executable, "-c", script]
+        )
         opening.choose_photographs(viewer, folder)
         viewer.state.training_form = replace(viewer.state.training_form, out=str(folder.with_name(out)))
         opening.start_training(viewer)
