@@ -234,7 +234,6 @@ class _LineStreams:
         os.dup2(2, 1)
 
     async def __aiter__(self) -> AsyncIterator[str]:
-        """Yield the lines that are messages."""
         from mcp_types import jsonrpc_message_adapter
 
         while line := await asyncio.to_thread(self._in.readline, LONGEST_LINE):
@@ -253,7 +252,6 @@ class _LineStreams:
                 await self.flush()
 
     async def write(self, text: str) -> None:
-        """Write lines to the agent."""
         self._out.write(text)
 
     async def flush(self) -> None:

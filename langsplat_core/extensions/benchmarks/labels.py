@@ -273,7 +273,6 @@ def _read_ovs3d_scene(folder: Path) -> LabelledScene:
 
 
 def _classes(path: Path) -> tuple[str, ...]:
-    """Return the classes in a file, one per line, each once."""
     lines = normalize("NFC", read_text(path)).split("\n")
     classes = tuple(dict.fromkeys(line.strip() for line in lines if line.strip()))
     if not classes:

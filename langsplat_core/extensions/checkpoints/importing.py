@@ -152,11 +152,6 @@ class Carrier:
         gaussians = replace(self.gaussians, means=self.gaussians.means + (self.scene.origin - origin))
         return replace(self, scene=replace(self.scene, gaussians=gaussians, origin=origin))
 
-    @property
-    def has_features(self) -> bool:
-        """True if the file has more than Gaussians."""
-        return self.method != PLAIN
-
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
@@ -454,10 +449,10 @@ def read_foreign(paths: Sequence[Path], levels: Sequence[str] = ()) -> ForeignSc
     """
     parts = [read_part(path) for path in paths]
     carriers = [part for part in parts if isinstance(part, Carrier)]
-    plain = _only([carrier for carrier in carriers if not carrier.has_features], "scenes without features")
+    plain = _only([carrier for carrier in carriers if carrier.method == PLAIN], "scenes without features")
     clusters = _only([part for part in parts if isinstance(part, Clusters)], "files of clusters")
     autoencoder = _only([part for part in parts if isinstance(part, Autoencoder)], "autoencoders")
-    featured = [_named(carrier, autoencoder) for carrier in carriers if carrier.has_features]
+    featured = [_named(carrier, autoencoder) for carrier in carriers if carrier.method != PLAIN]
     methods = {carrier.method for carrier in featured}
     if len(methods) > 1:
         listed = ", ".join(f"{carrier.path} is of {carrier.method}" for carrier in featured)

@@ -48,7 +48,7 @@ from langsplat_core.semantics.weights import (
 )
 
 Tensors = Mapping[str, Any]  # name -> torch.Tensor
-Settings = dict[str, Any]
+Settings = dict[str, Any]  # as in a config.json of transformers
 Names = tuple[tuple[str, str], ...]  # patterns of another layout's names, and their replacements
 
 MOBILE_SAM = (
@@ -215,9 +215,8 @@ def _clip(file: Path, tensors: Tensors) -> Converted:
             model["text_cfg"] = {k: value for k, value in model["text_cfg"].items() if k not in WORLDWIDE}
         _check(model, config)
         quick = bool(model.get("quick_gelu", False))
-        config["vision_config"]["num_attention_heads"] = config["vision_config"]["hidden_size"] // int(
-            model["vision_cfg"].get("head_width", HEAD_WIDTH)
-        )
+        head_width = int(model["vision_cfg"].get("head_width", HEAD_WIDTH))
+        config["vision_config"]["num_attention_heads"] = config["vision_config"]["hidden_size"] // head_width
         config["text_config"]["num_attention_heads"] = int(model["text_cfg"].get("heads", 8))
     else:
         named = file.name.lower().replace("_", "").replace("-", "")
@@ -244,7 +243,6 @@ def _stated(path: Path) -> Settings:
 
 
 def _clip_config(tensors: Tensors) -> Settings:
-    """Return settings from the shapes, as in a config.json of transformers."""
     words, wide = _shape(tensors, "token_embedding.weight", 2)
     channels, _, patch, _ = _shape(tensors, "visual.conv1.weight", 4)
     positions, _ = _shape(tensors, "visual.positional_embedding", 2)
@@ -312,7 +310,6 @@ def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
 
 
 def _sam_config(tensors: Tensors) -> Settings:
-    """Return settings from the shapes, as in a config.json of transformers."""
     _, grid, _, wide = _shape(tensors, "image_encoder.pos_embed", 4)
     patch = _shape(tensors, "image_encoder.patch_embed.proj.weight", 4)[2]
     layers = _count(tensors, r"image_encoder\.blocks\.(\d+)\.")
@@ -374,7 +371,6 @@ def _sam2_tensors(tensors: Tensors) -> dict[str, Any]:
 
 
 def _sam2_config(tensors: Tensors, sizes: Mapping[tuple[int, int], Hiera], side: int) -> Settings:
-    """Return settings from shapes and published sizes, as in a config.json of transformers."""
     _, wide, *background = _shape(tensors, "image_encoder.trunk.pos_embed", 4)
     blocks = _count(tensors, r"image_encoder\.trunk\.blocks\.(\d+)\.")
     if (wide, blocks) not in sizes:

@@ -222,7 +222,6 @@ def read_entry(path: Path, name: str, load_encoder: LoadEncoder | None) -> Entry
 
 
 def _columns(engine: QueryEngine) -> Columns:
-    """Return the arrays of a scene."""
     field, regions, scale = engine.field, engine.regions, engine.scale
     latents, of = field.codec.unique(field.latents[field.known])
     number = np.full(field.known.shape, -1, np.int64)
