@@ -25,7 +25,7 @@ from langsplat_core.errors import EXTRAS
 from langsplat_core.io.scenes import formats
 from langsplat_core.raster.opengl.rasterizer import create_egl_context
 from langsplat_viewer.state import TrainingForm
-from langsplat_viewer.viewer import command
+from langsplat_viewer.viewer import training_words
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGING = ROOT / "packaging"
@@ -74,10 +74,10 @@ def test_desktop_entry_and_mime_types_cover_every_format():
 
 def test_frozen_viewer_trains_by_the_program_beside_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     request = TrainingForm(str(tmp_path / "photographs"), out=str(tmp_path / "scene.ply"))
-    plain = command(request)
+    plain = training_words(request)
     monkeypatch.setattr("sys.frozen", True, raising=False)
     monkeypatch.setattr("sys.executable", str(tmp_path / "langsplat-viewer"))
-    frozen = command(request)
+    frozen = training_words(request)
     assert frozen == [str(tmp_path / "langsplat"), *plain[3:]]
 
 
