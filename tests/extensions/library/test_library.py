@@ -385,17 +385,21 @@ def test_changes_are_said_in_words_and_in_json(scans, capsys):
     scene = named_scene()
     sh = scene.gaussians.sh.copy()
     sh[:PER_BLOB] = sh[2 * PER_BLOB :]
-    save_scene(scans / "painted.ply", replace(scene, gaussians=replace(scene.gaussians, sh=sh)))
-    assert run("changes", pair[0], "painted.ply") == 0
+    there = np.array([5e5, 4e6, 120.0])
+    painted = place_scene(replace(scene, gaussians=replace(scene.gaussians, sh=sh)), moving(there))
+    save_scene(scans / "painted.ply", painted)
+    save_scene(scans / "far.ply", place_scene(scene, moving(there)))
+    assert run("changes", "far.ply", "painted.ply") == 0
     assert "red to blue" in capsys.readouterr().out
     lost = replace(scene.language, canonical=np.tile(axis(4), (4, 1)), encoder_id="lost")
     save_scene(scans / "lost.ply", replace(scene, language=lost))
     assert run("-q", "changes", "lost.ply", "lost.ply") == 0
     assert capsys.readouterr() == ("nothing changed\n", "")
     (scans / "placed.json").write_text(json.dumps({"matrix": np.eye(4).tolist()}))
-    assert run("changes", pair[0], "painted.ply", "--transform", "placed.json", "--json") == 0
+    assert run("changes", "painted.ply", "far.ply", "--transform", "placed.json", "--json") == 0
     (change,) = json.loads(capsys.readouterr().out)["changes"]
-    assert (change["kind"], change["colours"]) == ("recoloured", ["red", "blue"])
+    assert (change["kind"], change["colours"]) == ("recoloured", ["blue", "red"])
+    np.testing.assert_allclose(change["centre"], there + CENTRES[0], atol=0.1)
     both = "--transform", "placed.json", "--register"
     assert "leave one of them out" in refusal(capsys, "changes", pair[0], "painted.ply", *both)
 
