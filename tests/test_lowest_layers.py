@@ -401,14 +401,16 @@ def test_failing_part_is_one_line_that_names_its_extension(tmp_path, monkeypatch
     def nothing(*words: object) -> None: ...
 
     monkeypatch.chdir(tmp_path)
-    parts = SceneFormat(".odd", nothing, fails), Importer((".many",), nothing), Exporter(nothing)
-    monkeypatch.setitem(sys.modules, "odd", SimpleNamespace(**dict(zip("fie", parts, strict=True))))
-    named = {"formats": {".odd": "odd:f"}, "importers": {"many": "odd:i"}, "exporters": {"files": "odd:e"}}
+    empty = Importer((".few",), lambda *words: (None, ()))
+    parts = SceneFormat(".odd", nothing, fails), Importer((".many",), nothing), empty, Exporter(nothing)
+    monkeypatch.setitem(sys.modules, "odd", SimpleNamespace(**dict(zip("fije", parts, strict=True))))
+    importers = {"many": "odd:i", "few": "odd:j"}
+    named = {"formats": {".odd": "odd:f"}, "importers": importers, "exporters": {"files": "odd:e"}}
     monkeypatch.setattr(registry, "extensions", lambda: {"oddity": registry.Extension(**named)})
     save_scene("a.ply", Scene(random_gaussians(3)))
-    for name in ("a.odd", "a.many"):
+    for name in ("a.odd", "a.many", "a.few"):
         Path(name).touch()
-    for words in ("a.odd b.ply", "a.many b.ply", "a.ply b.odd", "a.ply b --to files"):
+    for words in ("a.odd b.ply", "a.many b.ply", "a.few b.ply", "a.ply b.odd", "a.ply b --to files"):
         assert "its extension's odd:" in refusal(capsys, "convert", *words.split())
 
 

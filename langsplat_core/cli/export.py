@@ -137,6 +137,8 @@ class Convert:
             request = scenes.ImportRequest(self.sources, self.encoder, self.levels, self.phrases, self.codec)
             with TerminalProgress() as progress, scenes.failures("importers", name):
                 scene, lines = reader.read(request, progress)
+                if not isinstance(scene, Scene):
+                    raise TypeError(f"it returns a {type(scene).__name__}, no Scene")
             print(*lines, sep="\n")
             return scene
         if self.levels or self.phrases or self.codec != CodecConfig():

@@ -371,8 +371,8 @@ def _ask(viewer: Viewer, to: str) -> None:
     state = viewer.state
     if state.is_unsaved:
         count = int(state.marks.deleted.sum())
-        edits = [f"{count:,} deleted"] * (count > 0) + ["some transformed"] * bool(state.session.moves)
-        said = " and ".join(edits) or "as once opened"
+        edits = {f"{count:,} deleted": count > 0, "some transformed": bool(state.session.moves)}
+        said = " and ".join(edit for edit, is_made in edits.items() if is_made) or "as once opened"
         imgui.text_wrapped(f"Gaussians: {said}. The scene is not saved so.")
     for other in viewer.unsaved():
         imgui.text_wrapped(f"Notes, names, bookmarks or keyframes of {other.path.name} are in no project.")
