@@ -29,10 +29,7 @@ def share_one_heap() -> None:
 
 
 def give_memory_back() -> None:
-    """Return to the system what the C library keeps of memory that was freed, where it can.
-
-    Reading a scene leaves tens of megabytes of it.
-    """
+    """Return freed memory that the C library keeps to the system: tens of megabytes after reading a scene."""
     _in_c_library("malloc_trim", 0)
 
 
@@ -154,11 +151,13 @@ class Worker:
             else:
                 job.failed(one_line(error))
 
-    def cancel(self) -> None:
-        """Drop everything queued and stop the running job where it next reports progress."""
+    def cancel(self, waiting: bool = True) -> None:
+        """Stop the present job where it next reports progress; with `waiting`, drop all behind it, too."""
+        present = next((job for job in self._jobs if not (job.stopped.is_set() or job.future.done())), None)
         for job in self._jobs:
-            job.stopped.set()
-            job.future.cancel()
+            if waiting or job is present:
+                job.stopped.set()
+                job.future.cancel()
 
     @property
     def current(self) -> tuple[str, float] | None:

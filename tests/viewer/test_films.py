@@ -2,6 +2,7 @@
 
 import json
 import math
+import threading
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -383,10 +384,13 @@ def test_a_film_can_be_stopped(opened, tmp_path, frames):
     record_three(opened)
     settings.put(opened.state.record, size=(320, 240))
     saving.save_film(opened, tmp_path)
-    opened.recorder.cancel()
+    gate = threading.Event()
+    opened.recorder.submit("next", lambda progress: gate.set(), lambda done: None, opened.say_error)
+    opened.recorder.cancel(waiting=False)
     recorded(opened)
     opened.recorder.close(10.0)
     assert len(list(tmp_path.glob("blobs-film-001/*.png"))) < 121
+    assert gate.is_set()  # what waited behind it was done
     assert not list(tmp_path.glob("**/.*"))
 
 

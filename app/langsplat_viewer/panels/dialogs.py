@@ -146,7 +146,7 @@ class Toasts:
                         self._toast(viewer, message)
             wide = min(BAR_EM, widest / hello_imgui.em_size(1) - 5)  # beside Cancel
             if writes is not None and ui.stoppable(*writes, wide, "##recorder"):
-                viewer.recorder.cancel()
+                viewer.recorder.cancel(waiting=False)
                 viewer.state.say("stopped: no file was written, a folder keeps the images so far")
             if imgui.is_window_hovered():
                 self._shown = [(message, now) for message, _ in self._shown]
