@@ -218,7 +218,7 @@ class OpenScene:
 
 @dataclass(frozen=True, eq=False)
 class Saved:
-    """What files hold of a session."""
+    """The session as its files hold it."""
 
     session: Session = field(default_factory=Session)  # as a project or an exported scene last had it
     project: Path | None = None  # the file that it is saved to again
@@ -231,7 +231,7 @@ class Saved:
 
 @dataclass(eq=False)
 class Visit:
-    """What is kept of a scene that was left: no large arrays."""
+    """A scene that was left, without large arrays."""
 
     path: Path
     view: OrbitCamera

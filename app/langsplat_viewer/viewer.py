@@ -255,8 +255,8 @@ class Viewer:
         """Return the scenes, the one shown first, with notes that no project holds."""
         seen = self.state.open
         shown = {} if seen is None else {seen.path.absolute(): self.state.visit(seen)}
-        scenes = {**shown, **self.visits, **shown}  # first and current
-        return [visit for visit in scenes.values() if visit.saved.lacks_notes(visit.session)]
+        left = [visit for path, visit in self.visits.items() if path not in shown]
+        return [visit for visit in (*shown.values(), *left) if visit.saved.lacks_notes(visit.session)]
 
     def searchable(self) -> QueryEngine | None:
         """Return the engine of a scene that can be searched; where there is none say why."""

@@ -107,7 +107,8 @@ def find_evidence(
         seen = features[view]
         if seen.labels.shape[1:] != (camera.height, camera.width) or seen.vectors.shape[1] != size:
             what = f"{camera.width}x{camera.height} pixels and vectors of {size} numbers"
-            raise FormatError(f"the masks of {camera.name!r} are of another scene, not of {what}; see --work")
+            remedy = "name this scene's own folder with --work"
+            raise FormatError(f"the masks of {camera.name!r} are of another scene, not of {what}; {remedy}")
         shown = _shown(scene, view, found[1])
         if shown.sum() >= SHOWN:
             mask, overlap = _nearest(seen, shown)

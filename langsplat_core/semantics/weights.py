@@ -229,7 +229,7 @@ def load_model(kind: Any, weights: Weights, config: Any) -> Any:
         layer = re.compile(r"(?:layers|blocks)\.\d+\.")
         wrong = sorted(name for name in more if weights.converted or layer.search(name))
     if wrong:
-        raise EncoderError(f"{weights.id}: {len(wrong)} weights do not fit {kind.__name__}, as {wrong[0]}")
+        raise EncoderError(f"{weights.id}: {len(wrong)} weights do not fit {kind.__name__}; one: {wrong[0]}")
     return model.eval().to(weights.device)
 
 

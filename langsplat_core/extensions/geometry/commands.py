@@ -82,7 +82,7 @@ class WriteMesh:
                 share = 100 * area / max(float(mesh.areas().sum()), 1e-300)
                 made = f" closed; made up: {area * unit.length**2:.3g} {unit.name}^2 ({share:.0f} %)"
                 if hollows := mesh.hollows():
-                    made += f"; pieces hollow as rooms, which what is solid surrounds: {hollows}"
+                    made += f"; hollow pieces, surrounded by what is solid, as rooms by walls: {hollows}"
             write_mesh(self.out, mesh, scene, self.phrase or self.scene.stem)
         print(
             f"{self.out}: {len(mesh.triangles)} triangles, {len(mesh.vertices)} vertices, voxels of "
