@@ -15,7 +15,7 @@ from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import Side, adopt_up, level
-from langsplat_viewer.marks import TOOLS
+from langsplat_viewer.marks import TOOLS, Tool
 from langsplat_viewer.session import Overlay
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
@@ -61,16 +61,13 @@ class Command:
     act: Callable[[Viewer], object]
     keys: tuple[str, ...] = ()
     button: str = ""  # its label in a panel
+    icon: str = ""  # on the toolbar: a name of Font Awesome 6 without its "ICON_FA_"
+    finds: str = ""  # other words that people look for
     repeats: bool = False  # while held
     is_edit: bool = False  # belongs to the box while one types, as it does everywhere
     is_on: Callable[[Viewer], bool] = lambda viewer: False  # for a check mark in the menu
     apart: bool = False  # a line is above it in the menu
     now: Callable[[Viewer], str] = lambda viewer: ""  # words for the menu in place of `does`
-
-    @property
-    def icon(self) -> str:
-        """Name of the icon on the toolbar, of Font Awesome 6 without its "ICON_FA_"; "" for none."""
-        return ICONS.get(self.does, "")
 
 
 def is_shown(state: ViewerState, button: Button) -> bool:
@@ -90,27 +87,30 @@ def _display(button: Button, number: int) -> Command:
         f"show {button.name.lower()}",
         lambda v: settings.set_display(v, button.display, button.latent_level),
         (str(number),) if number < 10 else (),
+        icon=DISPLAY_ICONS.get(button.display, "") if button.latent_level in (None, WHOLE) else "",
         is_on=lambda v: is_shown(v.state, button),
     )
 
 
-def _overlay(name: Overlay, title: str, *keys: str) -> Command:
+def _overlay(name: Overlay, title: str, *keys: str, finds: str = "") -> Command:
     return Command(
         f"show or hide the {title}",
         lambda v: settings.toggle_overlay(v, name),
         keys,
+        finds=finds,
         is_on=lambda v: name in v.state.session.overlays,
     )
 
 
-def _step(step: editing.Step, act: editing.Action, *keys: str) -> Command:
+def _step(step: editing.Step, act: editing.Action, *keys: str, finds: str = "") -> Command:
     now = partial(editing.named_step, step=step)
-    return Command(step, act, keys, repeats=True, is_edit=True, apart=step == "undo", now=now)
+    return Command(step, act, keys, "", "", finds, True, is_edit=True, apart=step == "undo", now=now)
 
 
 def _export_as(title: str) -> Command:
-    act, button = partial(saving.ask_export, title=title), f"Export {title} ..."
-    return Command(f"export: {title} ...", act, (), button, now=lambda viewer: f"{title} ...")
+    act, finds = partial(saving.ask_export, title=title), saving.EXPORTS[title].finds
+    now = f"{title} ..."
+    return Command(f"export: {now}", act, (), f"Export {now}", finds=finds, now=lambda viewer: now)
 
 
 def _side(side: Side, key: str) -> Command:
@@ -118,162 +118,140 @@ def _side(side: Side, key: str) -> Command:
     return Command(f"look from {where}", lambda v: viewpoint.look_from(v, side), (key,))
 
 
-ICONS = {  # by what a command does
-    "show colours": "IMAGE", "show relevancy": "FIRE", "show segmentation": "HIGHLIGHTER",
-    "show latent, whole": "PALETTE", "show tree, whole": "SITEMAP", "show depth": "MOUNTAIN",
-    "select with no tool: the left button turns the view": "HAND", "select: thing": "HAND_POINTER",
-    "select: rectangle": "VECTOR_SQUARE", "select: lasso": "DRAW_POLYGON", "select: brush": "BRUSH",
-    "select: sphere": "CIRCLE", "select: box": "CUBE", "save a picture": "CAMERA",
-    "gizmo: move, rotate, scale, box, off": "UP_DOWN_LEFT_RIGHT", "measure a distance": "RULER",
-    "say what is under the cursor": "COMMENT_DOTS", "compare two displays": "TABLE_COLUMNS",
-    "three levels side by side": "LAYER_GROUP", "pin a note to what is clicked": "NOTE_STICKY",
-    "return to the opening view": "HOUSE", "frame everything": "EXPAND",
-    "focus on the latest result found": "CROSSHAIRS",
+WHOLE = LEVELS.index("whole")
+DISPLAY_ICONS: dict[Display, str] = {
+    "rgb": "IMAGE", "relevancy": "FIRE", "segmentation": "HIGHLIGHTER", "latent": "PALETTE",
+    "tree": "SITEMAP", "depth": "MOUNTAIN",
+}  # fmt: skip
+TOOL_ICONS: dict[Tool, str] = {
+    "thing": "HAND_POINTER", "rectangle": "VECTOR_SQUARE", "lasso": "DRAW_POLYGON", "brush": "BRUSH",
+    "sphere": "CIRCLE", "box": "CUBE",
 }  # fmt: skip
 open_train = partial(settings.open_panel, title="Train")
 OTHER_THEME = {"dark": "light", "light": "dark"}
 
 BY_MENU: dict[str, tuple[Command, ...]] = {
     "File": (
-        Command("open a scene ...", opening.ask_for_file, ("Ctrl+O",), "Open a scene ..."),
-        Command("start page", settings.toggle_start, is_on=_is("show_start")),
+        Command("open a scene ...", opening.ask_for_file, ("Ctrl+O",), "Open a scene ...",
+                finds="load import file browse ply splat project"),
+        Command("start page", settings.toggle_start, is_on=_is("show_start"),
+                finds="home welcome recent close demo example bundled"),
         Command("reload the scene", opening.reload, ("F5",), apart=True),
-        Command("next scene of the list", lambda v: opening.step_scene(v, 1), ("Ctrl+PageDown",)),
-        Command("previous scene of the list", lambda v: opening.step_scene(v, -1), ("Ctrl+PageUp",)),
-        Command("train a scene", open_train, (), "Train from photographs ...", apart=True),
-        Command(
-            "save the project",
-            saving.save,
-            ("Ctrl+S",),
-            "Save project",
-            apart=True,
-            now=lambda v: "save the project (changed)" if v.state.is_changed else "",
-        ),
+        Command("next scene of the list", partial(opening.step_scene, by=1), ("Ctrl+PageDown",)),
+        Command("previous scene of the list", partial(opening.step_scene, by=-1), ("Ctrl+PageUp",)),
+        Command("train a scene", open_train, button="Train from photographs ...", apart=True,
+                finds="photographs photos images video reconstruct create make new colmap"),
+        Command("save the project", saving.save, ("Ctrl+S",), "Save project", apart=True,
+                now=lambda v: "save the project (changed)" if v.state.is_changed else ""),
         Command("save the project as ...", saving.save_as, ("Ctrl+Shift+S",)),
-        Command("save a picture", saving.save_picture, ("P",), "Save picture", apart=True),
-        Command("save the view", saving.save_view, (), "Save view"),
-        Command("save a film of the path", saving.save_film, (), "Save film"),
-        Command("save a picture of the film's size", saving.save_sized_picture, (), "Picture of this size"),
-        Command("save the camera path", saving.save_path, (), "Save path"),
-        Command("quit", saving.quit_viewer, ("Ctrl+Q",), apart=True),
+        Command("save a picture", saving.save_picture, ("P",), "Save picture", "CAMERA", apart=True,
+                finds="screenshot image png export capture snapshot render photo"),
+        Command("save the view", saving.save_view, button="Save view"),
+        Command("save a film of the path", saving.save_film, button="Save film",
+                finds="video movie mp4 animation export record render"),
+        Command("save a picture of the film's size", saving.save_sized_picture,
+                button="Picture of this size"),
+        Command("save the camera path", saving.save_path, button="Save path"),
+        Command("quit", saving.quit_viewer, ("Ctrl+Q",), apart=True, finds="exit close leave end"),
     ),
     "Edit": (
-        Command("search", queries.focus_search, ("Ctrl+F", "/")),
-        Command("remove all queries", queries.remove_all),
-        _step("undo", editing.undo, "Ctrl+Z"),
+        Command("search", queries.focus_search, ("Ctrl+F", "/"),
+                finds="find query ask phrase text words language where"),
+        Command("remove all queries", queries.remove_all, finds="clear reset delete search results answers"),
+        _step("undo", editing.undo, "Ctrl+Z", finds="back revert"),
         _step("redo", editing.redo, "Ctrl+Shift+Z", "Ctrl+Y"),
-        Command(
-            "gizmo: move, rotate, scale, box, off",
-            editing.next_gizmo,
-            ("G",),
-            is_on=lambda v: v.state.edit_form.gizmo != "off",
-            apart=True,
-        ),
+        Command("gizmo: move, rotate, scale, box, off", editing.next_gizmo, ("G",), icon="UP_DOWN_LEFT_RIGHT",
+                is_on=lambda v: v.state.edit_form.gizmo != "off", apart=True,
+                finds="transform translate turn resize handles crop box"),
     ),
     "Select": (
         Command("select everything", editing.select_all, ("Ctrl+A",), "All", is_edit=True),
         Command("select nothing", editing.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "None", is_edit=True),
         Command("invert the selection", editing.invert_selection, ("Ctrl+I",), "Invert", is_edit=True),
         Command("select what the search found", editing.select_query, apart=True),
-        Command("select everything like the selection", editing.select_alike, (), "More like it"),
-        Command("name the selection ...", editing.ask_for_name, ("F2",)),
-        Command("grow the selection", editing.grow_selection, (), "Grow"),
-        Command("shrink the selection", editing.shrink_selection, (), "Shrink"),
-        Command(
-            "select with no tool: the left button turns the view",
-            lambda v: editing.use_tool(v, None),
-            is_on=_is("tools.tool", None),
-            apart=True,
-        ),
-        *(
-            Command(f"select: {one}", partial(editing.use_tool, tool=one), is_on=_is("tools.tool", one))
-            for one in TOOLS
-        ),
+        Command("select everything like the selection", editing.select_alike, button="More like it"),
+        Command("name the selection ...", editing.ask_for_name, ("F2",), finds="rename teach label call"),
+        Command("grow the selection", editing.grow_selection, button="Grow"),
+        Command("shrink the selection", editing.shrink_selection, button="Shrink"),
+        Command("select with no tool: the left button turns the view", partial(editing.use_tool, tool=None),
+                icon="HAND", is_on=_is("tools.tool", None), apart=True),
+        *(Command(f"select: {tool}", partial(editing.use_tool, tool=tool), icon=TOOL_ICONS[tool],
+                  is_on=_is("tools.tool", tool)) for tool in TOOLS),
         Command("hide the selection", editing.hide_selected, ("H",), "Hide", apart=True),
         Command("isolate the selection", editing.isolate_selected, ("Shift+H",), "Isolate"),
         Command("show all that is hidden", editing.show_hidden, ("U", "Alt+H"), "Show all"),
-        Command("delete the selection", editing.delete_selected, ("Delete",), "Delete"),
-        Command(
-            "export the selection ...",
-            partial(saving.ask_export, title="scene", only_selected=True),
-            button="Export selection ...",
-            apart=True,
-        ),
+        Command("delete the selection", editing.delete_selected, ("Delete",), "Delete",
+                finds="remove erase clean cut crop"),
+        Command("export the selection ...", partial(saving.ask_export, title="scene", only_selected=True),
+                button="Export selection ...", apart=True, finds="save extract cut out ply"),
     ),
     "View": (
         *(_display(button, number) for number, button in enumerate(BUTTONS, 1)),
-        Command(
-            "say what is under the cursor",
-            viewpoint.toggle_pointing,
-            ("I",),
-            is_on=_is("pointing"),
-            apart=True,
-        ),
-        Command(
-            "compare two displays", settings.toggle_wipe, ("V",), is_on=_is("session.split.mode", "wipe")
-        ),
-        Command(
-            "three levels side by side", settings.toggle_levels, is_on=_is("session.split.mode", "levels")
-        ),
-        Command("compare with another scene ...", opening.ask_for_beside),
-        _overlay("things", "boxes of what was found", "B"),
+        Command("say what is under the cursor", viewpoint.toggle_pointing, ("I",), icon="COMMENT_DOTS",
+                is_on=_is("pointing"), apart=True, finds="inspect pick hover identify info"),
+        Command("compare two displays", settings.toggle_wipe, ("V",), icon="TABLE_COLUMNS",
+                is_on=_is("session.split.mode", "wipe"), finds="split side by side beside wipe divide"),
+        Command("three levels side by side", settings.toggle_levels, icon="LAYER_GROUP",
+                is_on=_is("session.split.mode", "levels")),
+        Command("compare with another scene ...", opening.ask_for_beside,
+                finds="split side by side beside difference"),
+        _overlay("things", "boxes of what was found", "B", finds="bounding box outline 3d"),
         _overlay("cameras", "training cameras"),
-        _overlay("cube", "axes"),
+        _overlay("cube", "axes", finds="compass orientation xyz cube"),
         _overlay("grid", "ground grid"),
-        Command(
-            "measure a distance",
-            settings.toggle_measuring,
-            ("M",),
-            is_on=_is("session.ruler.measures"),
-            apart=True,
-        ),
-        Command("pin a note to what is clicked", settings.toggle_pinning, ("N",), is_on=_is("pins_notes")),
+        Command("measure a distance", settings.toggle_measuring, ("M",), icon="RULER",
+                is_on=_is("session.ruler.measures"), apart=True, finds="ruler length size metre"),
+        Command("pin a note to what is clicked", settings.toggle_pinning, ("N",), icon="NOTE_STICKY",
+                is_on=_is("pins_notes"), finds="annotate annotation label comment text mark"),
         Command("click the middle of the image", editing.click_middle, ("X",)),
     ),
     "Camera": (
-        Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Reset"),
-        Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Frame all"),
-        Command("focus on the latest result found", viewpoint.focus_result, ("F",), "Focus"),
-        Command(
-            "previous training camera", lambda v: viewpoint.step_camera(v, -1), (",",), "", True, apart=True
-        ),
-        Command("next training camera", lambda v: viewpoint.step_camera(v, 1), (".",), "", True),
-        Command("level the horizon", lambda v: viewpoint.move(v, level), (), "Horizon", apart=True),
-        Command(
-            "align the up axis with the view", lambda v: viewpoint.move(v, adopt_up), (), "Align up axis"
-        ),
+        Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Reset", "HOUSE",
+                finds="reset camera home start"),
+        Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Frame all", "EXPAND",
+                finds="fit all zoom extents whole center centre"),
+        Command("focus on the latest result found", viewpoint.focus_result, ("F",), "Focus", "CROSSHAIRS"),
+        Command("previous training camera", partial(viewpoint.step_camera, by=-1), (",",), repeats=True,
+                apart=True),
+        Command("next training camera", partial(viewpoint.step_camera, by=1), (".",), repeats=True),
+        Command("level the horizon", partial(viewpoint.move, step=level), button="Horizon", apart=True,
+                finds="straighten roll upright"),
+        Command("align the up axis with the view", partial(viewpoint.move, step=adopt_up),
+                button="Align up axis"),
         _side("front", "Keypad1"),
         _side("back", "Ctrl+Keypad1"),
         _side("right", "Keypad3"),
         _side("left", "Ctrl+Keypad3"),
         _side("top", "Keypad7"),
         _side("bottom", "Ctrl+Keypad7"),
-        Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
-        Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True),
+        Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True,
+                finds="perspective parallel projection 2d"),
+        Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True,
+                finds="save camera remember favourite favorite"),
         Command("add a keyframe here", viewpoint.add_keyframe, ("K",), "Add keyframe"),
-        Command("make the path a turn around the view's centre", viewpoint.turn_around, (), "Turntable"),
+        Command("make the path a turn around the view's centre", viewpoint.turn_around, button="Turntable",
+                finds="turntable orbit spin rotate 360 film"),
         Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",)),
     ),
     "Window": (
-        Command("hide or show the panels", settings.toggle_panels, ("F11",)),
-        Command(
-            "reset the layout",
-            lambda v: settings.put(v.state, show_panel=True, resets_panels=True),
-            apart=True,
-        ),
-        Command(
-            "light theme, or dark again",
-            lambda v: settings.prefer(v, theme=OTHER_THEME[v.state.preferences.theme]),
-            is_on=_is("preferences.theme", "light"),
-        ),
-        Command("larger text", lambda v: settings.scale_text(v, 0.25), apart=True),
-        Command("smaller text", lambda v: settings.scale_text(v, -0.25)),
+        Command("hide or show the panels", settings.toggle_panels, ("F11",),
+                finds="full screen fullscreen clean interface sidebar ui"),
+        Command("reset the layout", lambda v: settings.put(v.state, show_panel=True, resets_panels=True),
+                apart=True, finds="default panels windows docking restore"),
+        Command("light theme, or dark again",
+                lambda v: settings.prefer(v, theme=OTHER_THEME[v.state.preferences.theme]),
+                is_on=_is("preferences.theme", "light"),
+                finds="appearance colours colors mode settings night day"),
+        Command("larger text", partial(settings.scale_text, by=0.25), apart=True,
+                finds="font size zoom interface bigger scale settings"),
+        Command("smaller text", partial(settings.scale_text, by=-0.25)),
     ),
     "Help": (
         Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),
-        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "First steps"),
+        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "First steps",
+                finds="help shortcuts keyboard manual tutorial documentation about"),
     ),
-}
+}  # fmt: skip
 EXPORT_MENU = tuple(map(_export_as, saving.exports()))  # in the menu File
 COMMANDS: tuple[Command, ...] = (
     *chain(*BY_MENU.values(), EXPORT_MENU),
@@ -306,68 +284,19 @@ def with_key(text: str, act: Callable[[Viewer], object]) -> str:
     return f"{text} ({keys[0]})" if keys else text
 
 
-# Other words that people look for, by what a command does.
-SYNONYMS = {
-    "open a scene ...": "load import file browse ply splat project",
-    "start page": "home welcome recent close demo example bundled",
-    "train a scene": "photographs photos images video reconstruct create make new colmap",
-    "save a picture": "screenshot image png export capture snapshot render photo",
-    "export: web page ...": "save html browser share website offline",
-    "export: scene ...": "save convert format ply spz sog gltf splat write as cleaned",
-    "export: cleaned copy ...": "floaters remove tidy",
-    "export: compacted copy ...": "compress smaller prune shrink reduce",
-    "export: mesh ...": "triangles surface glb geometry print",
-    "export: map for a robot ...": "occupancy ros navigation voxels collider",
-    "export: labels ...": "segmentation classes instances annotations",
-    "make the path a turn around the view's centre": "turntable orbit spin rotate 360 film",
-    "save a film of the path": "video movie mp4 animation export record render",
-    "quit": "exit close leave end",
-    "search": "find query ask phrase text words language where",
-    "remove all queries": "clear reset delete search results answers",
-    "undo": "back revert",
-    "gizmo: move, rotate, scale, box, off": "transform translate turn resize handles crop box",
-    "name the selection ...": "rename teach label call",
-    "delete the selection": "remove erase clean cut crop",
-    "export the selection ...": "save extract cut out ply",
-    "compare two displays": "split side by side beside wipe divide",
-    "compare with another scene ...": "split side by side beside difference",
-    "show or hide the boxes of what was found": "bounding box outline 3d",
-    "say what is under the cursor": "inspect pick hover identify info",
-    "show or hide the axes": "compass orientation xyz cube",
-    "measure a distance": "ruler length size metre",
-    "pin a note to what is clicked": "annotate annotation label comment text mark",
-    "return to the opening view": "reset camera home start",
-    "frame everything": "fit all zoom extents whole center centre",
-    "level the horizon": "straighten roll upright",
-    "orthographic view, and back": "perspective parallel projection 2d",
-    "bookmark this view": "save camera remember favourite favorite",
-    "hide or show the panels": "full screen fullscreen clean interface sidebar ui",
-    "reset the layout": "default panels windows docking restore",
-    "light theme, or dark again": "appearance colours colors mode settings night day",
-    "larger text": "font size zoom interface bigger scale settings",
-    "panel: Display": "background backdrop settings options preferences brightness colours color map heat",
-    "panel: Outline": "tree hierarchy objects things list contents inventory",
-    "panel: Transform": "crop clean move rotate scale box",
-    "panel: Messages": "log errors history console",
-    "first steps, and list of keys": "help shortcuts keyboard manual tutorial documentation about",
-}
+def matching(text: str, more: Sequence[Command] = (), recent: Sequence[str] = ()) -> list[Command]:
+    """Return the commands with every word of `text`, those that find it among other words last; all for none.
 
-
-def matching(text: str, panels: Sequence[str] = (), recent: Sequence[str] = ()) -> list[Command]:
-    """Return the commands with every word of `text`, those that find it among synonyms last; all for none.
-
-    Some open the `panels` of these titles, and `recent` scenes.
+    `more` commands are among them, and those that open `recent` scenes.
     """
-    more = [Command(f"panel: {title}", partial(settings.open_panel, title=title)) for title in panels]
-    for path in map(Path, recent):
-        name = f"{path.parent.name}/{path.name}"
-        more.append(Command(f"open {name}", partial(opening.open_file, path=path)))
-    words, commands = text.lower().split(), (*COMMANDS, *more)
+    files = [Path(path) for path in recent]
+    opens = (Command(f"open {f.parent.name}/{f.name}", partial(opening.open_file, path=f)) for f in files)
+    words, commands = text.lower().split(), (*COMMANDS, *more, *opens)
 
     def missed(command: Command) -> int:
-        """Return how many words are only among its synonyms; one more than there are if one is unknown."""
+        """Return how many words are only among others that find it; more than there are if one is unknown."""
         own = command.does.lower()
-        known = f"{own} {SYNONYMS.get(command.does, '')}"
+        known = f"{own} {command.finds}"
         is_unknown = any(word not in known for word in words)
         return len(words) + 1 if is_unknown else sum(word not in own for word in words)
 

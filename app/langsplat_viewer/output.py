@@ -54,7 +54,7 @@ def draw_something(request: RenderRequest, renderer: Renderer[Any]) -> Array:
     if renderer.shows_nothing():
         scene = request.scene.scene
         reason = why_nothing(scene.gaussians, request.camera)
-        raise InputError(f"{scene.path}: {reason}; try another --camera or scene")
+        raise InputError(f"{scene.path}: {reason}; try another camera or scene")
     return image
 
 
@@ -64,11 +64,11 @@ def in_one_line(out: Path, size: str) -> Iterator[None]:
     try:
         yield
     except MemoryError:
-        raise InputError(f"not enough memory for a picture of {size}; choose a smaller --size") from None
+        raise InputError(f"not enough memory for a picture of {size}; choose a smaller size") from None
     except moderngl.Error as error:
-        raise BackendError(f"OpenGL cannot draw {size} here ({error}); try --backend cpu") from None
+        raise BackendError(f"OpenGL cannot draw {size} here ({error}); start with --backend cpu") from None
     except OSError as error:
-        raise InputError(f"--out {out}: cannot be written ({error.strerror or error})") from None
+        raise InputError(f"{out}: cannot be written ({error.strerror or error})") from None
 
 
 # Writing films.
@@ -98,12 +98,12 @@ def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
         _check_own(out)
         return out
     if out.suffix.lower() != VIDEO:
-        raise InputError(f"--out {out}: a film is .mp4, or a folder of pictures")
+        raise InputError(f"{out}: a film is .mp4, or a folder of pictures")
     if not has_video():
         return check_film(out.with_suffix(""), None)
     if size is not None and (size[0] % 2 or size[1] % 2):
         even = "x".join(str(max(side - side % 2, 2)) for side in size)
-        raise InputError(f"--size: the sides of a video are even numbers; choose {even}")
+        raise InputError(f"{out}: the sides of a video are even numbers; choose {even}")
     check_output_file(out)
     return out
 
@@ -113,7 +113,7 @@ def _check_own(folder: Path) -> None:
     if folder.is_dir() and not (folder / SETTINGS).exists():
         stranger = next((path.name for path in folder.iterdir() if FRAME.fullmatch(path.name)), None)
         if stranger is not None:
-            raise InputError(f"--out {folder}: holds {stranger} of another program; choose another folder")
+            raise InputError(f"{folder}: holds {stranger} of another program; choose another folder")
 
 
 def write_film(out: Path, count: int, fps: float, draw: Draw) -> None:
@@ -159,7 +159,7 @@ def _write_video(out: Path, count: int, fps: float, draw: Draw) -> None:
         if isinstance(error, OSError):
             raise
         reason = printable_line(error, 160)
-        raise InputError(f"{out}: no video can be written ({reason}); use --out folder/") from None
+        raise InputError(f"{out}: no video can be written ({reason}); name a folder instead") from None
 
 
 # A film of the scene.
@@ -168,7 +168,7 @@ def _write_video(out: Path, count: int, fps: float, draw: Draw) -> None:
 def cameras_of(flight: Flight, extent: Extent, fps: float, size: tuple[int, int]) -> tuple[Camera, ...]:
     """Return one camera of `size` pixels for each image of a film. InputError for more than `MOST_FRAMES`."""
     if flight.seconds * fps > MOST_FRAMES:
-        raise InputError(f"a film of {flight.seconds * fps:.0f} pictures; at most {MOST_FRAMES}, lower --fps")
+        raise InputError(f"{flight.seconds * fps:.0f} pictures; at most {MOST_FRAMES}, choose fewer a second")
     return tuple(camera_of(pose, extent, size) for pose in flight.poses(frame_times(flight, fps)))
 
 

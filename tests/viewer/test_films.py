@@ -332,10 +332,12 @@ def test_a_path_is_saved_loaded_and_dropped(opened, tmp_path, frames):
     path = saving.save_path(opened, tmp_path)
     assert path.name == "blobs-001.path.json"
     assert len(read_flight(path).keyframes) == 3
+    assert not opened.state.is_changed  # a file has it
     viewpoint.set_path(opened, ())
     opening.open_dropped(opened, [path])
     assert times(opened) == [0, 2, 4]
     assert opened.state.wanted_panel == "Record"
+    assert not opened.state.is_changed
     (tmp_path / "bad.path.json").write_text("{}")
     viewpoint.load_path(opened, tmp_path / "bad.path.json")
     assert "no camera path" in errors(opened)[-1]
@@ -355,6 +357,7 @@ def test_impossible_recordings_are_refused_in_a_line(viewer, opened, tmp_path, f
     saving.save_film(opened, tmp_path)
     wanted = ["two keyframes", "needs a path", "needs a keyframe", "a film is .mp4"]
     assert [reason in text for reason, text in zip(wanted, errors(opened), strict=True)] == [True] * 4
+    assert "--" not in "".join(errors(opened))  # options of the command line
     assert list(tmp_path.iterdir()) == []
 
 
@@ -494,7 +497,7 @@ def test_a_video_has_the_images_at_their_rate(program, folder):
 
 def test_unwritable_films_leave_the_earlier_one(folder):
     (folder / "a.mp4").write_bytes(b"old")
-    with pytest.raises(InputError, match=r"a\.mp4: no video .*; use --out folder/"):
+    with pytest.raises(InputError, match=r"a\.mp4: no video .*; name a folder"):
         write_film(folder / "a.mp4", 2, 4.0, lambda number: np.zeros((25, 33, 3), np.uint8))
     assert (folder / "a.mp4").read_bytes() == b"old"
     assert not [path for path in folder.iterdir() if path.name.startswith(".a")]

@@ -19,6 +19,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer import viewer as training_process
 from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.disk import IN_TRAINING, write_preview
+from langsplat_viewer.panels.scene import waits_for
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.viewer import PREVIEW_EVERY, ProcessProgress, training_words
 from tests.support.fakes import blob_scene
@@ -117,6 +118,7 @@ def test_training_is_stopped_and_runs_once(viewer, begin):
     assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
     process = viewer.training.process
     viewer.training.interrupt()
+    assert "kernels" in waits_for(viewer.training)
     finish(viewer)
     assert process.returncode == -signal.SIGTERM
     assert "goes on" in viewer.state.messages[-1].text

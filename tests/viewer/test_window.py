@@ -169,7 +169,7 @@ REFUSED = [  # words, and why
             (["--path", "path.json", "--orthographic", "2"], "--orthographic is for one view"),
             (["--path", "broken.json"], "broken.json"),
             (["--turntable", "0"], "--turntable 0"),
-            (["--turntable", "36000", "--fps", "240"], "lower --fps"),
+            (["--turntable", "36000", "--fps", "240"], "choose fewer a second"),
             (["--turntable", "1", "--size", "33x24"], "choose 32x24"),
         ]
     ),

@@ -28,7 +28,7 @@ from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
 from langsplat_viewer.actions.settings import ask_for, folder_of
-from langsplat_viewer.actions.viewpoint import bookmarked_view, path_seconds
+from langsplat_viewer.actions.viewpoint import bookmarked_view, count_path_as_saved, path_seconds
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import say_compiling
@@ -116,7 +116,10 @@ def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
         return None
     path = _new_file(viewer.state.path, folder, PATHS)
     more, flight = "; langsplat-viewer --headless --path makes a film of it", flight_of(keyframes)
-    return viewer.save(path, lambda: write_flight(path, flight.moved(viewer.state.origin)), more)
+    saved = viewer.save(path, lambda: write_flight(path, flight.moved(viewer.state.origin)), more)
+    if saved is not None:
+        count_path_as_saved(viewer)
+    return saved
 
 
 # Films, drawn by the CPU on a thread of their own.
@@ -209,6 +212,7 @@ class ExportRow:
     options: tuple[str, ...] = ()  # of `OPTIONS`
     at_most: bool = False
     beside: bool = False
+    finds: str = ""  # other words that people look for
 
 
 CELL, UNIT = "--resolution", "--metres-per-unit"
@@ -226,31 +230,35 @@ PAGE, SCENE = "web page", "scene"
 EXPORTS = {
     PAGE: ExportRow(
         "export {scene} {out}", "One file that any browser shows and searches, without a network.",
-        {".html": (1.2e6, 52, 3)},
+        {".html": (1.2e6, 52, 3)}, finds="save html browser share website offline",
     ),
     SCENE: ExportRow(
         "convert {scene} {out}", ".ply keeps everything; .spz and .sog are a fifth, and rounded; .splat is "
         "without view dependence.", SCENE_SIZES, beside=True,
+        finds="save convert format ply spz sog gltf splat write as cleaned",
     ),
     "cleaned copy": ExportRow(
         "clean {scene} {out}", "Without floaters: small regions that touch nothing, and veils in free space.",
-        SCENE_SIZES, ("--max-psnr-loss",), at_most=True, beside=True,
+        SCENE_SIZES, ("--max-psnr-loss",), at_most=True, beside=True, finds="floaters remove tidy",
     ),
     "compacted copy": ExportRow(
         "compact {scene} --out {out}", "Without Gaussians and colours that the views do not need.",
         SCENE_SIZES, ("--max-psnr-loss",), at_most=True, beside=True,
+        finds="compress smaller prune shrink reduce",
     ),
     "mesh": ExportRow(
         "mesh {scene} {out}", "Triangles with colours: .glb in metres with y up, .ply in the scene's units.",
         {".glb": (15e6, 0, 0), ".ply": (15e6, 0, 0)}, ("--watertight",), at_most=True,
+        finds="triangles surface glb geometry print",
     ),
     "map for a robot": ExportRow(
         "map {scene} {out} {encoder}", "Occupancy grid, labelled voxels and a collider, into a folder.",
-        {"": (5e6, 0, 0)}, (CELL, UNIT),
+        {"": (5e6, 0, 0)}, (CELL, UNIT), finds="occupancy ros navigation voxels collider",
     ),
     "labels": ExportRow(
         "describe {scene} --labels {out} {encoder}", "The scene with instance, part and class of each "
         "Gaussian, and the words for them.", {".ply": (6e4, 68, 12)}, beside=True,
+        finds="segmentation classes instances annotations",
     ),
 }  # fmt: skip
 

@@ -346,9 +346,17 @@ def load_path(viewer: Viewer, path: Path) -> None:
         viewer.say_error(str(error))
         return
     set_path(viewer, found.keyframes, None)
+    count_path_as_saved(viewer)
     viewer.state.record.at = 0.0
     open_panel(viewer, "Record")
     viewer.state.say(f"{path.name}: {len(found.keyframes)} keyframes, {found.seconds:.1f} s")
+
+
+def count_path_as_saved(viewer: Viewer) -> None:
+    """Count the keyframes as saved: a file has them. A project that has others is still to be saved."""
+    saved, keyframes = viewer.state.saved, viewer.state.session.keyframes
+    if saved.project is None:
+        viewer.state.saved = replace(saved, session=replace(saved.session, keyframes=keyframes))
 
 
 # The cursor: the words for the point under it while it rests.

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui, imgui_ctx
 
 from langsplat_core import registry
 from langsplat_viewer.actions import queries, settings
-from langsplat_viewer.commands import with_key
+from langsplat_viewer.commands import Command, with_key
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.panels import (
     dialogs,
@@ -39,23 +40,31 @@ class Panel:
     is_open: bool = False  # until it is opened or closed
     needs_scene: bool = False  # grey without one
     dock: str = INSPECTOR  # for a section; FOOT for a window; "" for what floats over the scene
+    finds: str = ""  # other words that people look for
+
+    @property
+    def opens(self) -> Command:
+        """The command that opens it."""
+        act = partial(settings.open_panel, title=self.title)
+        return Command(f"panel: {self.title}", act, finds=self.finds)
 
 
 CORE_PANELS: tuple[Panel, ...] = (
     Panel(search.TITLE, search.draw, is_open=True, dock=""),
-    Panel("Display", scene.draw_display, is_open=True),
+    Panel("Display", scene.draw_display, is_open=True,
+          finds="background backdrop settings options preferences brightness colours color map heat"),
     Panel("Camera", viewpoint.draw_camera, needs_scene=True),
-    Panel("Outline", outline.draw),
+    Panel("Outline", outline.draw, finds="tree hierarchy objects things list contents inventory"),
     Panel("Selection", select.draw, needs_scene=True),
-    Panel("Transform", select.draw_transform, needs_scene=True),
+    Panel("Transform", select.draw_transform, needs_scene=True, finds="crop clean move rotate scale box"),
     Panel("Record", viewpoint.draw_record, needs_scene=True),
     Panel("Bookmarks", viewpoint.draw_bookmarks, needs_scene=True),
     Panel("Notes", overlays.draw_notes, needs_scene=True),
     Panel("Scene", scene.draw_scene),
     Panel("Train", scene.draw_training),
     Panel("Timeline", viewpoint.draw_timeline, needs_scene=True, dock=FOOT),
-    Panel("Messages", scene.draw_messages, dock=FOOT),
-)
+    Panel("Messages", scene.draw_messages, dock=FOOT, finds="log errors history console"),
+)  # fmt: skip
 
 
 def all_panels() -> tuple[Panel, ...]:
@@ -259,7 +268,7 @@ def draw_over(
     dialogs.draw_export(viewer)
     files.draw(viewer)
     menus.draw_help(viewer)
-    menus.draw_palette(viewer, [panel.title for panel in all_panels()])
+    menus.draw_palette(viewer, [panel.opens for panel in all_panels()])
 
 
 def _float_search(viewer: Viewer, area: ui.Area, left: float) -> ui.Area:

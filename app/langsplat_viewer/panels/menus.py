@@ -160,10 +160,10 @@ def _figures(viewer: Viewer) -> Iterator[tuple[str, str]]:
 WIDTH_EM, HEIGHT_EM = 26.0, 20.0
 
 
-def draw_palette(viewer: Viewer, panels: Sequence[str]) -> None:
+def draw_palette(viewer: Viewer, panels: Sequence[Command]) -> None:
     """Draw the palette: a box and the commands that match; Enter does the first, Esc closes.
 
-    `panels`: the titles of those that can be opened.
+    `panels`: the commands that open them.
     """
     if not viewer.state.show_palette:
         return

@@ -193,6 +193,13 @@ def draw_training(viewer: Viewer) -> None:
     ui.small_wrapped("The same entries continue an interrupted training.")
 
 
+def waits_for(process: Training) -> str:
+    """Return what a training that begins or stops waits for; "" for one that goes on."""
+    if process.interrupted:
+        return "stops after its present step; kernels, once per installation, are first compiled to the end"
+    return "" if process.progress.stages else "starting"
+
+
 def _running(viewer: Viewer, process: Training) -> None:
     progress = process.progress
     imgui.text_unformatted(process.out.name)
@@ -200,8 +207,8 @@ def _running(viewer: Viewer, process: Training) -> None:
         process.interrupt()
     if ui.next_button("Look at it so far"):
         opening.look_at_training(viewer)
-    if process.interrupted or not progress.stages:
-        ui.coloured("stopping soon" if process.interrupted else "starting")
+    if words := waits_for(process):
+        ui.small_wrapped(words)
     stages = dict(progress.stages)
     if done := [label for label, fraction in stages.items() if fraction >= 1]:
         ui.small_wrapped(f"done: {', '.join(done)}")
