@@ -307,7 +307,7 @@ class Viewer:
         try:
             write()
         except (OSError, ValueError, LangSplatError) as error:
-            self.say_error(f"{path}: not saved ({one_line(error)})")
+            self.say_error(f"{path}: not saved ({one_line(error).removeprefix(f'{path}: ')})")
             return None
         self.state.say(f"saved {path}{more}", file=path)
         return path

@@ -462,7 +462,8 @@ def test_failed_saving_stays_in_the_scene(pruned, tmp_path):
 
 
 def test_ending_process_saves_unsaved_edits_and_says_where(pruned, tmp_path, capsys):
-    saving.end(pruned, tmp_path)
+    pruned.state.open = replace(pruned.state.open, path=tmp_path / "blobs.ply")
+    saving.end(pruned, tmp_path / "gone")  # so it goes beside the scene
     assert not pruned.state.may_close
     settle(pruned)
     assert pruned.state.may_close

@@ -106,7 +106,7 @@ def test_quality_warnings_are_said(viewer, folder, begin):
 def test_failed_training_says_why(viewer, begin):
     begin(BAD)
     finish(viewer)
-    assert errors(viewer) == ["langsplat: photos: none can be located"]
+    assert errors(viewer) == ["photos: none can be located"]
     assert viewer.state.open is None
 
 

@@ -439,7 +439,7 @@ def watch_training(viewer: Viewer) -> None:
     elif training.interrupted:
         state.say("training stopped; Train goes on where it was")
     else:
-        viewer.say_error((training.progress.said or ["no reason given"])[-1])
+        viewer.say_error((training.progress.said or ["no reason given"])[-1].removeprefix("langsplat: "))
 
 
 # A second scene right of a line across the image, by another encoder or method in the same coordinates: a

@@ -39,11 +39,13 @@ from langsplat_viewer.state import ExportForm, FileChoice, Leaving, OpenScene, S
 from langsplat_viewer.viewer import CommandProcess, Viewer, needs_scene, program
 
 
-def _new_file(scene: Path | None, folder: Path, suffix: str, more: str = "") -> Path:
+def _new_file(
+    scene: Path | None, folder: Path, suffix: str, more: str = "", companions: tuple[str, ...] = ()
+) -> Path:
     """Return a free name after the scene's in `folder`, beside the scene or at home, where one can write."""
     places = (folder, folder if scene is None else scene.parent, Path(os.path.expanduser("~")))
     place = next((place for place in places if os.access(place, os.W_OK)), folder)
-    return output.free_name(place, f"{'scene' if scene is None else scene.stem}{more}", suffix)
+    return output.free_name(place, f"{'scene' if scene is None else scene.stem}{more}", suffix, companions)
 
 
 # Pictures, views and paths.
@@ -169,7 +171,7 @@ def save_edited(
     scene = replace(seen.scene, language=viewer.language)
 
     def work(progress: Progress) -> Path:
-        path = output.free_name(folder, f"{seen.path.stem}-edited", ".ply", COMPANIONS)
+        path = _new_file(seen.path, folder, ".ply", "-edited", COMPANIONS)
         save_scene(path, replace(scene.take(rows), path=path))
         return path
 

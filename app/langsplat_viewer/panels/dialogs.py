@@ -147,7 +147,7 @@ class Toasts:
             wide = min(BAR_EM, widest / hello_imgui.em_size(1) - 5)  # beside Cancel
             if writes is not None and ui.stoppable(*writes, wide, "##recorder"):
                 viewer.recorder.cancel(waiting=False)
-                viewer.state.say("stopped: no file was written, a folder keeps the images so far")
+                viewer.state.say("stopped: no file was written, a folder keeps those written so far")
             if imgui.is_window_hovered():
                 self._shown = [(message, now) for message, _ in self._shown]
                 if imgui.is_mouse_clicked(0) and not imgui.is_any_item_hovered():

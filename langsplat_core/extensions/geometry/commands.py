@@ -244,9 +244,9 @@ class Map:
             voxels = occupancy.find_occupancy(scene, axes, self.resolution, progress)
             plan = occupancy.floor_map(voxels, self.step, self.robot_height)
             self.out.mkdir(parents=True, exist_ok=True)
-            write_grid(self.out, plan)
-            write_collider(self.out / "collider.obj", voxels)
             write_voxels(self.out / "voxels.npz", voxels, scene, engine, progress)
+            write_collider(self.out / "collider.obj", voxels)
+            write_grid(self.out, plan)  # the last: where it is the others are
         floor = "" if room.has_floor else " (no floor was found: the ground is nearly the lowest surface)"
         print(
             f"{self.out}: {plan.free.shape[0]} x {plan.free.shape[1]} cells of {self.resolution:g} m, "

@@ -540,6 +540,9 @@ def test_the_command_writes_what_nav2_reads(tmp_path, capsys):
     voxels = np.load(tmp_path / "map" / "voxels.npz", allow_pickle=False)
     assert len(voxels["cells"]) == len(voxels["words"]) == len(voxels["nodes"])
     assert (tmp_path / "map" / "collider.obj").read_text().startswith("v ")
+    (tmp_path / "half" / "collider.obj").mkdir(parents=True)  # where none can be written
+    assert run("map", tmp_path / "room.ply", tmp_path / "half", *COARSE) != 0
+    assert not (tmp_path / "half" / "map.yaml").exists()  # which robots begin with
 
 
 def test_goals_by_phrase_and_what_has_none(tmp_path, capsys):
