@@ -46,7 +46,6 @@ from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.inventory import scene_inventory, scene_outline
-from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.transform import (
     IDENTITY,
@@ -278,7 +277,7 @@ def answers(case: Case) -> Found:
 def words(case: Case) -> Found:
     describer, camera = Describer(case.engine), case.scene.cameras[1]
     pixel = (camera.width // 2, camera.height // 2)
-    pointed = look_at_pixel(load_lifting_rasterizer("cpu"), describer, camera, pixel)
+    pointed = look_at_pixel(describer, camera, pixel)
     inventory = scene_inventory(describer)
     outline = scene_outline(describer)
     return {

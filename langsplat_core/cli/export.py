@@ -50,7 +50,7 @@ class Export:
             if scene.language is not None:
                 engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
                 if self.encoder:  # without it, a page is made that knows the phrasebook alone
-                    engine.load_encoder()
+                    engine.texts.encoder()
             first = [camera for camera in scene.cameras if self.view and camera.name == self.view][:1]
             if self.view and not first:
                 raise InputError(f"--view {self.view}: {self.scene} has no camera of this name")

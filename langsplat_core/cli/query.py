@@ -245,7 +245,7 @@ class QueryScene:
                 if self.mode == "paper":
                     if engine.is_taught(phrase):
                         raise InputError(NOT_DECODED)
-                    engine.text_vectors([phrase])
+                    engine.texts.of([phrase])
                 else:
                     compose.check_phrase(engine, phrase, camera)
             except LangSplatError as error:
@@ -384,7 +384,7 @@ def _pixel(view: View, engine: QueryEngine, result: QueryResult, mode: str) -> d
     """Return the pixel of an answer in a view, and its score there, ready for JSON."""
     gate = PictureConfig().alpha_gate
     if mode == "paper":
-        phrase = engine.text_vectors([result.phrase])
+        phrase = engine.texts.of([result.phrase])
         image = decoded_relevancy(view, engine.field, result.level, phrase, gate)
     else:
         image = splatted_relevancy(view, result.even[:, None], gate)

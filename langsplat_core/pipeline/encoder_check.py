@@ -222,7 +222,7 @@ def _geometry(
     absent: Sequence[str],
 ) -> dict[str, tuple[float, ...]]:
     """Return the figures of `GEOMETRY`."""
-    words = engine.text_vectors([*there, *absent])
+    words = engine.texts.of([*there, *absent])
     cosines = (images @ words.T).astype(np.float64)
     own, other = cosines[:, : len(there)], cosines[:, len(there) :]
     apart = room.owners[nodes][:, None] != room.owners[nodes]

@@ -64,7 +64,7 @@ def show(
     if phrases:
         trees = [parse(name, engine.taught) for name in (phrase, *phrases) if name]
         known = [text for tree in trees for text in encoded_texts(engine, tree)]
-        book = dict(zip(known, engine.text_vectors(known), strict=True))
+        book = dict(zip(known, engine.texts.of(known), strict=True))
         own = replace(engine.field, phrasebook=book, taught=tuple(engine.taught.values()))
         scene = replace(scene, language=own)
         engine = QueryEngine(scene)

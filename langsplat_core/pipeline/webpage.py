@@ -316,7 +316,7 @@ def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any
     """Return the phrases whose vectors are in the page, and the encoder where it is small enough."""
     book = tuple(engine.field.phrasebook)
     try:
-        encoder: TextEncoder | None = engine.load_encoder()
+        encoder: TextEncoder | None = engine.texts.encoder()
     except EncoderError:
         encoder = None
     plain = encoder.tower if isinstance(encoder, PhraseEncoder) else None
@@ -325,14 +325,14 @@ def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any
         ends = {"begin": plain.tokenizer.begin, "end": plain.tokenizer.end}
         ids = {word: plain.tokenizer.encode(word) for word in sorted(encoder.words)}
         tensors = {f"encoder.{name}": tensor.astype(np.float16) for name, tensor in plain.tensors.items()}
-        _, vectors = engine.known_vectors(book)
+        _, vectors = engine.texts.of_known(book)
         encoding = {"config": config, "words": ids, **ends}
         return {"keys": book, "encoder": encoding}, tensors | {"vectors": vectors.astype(np.float16)}
     phrases: Sequence[str] = book
     if encoder is not None:
         phrases = (*book, *suggested, *(phrase for name in BUNDLED for phrase in bundled_vocabulary(name)))
     others = (name for phrase in phrases for name in grammar.thing_and_part(phrase) if name)
-    known, vectors = engine.known_vectors((*phrases, *others))
+    known, vectors = engine.texts.of_known((*phrases, *others))
     return {"keys": known, "phrases": known if encoder else book}, {"vectors": vectors.astype(np.float16)}
 
 

@@ -88,7 +88,7 @@ def check_phrase(
     tree = grammar.parse(text, engine.taught)
     _check_viewpoint(tree, viewpoint)
     try:
-        engine.text_vectors(encoded_texts(engine, tree), progress)
+        engine.texts.of(encoded_texts(engine, tree), progress)
     except EncoderError:
         if phrase_key(text) not in engine.field.phrasebook:
             raise
@@ -101,7 +101,7 @@ def encode_phrases(engine: QueryEngine, texts: Sequence[str]) -> None:
         with suppress(InputError):
             wanted += encoded_texts(engine, grammar.parse(text, engine.taught))
     with suppress(EncoderError, InputError):
-        engine.known_vectors(wanted)
+        engine.texts.of_known(wanted)
 
 
 def _check_viewpoint(tree: grammar.Phrase, viewpoint: Camera | None) -> None:

@@ -22,7 +22,6 @@ from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import pixel_weights
 from langsplat_core.scene import LEVELS, Camera, CodebookCodec, Codec, LanguageField
 from langsplat_core.scene.surface import surface_areas
@@ -174,13 +173,13 @@ class Describer:
         vocabulary: phrases for all levels, by default the bundled ones: everyday things, and below the level
         "whole" parts of things too. Phrases with words that the encoder was never taught are left out. Raises
         InputError for a scene without a language field and if no phrase is left, EncoderError as
-        `QueryEngine.known_vectors` does.
+        `TextVectors.of_known` does.
         """
         things = tuple(vocabulary) if vocabulary is not None else bundled_vocabulary("things")
         parts = () if vocabulary is not None else bundled_vocabulary("parts")
         phrases, field = (*things, *parts), engine.field
         self.engine, self.known = engine, field.known
-        known, vectors = engine.known_vectors(phrases, progress)
+        known, vectors = engine.texts.of_known(phrases, progress)
         self.left_out: tuple[str, ...] = tuple(sorted(set(phrases) - set(known)))
         if not known:
             raise InputError(
@@ -230,7 +229,6 @@ class Pointed:
 
 
 def look_at_pixel(
-    rasterizer: LiftingRasterizer,
     describer: Describer,
     camera: Camera,
     pixel: tuple[int, int],
@@ -244,7 +242,7 @@ def look_at_pixel(
     rasterizers. `settings` of image formation: by default the scene's own.
     """
     scene = describer.engine.scene
-    rows, weights = pixel_weights(scene, camera, pixel, rasterizer, settings)
+    rows, weights = pixel_weights(scene, camera, pixel, settings)
     total = float(weights.sum())
     if total <= PictureConfig().alpha_gate:
         return None

@@ -1,50 +1,39 @@
 """The query engine: from a phrase to its answer in a scene.
 
-A phrase becomes a text vector (`text_vectors`), the vector a relevancy of every Gaussian (`lookup`), these
+A phrase becomes a text vector (`texts`), the vector a relevancy of every Gaussian (`lookup`), these
 become fits of the regions of the scene's tree (`answers`), and the fits an answer (`rule`).
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from threading import RLock
-from typing import Any
 
 import numpy as np
 import scipy
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import LevelChoice
-from langsplat_core.errors import EncoderError, InputError, UnknownWordError
+from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.sidecar import SUFFIX, Words
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query import answers
 from langsplat_core.query import taught as taught_words
 from langsplat_core.query.answers import AnswerRule, QueryResult, Regions
-from langsplat_core.query.grammar import STOP_WORDS, check_names, named, only, thing_and_part
+from langsplat_core.query.basis import Basis, basis_of
+from langsplat_core.query.grammar import STOP_WORDS, named, only, thing_and_part
 from langsplat_core.query.instances import Instance, find_instances, find_wholes
 from langsplat_core.query.lookup import Lookup, Relevancy, through_cells
 from langsplat_core.query.rule import Bars, bars_of, decide, on_things, scaling_of
-from langsplat_core.scene import (
-    CANONICAL_PHRASES,
-    LEVELS,
-    Calibration,
-    LanguageField,
-    Scene,
-    TaughtWord,
-    Tree,
-)
+from langsplat_core.query.texts import LoadEncoder, TextVectors
+from langsplat_core.scene import LEVELS, Calibration, LanguageField, Scene, TaughtWord, Tree
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
 from langsplat_core.scene.surface import Surface, build_surface, build_tree, surface_weights
-from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, kept_calibration, same_vectors
-from langsplat_core.semantics.relevancy import FEWEST, Scale, TextEncoder, everyday_vectors, relevancy_of
+from langsplat_core.semantics.encoders import kept_calibration, same_vectors
+from langsplat_core.semantics.relevancy import Scale, TextEncoder, relevancy_of
 
-BATCH = 512  # phrases that are encoded at a time
 SAMPLE = 200_000  # Gaussians, about, that tell which regions touch; the surface of a million takes 5 s
-
-LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
 
 
 def no_field(scene: Scene) -> str:
@@ -59,17 +48,6 @@ def searchable(path: Path) -> Scene:
     if scene.language is None:
         raise InputError(f"{path}: {no_field(scene)}")
     return scene
-
-
-@dataclass(frozen=True)
-class Basis:
-    """The encoder and calibration behind the answers in a scene, in words for people."""
-
-    encoder: str  # as the scene names it
-    calibration: str | None  # scenes in which probabilities were calibrated; None: there are none
-    short: str  # one line
-    long: str  # the same with consequences and remedy
-    guesses: bool  # True for the demo encoder outside the rooms that it was made for
 
 
 class QueryEngine:
@@ -97,20 +75,14 @@ class QueryEngine:
         neither scene nor encoder has everyday phrases. words: the user's, before the scene's; EncoderError if
         they are of another encoder.
         """
-        given: Any = load_encoder
-        if isinstance(scene, str | Path) or isinstance(given, str):
+        if isinstance(scene, str | Path) or isinstance(load_encoder, str):
             raise InputError("no name alone; say QueryEngine(load_scene(path), load_text_encoder(name))")
         self.scene = scene
         self.exact = exact
         self._rule: AnswerRule = rule
-        self._load_encoder: Any = (lambda _: given) if hasattr(given, "encode_texts") else given
-        self._encoder_id = encoder_id
-        self._encoder: TextEncoder | None = None
-        self._encoder_checked = False
-        self._turn = RLock()  # guards the encoder, whose tokenizer is not thread-safe
-        # Vectors of phrases that need no encoding, 2 KB each at D = 512.
-        self._vectors: dict[str, Array] = {} if scene.language is None else dict(scene.language.phrasebook)
-        taught = () if scene.language is None else scene.language.taught
+        field = scene.language
+        self._texts = None if field is None else TextVectors(field, load_encoder, encoder_id)
+        taught = () if field is None else field.taught
         if words is not None:
             check_words(self.field, words)
             taught += words.words
@@ -119,7 +91,7 @@ class QueryEngine:
     # Answers.
 
     def run(self, phrase: str, level: LevelChoice = "auto", progress: Progress = silent) -> QueryResult:
-        """Answer `phrase` as one name; a taught word by its examples. Raises as `text_vectors` does.
+        """Answer `phrase` as one name; a taught word by its examples. Raises as `TextVectors.of` does.
 
         The level is chosen per scene and not per view, so that images do not flicker between levels. "Lid of
         the teapot" is one name here; `run_phrase` parses it.
@@ -135,7 +107,7 @@ class QueryEngine:
         if isinstance(phrases, str) or not all(isinstance(phrase, str) for phrase in phrases):
             raise InputError("a phrase is text: run('blue gift'), or run_many(['cup', 'lamp']) for several")
         texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
-        vectors = self.text_vectors(texts, progress)  # first, so that a refused phrase leaves nothing cached
+        vectors = self.texts.of(texts, progress)  # first, so that a refused phrase leaves nothing cached
         relevancies = self._lookup.relevancies(vectors) if texts else iter(())
         others, found = self._fits_of_names(texts), []
         for phrase in phrases:
@@ -155,9 +127,8 @@ class QueryEngine:
         """Return the (R,) own fits of the wholes and parts in `phrases`, as far as the encoder knows them."""
         wanted = dict.fromkeys(name for phrase in phrases for name in thing_and_part(tidy(phrase)))
         names = [name for name in wanted if self.is_known(name) and self.bars is not None]
-        relevancies = self._lookup.relevancies(self.text_vectors(names)) if names else ()
-        found = zip(names, relevancies, strict=True)
-        return {name: self._own_fits(relevancy) for name, relevancy in found}
+        relevancies = self._lookup.relevancies(self.texts.of(names)) if names else ()
+        return dict(zip(names, map(self._own_fits, relevancies), strict=True))
 
     def _own_fits(self, relevancy: Relevancy) -> Array:
         return self.scale.fit(self._mixtures @ relevancy.values)
@@ -183,8 +154,8 @@ class QueryEngine:
             fits += [] if part is None else [part]
             on = on_things(self.regions.table, thing, self.touching)
         sought = named(phrase)
-        judged = self.bars, scaling_of(self.calibration, sought, phrase), on
-        decision = decide(self.regions.table, fits, sought, level, *judged)
+        scaling = scaling_of(self.calibration, sought, phrase)
+        decision = decide(self.regions.table, fits, sought, level, self.bars, scaling, on)
         return answers.by_regions(phrase, relevancy, decision, means, self.regions)
 
     def run_inside(
@@ -192,11 +163,11 @@ class QueryEngine:
     ) -> QueryResult:
         """Answer a part, by the mean over its `names`, among the regions of an instance, `members` (N,) bool.
 
-        The verdict is by the first name, among these regions. Raises as `text_vectors` does.
+        The verdict is by the first name, among these regions. Raises as `TextVectors.of` does.
         """
         assert self.bars is not None
         assert self.chance is not None
-        asked = list(self._lookup.relevancies(self.text_vectors(names)))
+        asked = list(self._lookup.relevancies(self.texts.of(names)))
         relevancy = replace(asked[0], values=np.mean([one.values for one in asked], axis=0))
         fits, on, table = list(map(self._own_fits, asked)), self.regions.mostly(members), self.regions.table
         bars = self.bars if calibration else bars_of(table, self.chance, on)
@@ -216,11 +187,16 @@ class QueryEngine:
     # Data that answers are computed from, each made when it is first needed.
 
     @property
+    def texts(self) -> TextVectors:
+        """Vectors of phrases; InputError if the scene has no language field."""
+        if self._texts is None:
+            raise InputError(no_field(self.scene))
+        return self._texts
+
+    @property
     def field(self) -> LanguageField:
         """The scene's language field; InputError if it has none."""
-        if (field := self.scene.language) is None:
-            raise InputError(no_field(self.scene))
-        return field
+        return self.texts.field
 
     @property
     def rule(self) -> AnswerRule:
@@ -230,8 +206,8 @@ class QueryEngine:
     @property
     def scale(self) -> Scale:
         """Scale that turns cosines into relevancies."""
-        field = self.field
-        return Scale(field.canonical, self._everyday, field.temperature)
+        everyday = None if self._rule == "peak" else self.texts.everyday
+        return Scale(self.field.canonical, everyday, self.field.temperature)
 
     @property
     def calibration(self) -> Calibration | None:
@@ -296,126 +272,12 @@ class QueryEngine:
     @property
     def basis(self) -> Basis:
         """The basis of answers, as far as it is known: nothing is loaded for it."""
-        field = self.field
-        everyday = None if self._rule == "peak" else self.__dict__.get("_everyday", _enough(field.everyday))
-        name = "demo encoder" if field.encoder_id == DEMO else field.encoder_id
-        guesses = field.encoder_id == DEMO and field.calibration is None
-        calibration = None
-        if guesses:
-            short, long = f"{name}, made for drawn rooms: guesses here", DEMO_ELSEWHERE
-        elif everyday is None:
-            short = f"{name}, as published: no everyday phrases to compare with"
-            long = f"{short}. Found is a relevancy of {field.found:g} or more, without percentages"
-        elif field.calibration is None and self._kept is None:
-            short = f"{name}, no calibration here: found is more than by chance"
-            long = (
-                f"{short}. Percentages are of phrases for nothing here that fit as well (found: up to 5); "
-                "probabilities need a calibration in such scenes"
-            )
-        elif field.calibration is None:
-            short, calibration = f"{name}, calibrated by `langsplat doctor`", "the bundled room"
-            long = f"{short}, from drawn rooms: percentages hold there, and may be off in this scene"
-        else:
-            short, calibration = f"{name}, calibrated in drawn rooms", "drawn rooms"
-            long = f"{short}. Percentages hold in such rooms, and this scene is one"
-        return Basis(field.encoder_id, calibration, short, long, guesses)
-
-    # Text vectors.
-
-    def load_encoder(self, progress: Progress = silent) -> TextEncoder:
-        """Return the text encoder, which the first call loads, in seconds; EncoderError if that fails."""
-        with self._turn:
-            if self._encoder is None:
-                if self._load_encoder is None:
-                    raise EncoderError(
-                        "without a text encoder only the phrases in the scene's phrasebook can be asked; "
-                        f"the scene was made with {self.field.encoder_id}"
-                    )
-                progress("loading the text encoder", 0.1)
-                self._encoder = self._load_encoder(self._encoder_id or self.field.encoder_id)
-            return self._encoder
+        by_chance = self._rule == "regions" and self.texts.everyday_so_far is not None
+        return basis_of(self.field, by_chance, self.field.calibration or self._kept)
 
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
-        """Return the words of `phrase` that the encoder was never taught. Raises as `load_encoder` does."""
-        key = phrase_key(phrase)
-        return () if key in self.taught or key in self._vectors else self.load_encoder().unknown_words(key)
-
-    def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
-        """Return (Q, D) unit vectors of phrases, from the scene's phrasebook, else encoded together.
-
-        Raises InputError for an empty phrase and one of stop words alone, UnknownWordError for words that the
-        encoder was never taught, and EncoderError if the encoder cannot be loaded or is not the scene's.
-        """
-        keys = list(map(phrase_key, phrases))
-        fresh = [key for key in dict.fromkeys(keys) if key not in self._vectors]
-        for key in fresh:
-            check_names(key.split())
-        if fresh:
-            encoder = self.load_encoder(progress)
-            with self._turn:
-                if unknown := dict.fromkeys(word for key in fresh for word in encoder.unknown_words(key)):
-                    near = {word: encoder.near_words(word) for word in unknown}
-                    raise UnknownWordError(near, "use other words, or a scene made with OpenCLIP weights")
-                self._encode(encoder, fresh)
-        return self._stacked(keys)
-
-    def known_vectors(
-        self, phrases: Iterable[str], progress: Progress = silent
-    ) -> tuple[tuple[str, ...], Array]:
-        """Return the keys of `phrases` whose words the encoder was taught, each once, and (V, D) vectors.
-
-        Raises EncoderError if the encoder cannot be loaded or is not the scene's.
-        """
-        keys = tuple(dict.fromkeys(map(phrase_key, phrases)))
-        fresh = [key for key in keys if key not in self._vectors and not only(STOP_WORDS, key.split())]
-        if fresh:
-            encoder = self.load_encoder(progress)
-            progress("loading the text encoder", 1.0)
-            self._encode(encoder, [key for key in fresh if not encoder.unknown_words(key)], progress)
-        known = tuple(key for key in keys if key in self._vectors)
-        return known, self._stacked(known)
-
-    def _stacked(self, keys: Sequence[str]) -> Array:
-        vectors = [self._vectors[key] for key in keys]
-        return np.stack(vectors) if vectors else np.zeros((0, self.field.codec.vector_dim), np.float32)
-
-    def _encode(self, encoder: TextEncoder, keys: Sequence[str], progress: Progress = silent) -> None:
-        """Encode phrases in batches and keep their vectors; EncoderError if `encoder` is not the scene's."""
-        for start in range(0, len(keys), BATCH):
-            batch = list(keys[start : start + BATCH])
-            with self._turn:
-                self._check_encoder(encoder)
-                vectors = np.asarray(encoder.encode_texts(batch), np.float32)
-            self._vectors.update(zip(batch, vectors, strict=True))
-            progress("reading the vocabulary", (start + len(batch)) / len(keys))
-
-    def _check_encoder(self, encoder: TextEncoder) -> None:
-        """Raise EncoderError unless `encoder` makes the scene's canonical vectors: others give noise."""
-        if self._encoder_checked:
-            return
-        own, made_with = self.field.canonical, self.field.encoder_id
-        canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
-        if not same_vectors(canonical, own):
-            raise EncoderError(
-                f"the scene was made with other weights of {made_with}, vectors of {own.shape[1]} numbers; "
-                "give those with --encoder, or make the scene again"
-            )
-        self._encoder_checked = True
-
-    @cached_property
-    def _everyday(self) -> Array | None:
-        """The scene's own everyday vectors, else the encoder's; None by the rule "peak" or if too few."""
-        if self._rule == "peak":
-            return None
-        if self.field.everyday is not None:
-            return _enough(self.field.everyday)
-        try:
-            encoder = self.load_encoder()
-            with self._turn:
-                self._check_encoder(encoder)
-                return everyday_vectors(encoder)
-        except EncoderError:
-            return None
+        """Return the words of a phrase that its encoder was never taught; none of a taught word."""
+        return () if self.is_taught(phrase) else self.texts.unknown_words(phrase)
 
     # Taught words.
 
@@ -471,7 +333,7 @@ class QueryEngine:
         """Return the (M,) cosines of a phrase with (M, D) unit image vectors at a level, and (M,) fits."""
         if self.is_taught(phrase):
             return taught_words.compare(self.taught[phrase_key(phrase)], self.word_space, vectors, level)
-        cosines = vectors @ self.text_vectors([phrase])[0]
+        cosines = vectors @ self.texts.of([phrase])[0]
         zero, rate = self.scale.of(vectors @ self.scale.texts.T)
         return cosines, self.scale.fit(relevancy_of(cosines, zero, rate))
 
@@ -484,7 +346,3 @@ def check_words(field: LanguageField, words: Words) -> None:
             f"{which} were taught with {words.encoder_id}, the scene was made with {field.encoder_id}; "
             "teach them in a scene of that encoder"
         )
-
-
-def _enough(everyday: Array | None) -> Array | None:
-    return None if everyday is None or len(everyday) < FEWEST else everyday

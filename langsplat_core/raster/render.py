@@ -14,7 +14,6 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import overload
 
 import numpy as np
 
@@ -27,27 +26,16 @@ from langsplat_core.scene import Camera, Gaussians, Scene
 SLACK = 1e-3  # px by which footprints are widened where one pixel's are chosen: backends round
 
 
-@overload
-def view_of(
-    scene: Scene, camera: Camera, rasterizer: None = None, settings: RasterSettings | None = None
-) -> protocol.LiftingView: ...
-@overload
 def view_of(
     scene: Scene,
     camera: Camera,
-    rasterizer: protocol.Backend[protocol.V],
+    rasterizer: protocol.LiftingRasterizer | None = None,
     settings: RasterSettings | None = None,
-) -> protocol.V: ...
-def view_of(
-    scene: Scene,
-    camera: Camera,
-    rasterizer: protocol.Backend[protocol.View] | None = None,
-    settings: RasterSettings | None = None,
-) -> protocol.View:
+) -> protocol.LiftingView:
     """Project `scene` into `camera`, once for any number of images.
 
-    rasterizer: by default that of the CPU, whose views can lift; settings of image formation: by default
-    those that the scene was trained with.
+    rasterizer: by default that of the CPU; settings of image formation: by default those that the scene was
+    trained with.
     """
     expect(scene, Scene, "load_scene(path) returns one")
     expect(camera, Camera, "scene.cameras has those of a scene, look_at makes one")
@@ -91,13 +79,14 @@ def render(
     that cannot load here, ValueError for values of another shape.
     """
     expect(scene, Scene, "load_scene(path) returns one")
+    expect(camera, Camera, "scene.cameras has those of a scene, look_at makes one")
     expect(profile, RasterSettings | None, "config.INRIA is one")
     if values is not None:
         check_array("values", np.asarray(values), ("N", "C"), {"N": len(scene.gaussians.means)})
         if not np.isfinite(values).all():
             raise InputError("values: some are not finite, and would spoil all that they blend with")
     rasterizer = _cpu() if backend == "cpu" else load_rasterizer(backend)
-    view = view_of(scene, camera, rasterizer, scene.raster_settings(profile))
+    view = rasterizer.view(scene.gaussians, camera, scene.raster_settings(profile))
     return splat_colours(view, scene.gaussians, values)
 
 
@@ -122,17 +111,12 @@ def colours_seen(gaussians: Gaussians, camera: Camera, rows: Array | None = None
 
 
 def pixel_weights(
-    scene: Scene,
-    camera: Camera,
-    pixel: tuple[int, int],
-    rasterizer: protocol.LiftingRasterizer | None = None,
-    settings: RasterSettings | None = None,
+    scene: Scene, camera: Camera, pixel: tuple[int, int], settings: RasterSettings | None = None
 ) -> tuple[Array, Array]:
     """Return (M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and (M,) float32 weights.
 
-    The weights, alpha_i T_i > 0, add up to the pixel's alpha; rasterizer and settings as in `view_of`. Only
-    Gaussians whose footprint covers the pixel are blended, and the weights are those of the whole view. The
-    pixel must lie in the image.
+    The weights, alpha_i T_i > 0, add up to the pixel's alpha. Only Gaussians whose footprint covers the pixel
+    are blended. The pixel must lie in the image; settings as in `view_of`.
     """
     from langsplat_core.compiled import shared_workers  # numba takes a second to import
     from langsplat_core.raster.cpu import projection
@@ -145,7 +129,7 @@ def pixel_weights(
     across = np.abs(boxes[:, projection.MEAN_X] - column - 0.5) <= boxes[:, projection.HALF_WIDTH] + SLACK
     down = np.abs(boxes[:, projection.MEAN_Y] - row - 0.5) <= boxes[:, projection.HALF_HEIGHT] + SLACK
     near = found.drawn[across & down].astype(np.int64)
-    view = (rasterizer or _cpu()).view(scene.gaussians.take(near), camera, formed)
+    view = _cpu().view(scene.gaussians.take(near), camera, formed)
     chosen = np.zeros((camera.height, camera.width, 1), np.float32)
     chosen[row, column] = 1
     weights = np.asarray(view.gather(chosen))[:, 0]

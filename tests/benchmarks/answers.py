@@ -405,10 +405,10 @@ def show_things(room: Room, engine: QueryEngine) -> Showing:
         members = room.labels[-1] == number
         known = region.level == "whole" and region.thing and not engine.unknown_words(region.thing)
         if known and members.sum() >= MIN_GAUSSIANS:
-            vector = engine.text_vectors([region.thing]).tobytes()
+            vector = engine.texts.of([region.thing]).tobytes()
             if vector not in shown:
                 shown[vector] = engine.teach(region.thing, members, "whole")
-    _, vectors = engine.known_vectors(sorted(room.truth.words))
+    _, vectors = engine.texts.of_known(sorted(room.truth.words))
     return Showing(room, engine, shown, {vector.tobytes() for vector in vectors})
 
 

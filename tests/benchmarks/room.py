@@ -321,7 +321,7 @@ class Room:
         if variant.query != "paper":
             splatted_relevancy(view, answer.relevancy[answer.level][:, None], gate)
             return
-        vector = asked.engine.text_vectors([answer.phrase])
+        vector = asked.engine.texts.of([answer.phrase])
         for level in range(len(LEVELS)):
             decoded_relevancy(view, asked.engine.field, level, vector, gate)
 

@@ -24,7 +24,6 @@ from langsplat_core.query.answers import SPAN, QueryResult, Regions
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.raster.protocol import Rasterizer, View
-from langsplat_core.raster.render import view_of
 from langsplat_core.scene import Camera
 from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_core.training.language.codec_fit import CodecReport
@@ -107,7 +106,7 @@ def evaluate(
     results: dict[str, list[tuple[float, bool]]] = {}
     for done, camera in enumerate(cameras):
         labels = truth.labels(camera.name)
-        view = view_of(scene, camera, rasterizer)
+        view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
         masks = {p: _mask(labels, p) for p in truth.phrases if p.text in asked.answers}
         visible = [phrase for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS]
         answers = [asked.answers[phrase.text] for phrase in visible]
@@ -149,7 +148,7 @@ def _paper_masks(
     maps: dict[int, Array] = {}
     for level in {answer.level for answer in answers}:
         rows = [row for row, answer in enumerate(answers) if answer.level == level]
-        vectors = engine.text_vectors([answers[row].phrase for row in rows])
+        vectors = engine.texts.of([answers[row].phrase for row in rows])
         decoded = decoded_relevancy(view, engine.field, level, vectors, PictureConfig().alpha_gate)
         maps |= dict(zip(rows, np.moveaxis(decoded, 2, 0), strict=True))
     for row, answer in enumerate(answers):

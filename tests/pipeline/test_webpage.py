@@ -284,8 +284,8 @@ def without_encoder(demo: Scene, **field: Any) -> tuple[Scene, QueryEngine]:
 
 
 def test_page_without_encoder_answers_phrasebook_and_taught_words(browser, demo, engine, tmp_path):
-    book = dict(zip(PHRASES[:60], engine.text_vectors(PHRASES[:60]), strict=True))
-    book["duck sœur"] = engine.text_vectors(["duck"])[0]  # a quoted word of other letters is no possessive
+    book = dict(zip(PHRASES[:60], engine.texts.of(PHRASES[:60]), strict=True))
+    book["duck sœur"] = engine.texts.of(["duck"])[0]  # a quoted word of other letters is no possessive
     book["red not laptop"] = book["laptop"]
     word = QueryEngine(demo).teach("bruno", engine.run("teddy bear").members)
     words = word, replace(word, name="bear of anna")
@@ -326,7 +326,7 @@ def test_page_without_small_encoder_knows_encoded_phrases(browser: Any, demo: Sc
 def test_markup_in_names_is_shown_as_text(browser, demo, engine, tmp_path):
     name = MARKUP.replace(",", "")[:80]
     word = replace(QueryEngine(demo).teach("bruno", engine.run("teddy bear").members), name=name)
-    vector = engine.text_vectors(["laptop"])[0]
+    vector = engine.texts.of(["laptop"])[0]
     scene, other = without_encoder(demo, phrasebook={MARKUP: vector, "laptop": vector}, taught=(word,))
     scene = replace(scene, cameras=tuple(replace(camera, name=MARKUP) for camera in demo.cameras[:3]))
     path = tmp_path / "a.html"

@@ -533,7 +533,7 @@ def vocabularies(_: Path) -> list[bytes]:
 
 
 def encoded(path: Path) -> float:
-    known, vectors = QueryEngine(_demo(), load_text_encoder).known_vectors(read_vocabulary(path))
+    known, vectors = QueryEngine(_demo(), load_text_encoder).texts.of_known(read_vocabulary(path))
     assert len(known) == len(vectors)
     return 1.0
 

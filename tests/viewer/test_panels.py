@@ -14,7 +14,6 @@ from langsplat_core.errors import InputError
 from langsplat_core.query import instances
 from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import look_at
 from langsplat_core.scene.transform import AXES, moving, rotating
 from langsplat_viewer import panels
@@ -313,7 +312,7 @@ def compiled() -> None:
     """The kernels that look at a pixel: half a minute on a fresh machine."""
     engine = QueryEngine(blob_scene(), lambda encoder_id: FakeEncoder())
     camera = engine.scene.cameras[0].resized(16, 12)
-    look_at_pixel(load_lifting_rasterizer("cpu"), Describer(engine, ("mug",)), camera, (8, 6))
+    look_at_pixel(Describer(engine, ("mug",)), camera, (8, 6))
 
 
 @pytest.fixture

@@ -155,7 +155,7 @@ def _prepare_search(viewer: Viewer, engine: QueryEngine) -> None:
         label = "compiling the search kernels, once per installation (half a minute)"
         viewer.run(label, lambda progress: engine.regions)
     if viewer.has_encoder_here:
-        viewer.run("loading the text encoder", engine.load_encoder)
+        viewer.run("loading the text encoder", engine.texts.encoder)
 
 
 # Visits: a scene that was shown before is restored as it was left.

@@ -11,7 +11,6 @@ from langsplat_core.errors import LangSplatError, printable_line
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera import controls, flight
@@ -394,8 +393,8 @@ def _ask(viewer: Viewer, place: Hover) -> None:
 
     def work(engine: QueryEngine, progress: Progress) -> tuple[Describer, Pointed | None]:
         settings = image_formation(engine.scene, camera, clip)
-        describer, cpu = viewer.describing(engine, progress), load_lifting_rasterizer("cpu")
-        return describer, look_at_pixel(cpu, describer, camera, place.pixel, results, settings=settings)
+        describer = viewer.describing(engine, progress)
+        return describer, look_at_pixel(describer, camera, place.pixel, results, settings=settings)
 
     def done(found: tuple[Describer, Pointed | None]) -> None:
         viewer.describer, place.found = found

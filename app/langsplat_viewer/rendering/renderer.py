@@ -41,7 +41,7 @@ from langsplat_core.raster.opengl.rasterizer import (
     is_software,
     set_uniforms,
 )
-from langsplat_core.raster.render import splat_colours, view_of
+from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
 from langsplat_core.scene.gaussians import Merged
 from langsplat_viewer.rendering.request import (
@@ -225,7 +225,7 @@ class Renderer(ABC, Generic[L]):
 
 def _view(rasterizer: Rasterizer, scene: Scene, request: RenderRequest) -> View:
     settings = image_formation(scene, request.camera, request.clip)
-    return view_of(scene, request.camera, rasterizer, settings)
+    return rasterizer.view(scene.gaussians, request.camera, settings)
 
 
 def _distinct(channels: Sequence[Channel]) -> tuple[Channel, ...]:

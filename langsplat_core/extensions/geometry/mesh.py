@@ -25,7 +25,7 @@ from langsplat_core.io.ply import CHANNELS, POSITION, write_table
 from langsplat_core.io.quantised import to_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.raster.render import splat_colours, view_of
+from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians, Scene
 
 SIDE, MOST = 640, 160  # pixels of the longer side of an image, and images, at most
@@ -133,7 +133,7 @@ def fuse(
 
 
 def _rendered(scene: Scene, camera: Camera) -> Depth:
-    view = view_of(scene, camera, CpuRasterizer())
+    view = CpuRasterizer().view(scene.gaussians, camera, scene.raster_settings())
     image = splat_colours(view, scene.gaussians)
     colours = np.clip(image.colours / np.maximum(image.alpha, 0.5)[..., None], 0, 1)
     depth = surface_depth(scene.gaussians, camera, view.median_rows())

@@ -552,7 +552,7 @@ def _vector(library: Library, group: EncoderGroup, text: str, load_encoder: Load
     none = np.zeros((len(LEVELS), 0, 1), np.float32), np.zeros((len(LEVELS), 0), np.float32)
     field = LanguageField(*none, codec, group.canonical, group.encoder_id)
     try:
-        return QueryEngine(Scene(join_gaussians([]), field), load_encoder).text_vectors([text])[0]
+        return QueryEngine(Scene(join_gaussians([]), field), load_encoder).texts.of([text])[0]
     except EncoderError:
         for scene in group.scenes:
             if scene.phrases:

@@ -66,6 +66,7 @@ class KernelCamera(NamedTuple):
 
     rotation: Array  # (3, 3) world to camera
     translation: Array  # (3,)
+    orthographic: bool
     fx: float  # px
     fy: float
     cx: float
@@ -73,33 +74,25 @@ class KernelCamera(NamedTuple):
     width: float  # px
     height: float
     left: float  # limits of |x/z| and |y/z| in the Jacobian, on each side of the axis
-    right: float
     top: float
+    right: float
     bottom: float
     near: float
     far: float
     dilation: float
     fitted: float  # part of the dilation, see `protocol.Dilation`
     alpha_min: float
-    orthographic: bool
 
 
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
     """Return camera and settings as kernels take them."""
-    limits = dict(zip(("left", "top", "right", "bottom"), tangent_limits(camera, settings), strict=True))
-    added, fitted = dilation(camera, settings)
-    plane = {name: float(value) for name, value in vars(camera.intrinsics).items()}
+    plane = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+    formed = settings.near, far_plane(settings), *dilation(camera, settings), settings.alpha_min
     return KernelCamera(
-        rotation=np.ascontiguousarray(camera.rotation),
-        translation=np.ascontiguousarray(camera.world_to_camera[:3, 3]),
-        **plane,
-        **{side: float(limit) for side, limit in limits.items()},
-        near=float(settings.near),
-        far=float(far_plane(settings)),
-        dilation=float(added),
-        fitted=float(fitted),
-        alpha_min=float(settings.alpha_min),
-        orthographic=camera.orthographic,
+        np.ascontiguousarray(camera.rotation),
+        np.ascontiguousarray(camera.world_to_camera[:3, 3]),
+        camera.orthographic,
+        *map(float, (*plane, *tangent_limits(camera, settings), *formed)),
     )
 
 

@@ -417,7 +417,7 @@ def index_verdicts(engine: QueryEngine, phrases: list[str], folder: Path) -> Ite
     group = read_library(folder / "index", folder).groups[0]
     (scene,) = group.scenes
     for phrase in phrases:
-        (fits,), (common,) = fits_in(group, engine.text_vectors([phrase])[0])
+        (fits,), (common,) = fits_in(group, engine.texts.of([phrase])[0])
         scaling = scaling_of(scene.calibration, named(phrase), phrase)
         yield fits, judge(triple(fits), named(phrase), "auto", scene.bars, scaling, float(common))
 
@@ -426,7 +426,7 @@ def index_verdicts(engine: QueryEngine, phrases: list[str], folder: Path) -> Ite
 def test_index_answers_200_phrases_as_the_engine_does(tmp_path):
     scene = load_scene(DEMO)
     engine = QueryEngine(scene.take(np.arange(0, len(scene.gaussians), EVERY)), load_text_encoder)
-    known, _ = engine.known_vectors((*bundled_vocabulary("things"), *bundled_vocabulary("parts")))
+    known, _ = engine.texts.of_known((*bundled_vocabulary("things"), *bundled_vocabulary("parts")))
     phrases = list(known[:: len(known) // 200][:200])
     assert len(phrases) == 200
     expected = engine.run_many(phrases)
