@@ -260,10 +260,17 @@ class Viewer:
 
     def searchable(self) -> QueryEngine | None:
         """Return the engine of a scene that can be searched; where there is none say why."""
-        reason = self.state.why_no_field if self.state.open else "open a scene first, then search it"
-        if reason:
-            self.say_error(reason)
+        if self.state.open is None:
+            self.say_no_scene("search it")
+        elif self.state.why_no_field:
+            self.say_error(self.state.why_no_field)
         return self.engine if self.state.has_field else None
+
+    def say_no_scene(self, then: str) -> None:
+        """Say that a scene must be open before what is to be done `then`."""
+        opening = self.state.opening
+        first = "open a scene first" if opening is None else f"{opening.name} is being opened: wait for it"
+        self.say_error(f"{first}, then {then}")
 
     @property
     def language(self) -> LanguageField | None:
@@ -338,7 +345,7 @@ def needs_scene(then: str = "") -> Callable[[SceneAction[P, T]], Callable[Concat
             if seen is not None:
                 return act(viewer, seen, *arguments, **options)
             if then:
-                viewer.say_error(f"open a scene first, then {then}")
+                viewer.say_no_scene(then)
             return None
 
         return do

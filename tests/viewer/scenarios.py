@@ -603,10 +603,13 @@ def large_letters(s: Any) -> None:
     s.settle()
     assert imgui.internal.find_window_by_name("Messages").dock_id == docked
     assert abs(s.state.size[0] - narrow) < 0.15 * narrow
-    settings.prefer(s.viewer, ui_scale=1.5, panels=("Display",))
+    settings.prefer(s.viewer, panels=("Display",))
     s.search("mug or plant", stay=True)
     card, legend = map(imgui.internal.find_window_by_name, ("Search", "legend"))
-    assert legend.active
+    for scale, fits in ((2.0, False), (1.5, True)):  # beside the search
+        settings.prefer(s.viewer, ui_scale=scale)
+        s.settle()
+        assert legend.active == fits
     assert card.pos.x + card.size.x <= legend.pos.x
     settings.toggle_wipe(s.viewer)  # depth is right of the line, heat left of it: a legend in each
     s.settle()

@@ -346,17 +346,13 @@ def test_a_bookmark_leads_back_and_is_undone(opened):
     assert names(opened) == []
 
 
-def view_with_up(up) -> controls.OrbitCamera:
-    inner = controls.symmetric_intrinsics()
-    return controls.OrbitCamera(np.eye(3), np.array([1.0, 2, 3]), 4.0, np.array(up, float), inner)
-
-
 SIDES = ("front", "back", "left", "right", "top", "bottom")
 
 
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0), (0.6, -0.8, 0)])
 def test_the_six_sides(up):
-    view = view_with_up(up)
+    inner = controls.symmetric_intrinsics()
+    view = controls.OrbitCamera(np.eye(3), np.array([1.0, 2, 3]), 4.0, np.array(up, float), inner)
     seen = {side: controls.from_side(view, side) for side in SIDES}
     for side in seen.values():
         assert_allclose(side.rotation @ side.rotation.T, np.eye(3), atol=1e-12)

@@ -59,6 +59,8 @@ def test_cancelled_opening_shows_nothing(viewer):
 
     viewer.services = replace(viewer.services, load_scene=slow)
     opening.open_scene(viewer, Path("blobs.ply"))
+    queries.focus_search(viewer)
+    assert errors(viewer) == ["blobs.ply is being opened: wait for it, then search it"]
     opening.cancel(viewer)
     assert viewer.worker.current is None
     assert viewer.state.opening is None

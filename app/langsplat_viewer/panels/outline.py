@@ -165,6 +165,8 @@ def draw_legend(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
     if not seen:
         return
     place = beside_search(parts_of(area, state.session.split)[0], free, 2 * len(seen))
+    if place is None:
+        return
     with legend("legend" if place is free else "left legend", place):  # together with what is there
         for name, colour in seen.items():
             _swatch(colour, imgui.get_text_line_height())

@@ -358,7 +358,7 @@ def draw_legends(viewer: Viewer, area: ui.Area, free: ui.Area) -> None:
         if not side.state.nothing and (side, drawing, name) not in images[place + 1 :]:  # nothing twice
             bars += _bars(side, drawing, name)
         at, is_last = beside_search(part, free, 3 * len(bars)), place + 1 == len(images)
-        if bars and (is_last or at is part):
+        if bars and at is not None and (is_last or at is part):
             ems = min(BAR_EM, max(at.width / hello_imgui.em_size(1) - AROUND_EM, LEAST_EM))
             with legend("legend" if is_last else "left legend", at):
                 for bar in bars:
@@ -372,11 +372,12 @@ def _not_here(side: Viewer, phrase: str) -> str:
     return f"'{phrase}': {result.said}" if result is not None and result.verdict == "not here" else ""
 
 
-def beside_search(part: ui.Area, free: ui.Area, rows: int) -> ui.Area:
-    """Return where an image's legend of so many rows can be: all of it, or what the search leaves."""
+def beside_search(part: ui.Area, free: ui.Area, rows: int) -> ui.Area | None:
+    """Return where an image's legend of so many rows can be: all of it, beside the search, or nowhere."""
     em = hello_imgui.em_size(1)
     is_free = part.left >= free.left or below_search(part).height > (AROUND_EM + rows) * em
-    return part if is_free and part.width > (LEAST_EM + AROUND_EM) * em else free
+    places = (part, free) if is_free else (free,)
+    return next((place for place in places if place.width > (LEAST_EM + AROUND_EM) * em - 1), None)
 
 
 def _bars(viewer: Viewer, drawing: Drawing, of: str) -> list[Callable[[float], None]]:
