@@ -406,10 +406,20 @@ def use_the_mouse_alone(s: Any) -> None:
     s.rest(4)
     assert imgui.internal.find_window_by_name("toasts").pos.x >= 0
     written.set()
+    read_a_narrow_panel(s)
     s.open_panel("Timeline")
     assert s.ctx.item_info("//Timeline/Loop").rect_full.max.x < scene_area().corners[1].x
     glfw.set_window_size(glfw_window_hello_imgui(), 1040, 620)
     s.until(lambda: s.state.size[0] == wide)
+
+
+def read_a_narrow_panel(s: Any) -> None:
+    """Its rows are below its header, into which no button fits."""
+    settings.prefer(s.viewer, ui_scale=1.5)
+    s.open_panel("Selection", frames=4)
+    header, below = (s.ctx.item_info(f"//**/{name}").rect_full for name in ("Selection", "No tool"))
+    assert header.max.y <= below.min.y
+    settings.prefer(s.viewer, ui_scale=1.0)
 
 
 def compare_two_scenes(s: Any) -> None:

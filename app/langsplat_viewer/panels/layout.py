@@ -151,11 +151,12 @@ def draw_inspector(viewer: Viewer) -> None:
                 window = imgui.internal.get_current_window()
                 imgui.internal.set_focus_id(imgui.get_item_id(), window)  # Tab goes on from it
             left = right - ui.button_width(TAKE_OUT)
-            imgui.same_line(left)
-            if left > ui.width_of(f"mmm {panel.title}") and imgui.small_button(f"{TAKE_OUT}##{panel.title}"):
-                settings.prefer(viewer, undocked=(*kept, panel.title))
-                settings.open_panel(viewer, panel.title)
-            ui.tip("As a panel of its own, whose title drags it anywhere; its cross puts it back here")
+            if left > ui.width_of(f"mmm {panel.title}"):
+                imgui.same_line(left)
+                if imgui.small_button(f"{TAKE_OUT}##{panel.title}"):
+                    settings.prefer(viewer, undocked=(*kept, panel.title))
+                    settings.open_panel(viewer, panel.title)
+                ui.tip("As a panel of its own, whose title drags it anywhere; its cross puts it back here")
         if is_open != was_open:
             settings.turn_panel(viewer, panel.title, is_open=not was_open)
         if was_open:

@@ -7,7 +7,7 @@ import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import __version__
-from langsplat_viewer.actions import editing, opening, settings
+from langsplat_viewer.actions import editing, opening, saving, settings
 from langsplat_viewer.commands import BY_MENU, COMMANDS, EXPORT_MENU, HELD, Command, matching, with_key
 from langsplat_viewer.panels import theme, ui
 from langsplat_viewer.viewer import Viewer
@@ -15,22 +15,16 @@ from langsplat_viewer.viewer import Viewer
 
 def draw_menus(viewer: Viewer, draw_titles: Callable[[Viewer], None]) -> None:
     """Draw the menus, for hello_imgui; `draw_titles` draws those of the panels."""
-    for menu, (first, *others) in BY_MENU.items():
+    for menu, commands in BY_MENU.items():
         if imgui.begin_menu(menu):
-            _items(viewer, [first])
-            if menu == "File":
-                _recent(viewer)
-            _items(viewer, others[:-1])
-            if menu == "File" and imgui.begin_menu("Export", viewer.state.open is not None):
-                _items(viewer, EXPORT_MENU)
-                imgui.end_menu()
-            _items(viewer, others[-1:])
+            _items(viewer, commands)
             if menu == "Window":
                 draw_titles(viewer)
             imgui.end_menu()
 
 
 def _items(viewer: Viewer, commands: Sequence[Command]) -> None:
+    submenus = {opening.ask_for_file: _recent, saving.save_path: _exports}  # by the row above them
     for command in commands:
         if command.apart:
             imgui.separator()
@@ -38,6 +32,14 @@ def _items(viewer: Viewer, commands: Sequence[Command]) -> None:
         title = does[0].upper() + does[1:]
         if imgui.menu_item(title, ", ".join(command.keys[:1]), command.is_on(viewer))[0]:
             command.act(viewer)
+        if command.act in submenus:
+            submenus[command.act](viewer)
+
+
+def _exports(viewer: Viewer) -> None:
+    if imgui.begin_menu("Export", viewer.state.open is not None):
+        _items(viewer, EXPORT_MENU)
+        imgui.end_menu()
 
 
 def _recent(viewer: Viewer) -> None:
