@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import scipy
 from msgspec import Meta, Struct
 from PIL import Image
 
@@ -219,9 +220,8 @@ def write_sog(path: Path | str, scene: Scene) -> None:
 
     Positions are rounded to 1/65535 of the scene's extent in sign(x) log(1 + |x|), quaternions and opacities
     to 1/255; scales, colours and higher coefficients to the nearest of 256 values each, fitted to the scene.
-    With more than 65536 Gaussians several share the higher coefficients of a palette entry. A row that cannot
-    be drawn is written with opacity 0. Raises InputError if the steps of positions are larger than most
-    Gaussians.
+    With more than 65536 Gaussians several share a palette entry of higher coefficients. A row that cannot be
+    drawn gets opacity 0. Raises InputError if the steps of positions are larger than most Gaussians.
     """
     gaussians = scene.gaussians
     valid, count = gaussians.valid(), len(gaussians)
@@ -283,7 +283,7 @@ def write_sog(path: Path | str, scene: Scene) -> None:
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, pixels in images.items():
             encoded = io.BytesIO()
-            Image.fromarray(pixels).save(encoded, "WEBP", lossless=True, exact=True, quality=100)
+            Image.fromarray(pixels).save(encoded, "WEBP", lossless=True, exact=True, quality=100, method=2)
             archive.writestr(zipfile.ZipInfo(name), encoded.getvalue())
         archive.writestr(zipfile.ZipInfo(META_NAME), json.dumps(meta))
 
@@ -311,17 +311,18 @@ def _palette(values: Array, counts: Array) -> tuple[Array, Array]:
     the axis of largest variance.
     """
     rows = values[counts]
-    own = np.zeros(len(rows), np.int64)
+    squares, own = rows**2, np.zeros(len(rows), np.int64)
 
     def means(of: Array) -> Array:
-        return np.stack([np.bincount(own, column) for column in of.T], 1) / np.bincount(own)[:, None]
+        groups = scipy.sparse.csr_array((np.ones(len(own)), own, np.arange(len(own) + 1))).T
+        return np.asarray(groups @ of) / np.bincount(own)[:, None]
 
     if len(rows) <= 1 << HALVINGS:
         own = np.arange(len(rows))
     else:
         for _ in range(HALVINGS):
             centres = means(rows)
-            axis = (means(rows**2) - centres**2).argmax(1)[own]
+            axis = (means(squares) - centres**2).argmax(1)[own]
             above = rows[np.arange(len(rows)), axis] > centres[own, axis]
             own = np.unique(2 * own + above, return_inverse=True)[1]
     entry = np.zeros(len(values), np.int64)
