@@ -58,10 +58,11 @@ everything is float32, with `means` (N, 3) in place of positions and corners, no
 import hashlib
 import json
 import math
+import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -360,6 +361,7 @@ def write_words(path: Path | str, words: Words) -> None:
 
 def read_words(path: Path | str) -> Words:
     """Return the taught words in a file of `write_words`. Raises as `read_stored` does."""
+    expect(path, str | os.PathLike, "name a file that write_words wrote")
     path = Path(path)
     with _faults(path):
         tensors, about = _read(path, WORDS)
@@ -406,8 +408,8 @@ def rematch_language(sidecar: Path | str, new_means: Array) -> LanguageField:
     added or moved far get no feature, which is confidence 0 and zero latents.
     """
     stored = read_stored(Path(sidecar))
-    field, old_rows = stored.field, np.flatnonzero(np.isfinite(stored.means).all(1))
-    match = np.full(len(new_means), -1)  # -1: the padded row
+    old_rows = np.flatnonzero(np.isfinite(stored.means).all(1))
+    match = np.full(len(new_means), -1)
     if len(old_rows):
         points = scipy.spatial.cKDTree(stored.means[old_rows])
         spacing = points.query(points.data[:: max(1, len(old_rows) // 10_000)], k=2)[0][:, 1]
@@ -416,11 +418,7 @@ def rematch_language(sidecar: Path | str, new_means: Array) -> LanguageField:
         distance, nearest = points.query(new_means[new_rows])
         found = distance <= np.median(spacing) + stored.precision
         match[new_rows[found]] = old_rows[nearest[found]]
-    if (tree := field.tree) is not None:
-        tree = replace(tree, leaves=np.pad(tree.leaves, (0, 1), constant_values=NO_NODE))
-    latents = np.pad(field.latents, ((0, 0), (0, 1), (0, 0)))
-    confidence = np.pad(field.confidence, ((0, 0), (0, 1)))
-    return replace(field, latents=latents, confidence=confidence, tree=tree).take(match)
+    return stored.field.matched(match)
 
 
 # ---- positions in 8 bytes: 21 bits per axis, between the corners of their box ----

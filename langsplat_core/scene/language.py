@@ -333,3 +333,11 @@ class LanguageField:
             confidence=self.confidence[:, rows],
             tree=None if self.tree is None else replace(self.tree, leaves=self.tree.leaves[rows]),
         )
+
+    def matched(self, rows: Array) -> "LanguageField":
+        """Return the field of the Gaussians at (M,) `rows`; where a row is -1, without features."""
+        if (tree := self.tree) is not None:
+            tree = replace(tree, leaves=np.pad(tree.leaves, (0, 1), constant_values=NO_NODE))
+        latents = np.pad(self.latents, ((0, 0), (0, 1), (0, 0)))
+        confidence = np.pad(self.confidence, ((0, 0), (0, 1)))
+        return replace(self, latents=latents, confidence=confidence, tree=tree).take(rows)

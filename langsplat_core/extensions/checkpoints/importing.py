@@ -326,11 +326,8 @@ def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[i
 
 def _numbered(path: Path) -> int | None:
     """Return the number at the end of a file's name, or of its folder's name; None without one."""
-    for name in (path.stem, path.resolve().parent.name):
-        found = _NUMBER.search(name)
-        if found:
-            return int(found[1])
-    return None
+    found = _NUMBER.search(path.stem) or _NUMBER.search(path.resolve().parent.name)
+    return int(found[1]) if found else None
 
 
 def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:

@@ -19,9 +19,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, optional_imports, quoted
 from langsplat_core.io.hostile import open_for_reading, opened_archive
 
-# Of a pickle; a tensor takes five. They may be nested, and Python's hash of a key recurses on the machine's
-# stack, which ends at 100 000.
-MOST_TUPLES = 10_000
+DEEPEST = 1_000  # tuples in one another: Python's hash of a key recurses on the machine's stack
 _ARCHIVE = b"PK\x03\x04"  # by which torch recognises an archive
 _PICKLES = 5  # at the start of a file that is no archive: magic number, version, system, content, storages
 _STORAGES = ("Bool", "Byte", "Char", "Short", "Int", "Long", "Half", "BFloat16", "Float", "Double")
@@ -98,17 +96,26 @@ def _look_through(path: Path) -> bool:
 
 
 def _check_pickle(stream: IO[bytes]) -> None:
-    """Raise FormatError for a name that is not in `_NAMED`, and for more than `MOST_TUPLES` tuples."""
-    tuples = 0
+    """Raise FormatError for a name that is not in `_NAMED`, and for tuples nested deeper than `DEEPEST`."""
+    stack, memo = list[int](), dict[Any, int]()  # of each object at most how deep its tuples are; -1: a mark
     for opcode, argument, _ in pickletools.genops(stream):
         if opcode.name == "GLOBAL" and (name := str(argument).replace(" ", ".", 1)) not in _NAMED:
             raise FormatError(
                 f"needs {quoted(name)}; only tensors, arrays and numbers are read, as all else could run "
                 "code of whoever made the file; save it again as plain tensors"
             )
-        tuples += opcode.name.startswith("TUPLE")
-        if tuples > MOST_TUPLES:
-            raise FormatError(f"damaged: more than {MOST_TUPLES} tuples")
+        depth = 0
+        for part in reversed(opcode.stack_before):
+            while part is pickletools.stackslice and stack[-1] >= 0:
+                depth = max(depth, stack.pop())
+            if part is not pickletools.stackslice:
+                depth = max(depth, stack.pop())
+        depth = memo[argument] if "GET" in opcode.name else depth + opcode.name.startswith("TUPLE")
+        stack += [-1 if opcode.name == "MARK" else depth] * len(opcode.stack_after)
+        if "PUT" in opcode.name or opcode.name == "MEMOIZE":
+            memo[len(memo) if argument is None else argument] = stack[-1]
+        if depth > DEEPEST:
+            raise FormatError(f"tuples nested deeper than {DEEPEST}, as no training writes; copy it again")
 
 
 def plain_array(value: Any, path: Path) -> Array | None:

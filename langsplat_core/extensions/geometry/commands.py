@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, Needs, OutFile, OutFolder
 from langsplat_core.cli.query import Unit, found_answer
-from langsplat_core.config import Count, LevelChoice, Positive
+from langsplat_core.config import Coordinate, Count, LevelChoice, Positive
 from langsplat_core.errors import EncoderError, InputError, malformed, optional_imports, printable_line
 from langsplat_core.extensions.geometry import occupancy
 from langsplat_core.extensions.geometry.mesh import check_suffix, close_holes, fuse, write_mesh
-from langsplat_core.extensions.geometry.registration import NEAR, TRUSTED, Registration, merge, once, register
+from langsplat_core.extensions.geometry.registration import TRUSTED, Registration, merge, once, register
 from langsplat_core.io.files import atomic_path, write_json, write_whole
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
@@ -160,7 +160,7 @@ class Merge:
             said = f"registered, {100 * found.agreement:.0f} % of the surfaces agree"
         scene = merge(first, second)
         if not self.keep_both:
-            scene, things = once(scene, len(first.gaussians), NEAR * first.bounds()[1])
+            scene, things = once(scene, first)
             said += f"; {things} things that both show are kept once (--keep-both: twice)" if things else ""
         save_scene(self.out, replace(scene, path=self.out))
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {len(scene.cameras)} cameras; {said}")
@@ -221,7 +221,7 @@ class Map:
     """Least distance of its centre from obstacles, metres."""
     step: Positive = 0.12
     """Metres below which nothing is an obstacle; above the floor's roughness."""
-    start: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="X Y"), Needs("goal")] = None
+    start: Annotated[tuple[Coordinate, Coordinate] | None, tyro.conf.arg(metavar="X Y"), Needs("goal")] = None
     """Position of the robot, metres on the map; by default anywhere in the largest connected free region."""
     metres_per_unit: Positive | None = None
     """In place of the scene's own."""

@@ -30,8 +30,8 @@ MOST_LOOKS = 20_000  # positions, at most, that are tested for a free line to an
 MOST_PAIRS = 4_000_000  # distances, at most, between positions and cells of an instance
 STAGE = "measuring what is free"
 # Of the floor.
-SAMPLES = 30_000  # points of the surface
-NEAR = 0.02  # largest distance of a plane's points, as a share of the scene's radius
+FLOOR_POINTS = 30_000  # of the surface
+IN_PLANE = 0.02  # largest distance of a plane's points, as a share of the scene's radius
 LEAST = 0.02  # least share of the surface in a plane of a room
 MOST = 8  # planes that are tried
 LEVEL = 0.9  # least cosine of a floor's normals with up
@@ -54,8 +54,8 @@ def find_room(scene: Scene) -> Room:
     """
     import open3d
 
-    points, normals = sample_surface(scene.gaussians, SAMPLES)
-    up, near, least = scene.up(), NEAR * scene.bounds()[1], max(LEAST * len(points), 3)
+    points, normals = sample_surface(scene.gaussians, FLOOR_POINTS)
+    up, near, least = scene.up(), IN_PLANE * scene.bounds()[1], max(LEAST * len(points), 3)
     left = points[np.abs(normals @ up) >= LEVEL]
     open3d.utility.random.seed(0)
     for _ in range(MOST):

@@ -6,7 +6,7 @@ transform.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -23,8 +23,11 @@ from langsplat_core.scene.language import NO_NODE
 from langsplat_core.scene.surface import surface_areas, surface_weights
 from langsplat_core.scene.transform import Similarity, place_scene, rotating, similarity
 
+if TYPE_CHECKING:
+    import open3d
+
 FEWEST = 100  # least opaque Gaussians of a scene with a surface
-SAMPLES = 40_000  # points of each surface
+MATCHED_POINTS = 40_000  # of each surface
 ROUGH, FINE = 0.06, 0.03  # spacing of points for features and for ICP, as shares of the fixed scene's radius
 TRIES = 50_000  # of RANSAC
 AGAIN = 2  # starts of RANSAC
@@ -33,7 +36,7 @@ VIEWS, SIDE = 8, 120  # cameras of each scene for verification, and pixels of th
 ALIKE = 0.05  # largest distance of equal surfaces, as a share of the depth
 TRUSTED = 0.7  # least share of equal depths, of pixels that both scenes fill, for scenes of one place
 OVERLAP = 0.2  # least share of an image that both scenes fill, for a camera to count
-NEAR = 0.02  # largest distance of surfaces of one instance, as a share of the first scene's radius
+SAME_SPOT = 0.02  # largest distance of surfaces of one instance, as a share of the first scene's radius
 SAME = 0.4  # least share of the surfaces of two equal instances that are near each other
 
 STAGE = "registering"
@@ -60,7 +63,7 @@ def sample_surface(gaussians: Gaussians, count: int) -> tuple[Array, Array]:
     return points, unit(axes[np.arange(count), :, shortest])
 
 
-def cloud(points: Array, normals: Array | None = None) -> Any:
+def cloud(points: Array, normals: Array | None = None) -> "open3d.geometry.PointCloud":
     """Return (P, 3) points, with (P, 3) normals if given, as a point cloud of Open3D."""
     import open3d
 
@@ -98,7 +101,7 @@ def register(moving: Scene, fixed: Scene, scaled: bool = False, progress: Progre
     centre, radius = fixed.bounds()
     # Rooms look similar after quarter turns.
     turns = [rotating(fixed.up(), -90.0 * quarter).about(centre).matrix for quarter in range(4)]
-    mine, theirs = (sample_surface(scene.gaussians, SAMPLES)[0] for scene in (moving, fixed))
+    mine, theirs = (sample_surface(scene.gaussians, MATCHED_POINTS)[0] for scene in (moving, fixed))
     best: Registration | None = None
     sizes = [ratio * factor for factor in SIZES] if scaled else [ratio] * AGAIN
     for start, size in enumerate(sizes):
@@ -220,13 +223,14 @@ def merge(first: Scene, second: Scene) -> Scene:
     )
 
 
-def once(both: Scene, count: int, near: float) -> tuple[Scene, int]:
+def once(both: Scene, first: Scene) -> tuple[Scene, int]:
     """Return a merged scene with instances of both scenes kept once, and the number of those with votes.
 
-    count: Gaussians of the first scene, which come first. Two wholes are equal if `SAME` of the surface of
-    each is at most `near` units from the other. The one that more photographs show is kept, else that of more
-    Gaussians; Gaussians of the other one farther than `near` from it become a part of it.
+    first: whose Gaussians come first. Two wholes are equal if `SAME` of the surface of each is within
+    `SAME_SPOT` of the other. The one that more photographs show is kept, else that of more Gaussians;
+    Gaussians of the other one farther from it become a part of it.
     """
+    count, near = len(first.gaussians), SAME_SPOT * first.bounds()[1]
     tree = None if both.language is None else both.language.tree
     if both.language is None or tree is None:
         return both, 0
@@ -256,11 +260,11 @@ def once(both: Scene, count: int, near: float) -> tuple[Scene, int]:
 
 
 def _language(first: Scene, second: Scene) -> LanguageField | None:
-    known = first.language if first.language is not None else second.language
-    if known is None:
-        return None
-    a = _empty(known, len(first.gaussians)) if first.language is None else first.language
-    b = _empty(known, len(second.gaussians)) if second.language is None else second.language
+    a, b, count, more = first.language, second.language, len(first.gaussians), len(second.gaussians)
+    if b is None:
+        return None if a is None else a.matched(np.pad(np.arange(count), (0, more), constant_values=-1))
+    if a is None:
+        return b.matched(np.pad(np.arange(more), (count, 0), constant_values=-1))
     if a.encoder_id != b.encoder_id or a.codec.vector_dim != b.codec.vector_dim:
         raise InputError(
             f"their language fields are of two text encoders, {a.encoder_id} and {b.encoder_id}, and no "
@@ -277,19 +281,6 @@ def _language(first: Scene, second: Scene) -> LanguageField | None:
         tree=None if a.tree is None or b.tree is None else _one_tree(a.tree, b.tree),
         everyday=a.everyday if a.everyday is not None else b.everyday,
         taught=a.taught + tuple(word for word in b.taught if word.key not in words),
-    )
-
-
-def _empty(field: LanguageField, count: int) -> LanguageField:
-    """Return a field of `count` Gaussians without features, otherwise like `field`."""
-    nothing = np.zeros(0, np.int32)
-    empty = Tree(np.full(count, NO_NODE, np.int32), nothing, nothing.astype(np.uint8),
-                 np.zeros((0, 2), np.uint16))  # fmt: skip
-    return replace(
-        field,
-        latents=np.zeros((3, count, field.latents.shape[2]), field.latents.dtype),
-        confidence=np.zeros((3, count), np.float32),
-        tree=None if field.tree is None else empty,
     )
 
 

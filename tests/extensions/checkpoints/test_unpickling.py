@@ -172,6 +172,7 @@ def harmless_files() -> dict[str, bytes]:
         "untouched": saved(model()),
         "untouched, old": saved(model(), **OLD),
         **{name: saved(model(extent=crafted)) for name, crafted in NUMBERS.items()},
+        "many tensors": saved(model(extent=[*torch.zeros(4_000, 1)])),
         "numpy 1": numpy_1(saved(model(extent=np.float64(4.25)))),
         "a view of one number": saved(model(means=rebuilt(stride=(0, 0)))),
     }

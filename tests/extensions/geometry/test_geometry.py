@@ -314,7 +314,7 @@ def test_merge_keeps_what_both_scenes_show_once(tmp_path, capsys):
     sizes = np.bincount(engine.scene.language.tree.at(2), minlength=6).tolist()
     # the first's mug is part of the second's where it has what that has not
     assert sizes == [0, PER_BLOB, PER_BLOB, PER_BLOB, 0, PER_BLOB / 2]
-    assert once(merge(first, Scene(random_gaussians(0))), len(first.gaussians), 0.1)[1] == 0
+    assert once(merge(first, Scene(random_gaussians(0))), first)[1] == 0
 
 
 def test_merge_refuses_scenes_of_two_encoders_or_far_apart():
