@@ -64,20 +64,21 @@ def named_values(settings: object, option: str = "--") -> Iterator[tuple[str, An
 
 
 def annotations(hint: Any) -> Iterator[Any]:
-    """Yield what `Annotated` says beside types, inside of unions and tuples too, and the plain types."""
+    """Yield what `Annotated` says beside types, in unions and tuples too, plain types and literal words."""
     if get_origin(hint) is Annotated:
         yield from hint.__metadata__
-        yield from annotations(hint.__origin__)
-    elif get_origin(hint) is not Literal:
-        for part in get_args(hint):
-            yield from annotations(part)
-        if isinstance(hint, type) and not get_args(hint):
-            yield hint
+        hint = hint.__origin__
+    for part in get_args(hint):
+        yield from annotations(part)
+    if not get_args(hint):
+        yield hint
 
 
 def _problem(value: Any, hint: Any) -> str | None:
     """Fault of the value of a field of this type; None where there is none."""
-    bound, numbers, whole = range_of(hint), list(_flat(value)), float not in annotations(hint)
+    said = list(annotations(hint))
+    bound, whole = range_of(hint), float not in said
+    numbers = [one for one in _flat(value) if one not in said]
     if bound is None:
         return None
     if bound.some and not numbers:
@@ -89,7 +90,7 @@ def _problem(value: Any, hint: Any) -> str | None:
 
 
 def _flat(value: Any) -> Iterator[Any]:
-    """Return the values in tuples and lists of them, without absent ones and words for numbers."""
+    """Return the values in tuples and lists of them, without absent ones."""
     if isinstance(value, tuple | list):
         for part in value:
             yield from _flat(part)
@@ -118,6 +119,8 @@ Rate = Annotated[float, Range(0.0, 10.0, above=True)]  # a learning rate
 NotNegative = Annotated[float, Range(0.0, 1e9)]
 Decibels = Annotated[float, Range(0.0, 200.0)]
 Positive = Annotated[float, Range(0.0, 1e9, above=True)]
+Coordinate = Annotated[float, Range(-1e12, 1e12)]
+Degrees = Annotated[float, Range(-360.0, 360.0)]
 Device = Literal["auto", "cpu", "cuda"]
 
 

@@ -16,7 +16,7 @@ from langsplat_core.cli.arguments import EncoderOption, JsonOption, Needs, Train
 from langsplat_core.cli.query import Unit, basis_fields, camera_of, in_world
 from langsplat_core.cli.run import aligned, print_json
 from langsplat_core.config import CountOrZero, Level, PictureConfig
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, shortened
 from langsplat_core.io import sidecar as files
 from langsplat_core.io.files import check_output_file, locked
 from langsplat_core.io.scenes import check_writable, companion_path
@@ -75,10 +75,9 @@ class Describe:
             _print_inventory(found, scene.origin)
         print(f"answers: {engine.basis.long}")
         if left_out:
-            names = ", ".join(left_out[:3]) + (" ..." if len(left_out) > 3 else "")
             print(
                 f"{asked} phrases were compared; {len(left_out)} were left out, because the encoder was "
-                f"never taught their words ({names})"
+                f"never taught their words ({shortened(left_out, 3)})"
             )
 
 

@@ -11,7 +11,7 @@ import tyro
 
 from langsplat_core import registry
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, WrittenScene
-from langsplat_core.config import CodecConfig, Level, Positive, Range
+from langsplat_core.config import CodecConfig, Coordinate, Degrees, Level, Positive
 from langsplat_core.errors import InputError
 from langsplat_core.io import scenes
 from langsplat_core.io.files import check_output_file, check_output_folder, write_whole
@@ -177,12 +177,11 @@ class Convert:
 
 # Scenes edited by numbers; what belongs to them goes along.
 
-Coordinate = Annotated[float, Range(-1e12, 1e12)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Four = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 Box = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-Turn = tuple[Literal["x", "y", "z"], float]
+Turn = tuple[Literal["x", "y", "z"], Degrees]
 
 
 @dataclass(frozen=True)

@@ -319,8 +319,7 @@ class _Explainer:
             found = find_evidence(engine, answer, phrases, self._features, progress)
         if found is None:
             return None
-        source = engine.scene, self._features, self._photographs
-        self._sheets.append(draw_evidence(found, answer, *source))
+        self._sheets.append(draw_evidence(found, answer, engine.scene, self._features, self._photographs))
         return {
             "summary": str(found),
             "phrase": found.phrase,

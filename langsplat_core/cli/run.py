@@ -79,7 +79,7 @@ def one_line(box: str) -> str:
     words = re.sub(r"Missing value for argument 'command\.(\w+)'.*", hint, words)
     optional = r"Error parsing (\S+): no type .*?\|(.*?) could be instantiated from (\[.*?\])\. Got.*"
     words = re.sub(optional, r"\1: expected \2, got \3", words)
-    pair = r"Error parsing (\S+): .*? (\[.*?\]) into tuple type tuple\[typing\.Literal\[(.*?)\], float\]"
+    pair = r"Error parsing (\S+): .*? (\[.*?\]) into tuple type tuple\[typing\.Literal\[(.*?)\], .*?float.*\]"
     words = re.sub(pair, r"\1: expected one of \3 and a number, got \2", words)
     words = re.sub(r"invalid literal for int\(\) with base 10: ", "expected a whole number, got ", words)
     if "Perhaps you meant:" in body:

@@ -28,13 +28,11 @@ ACCEPTED = (
 def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
     """Return undistorted photographs of at most ``config.max_side`` pixels, their cameras and points.
 
-    Recognises, in this order, a nerfstudio ``transforms.json``, a COLMAP model, and plain photographs,
-    whose cameras are then found by structure from motion. A dataset with cameras but without points gets
-    ones that are triangulated from its training views. Whatever had to be computed is kept in ``work/sfm-*``
-    and not computed again for the same photographs. The world is the dataset's own, about `Capture.origin`
-    where it is far from zero; `config`, the dataset, or the places (GPS) of the photographs tell how long its
-    unit is. What had to be left out is reported once, by a warning of the logger "langsplat". Raises
-    InputError where nothing usable remains.
+    Recognises, in this order, a nerfstudio ``transforms.json``, a COLMAP model, and plain photographs, whose
+    cameras are found by structure from motion. Without points, some are triangulated from training views.
+    What is computed is kept in ``work/sfm-*`` for the same photographs. The world is the dataset's own, about
+    `Capture.origin` where it is far from zero; `config`, the dataset, or the places (GPS) of the photographs
+    tell how long its unit is. What is left out is reported once. InputError where nothing usable remains.
     """
     capture = load_photographs(path, config, work, progress)
     metres = config.metres_per_unit or capture.metres_per_unit

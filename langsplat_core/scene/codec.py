@@ -276,10 +276,8 @@ class CodebookCodec(Codec):
 
     def cosines(self, latents: Array, vectors: Array) -> Array:
         if 2 * len(latents) < len(self.vectors):
-            few: Array = self.decode(latents) @ vectors.T
-            return few.astype(np.float32)
-        every: Array = (self.vectors @ vectors.T).astype(np.float32)
-        return every[latents[:, 0]]
+            return np.asarray(self.decode(latents) @ vectors.T, np.float32)
+        return np.asarray(self.vectors @ vectors.T, np.float32)[latents[:, 0]]
 
     def check(self, latents: Array) -> None:
         if latents.max(initial=0) >= len(self.vectors):

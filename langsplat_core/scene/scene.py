@@ -1,7 +1,7 @@
 """Scenes: Gaussians with cameras, in OpenCV's frame (x right, y down, z forward), and a language field."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -292,6 +292,7 @@ class Scene:
     def __post_init__(self) -> None:
         expect(self.gaussians, Gaussians, "load_scene(path) makes a scene of a file")
         expect(self.language, LanguageField | None, "a scene's own is scene.language")
+        expect(self.cameras, Iterable, "say cameras=(camera,) for one")
         object.__setattr__(self, "cameras", tuple(self.cameras))
         for camera in self.cameras:
             expect(camera, Camera, "look_at makes one")

@@ -139,10 +139,9 @@ class OnDemand(Sequence[T]):
 def masked_crop(image: Array, mask: Array, size: int) -> Array:
     """Return one region cropped to its bounding box, black outside the mask, centred on a black square.
 
-    image: (H, W, 3) uint8; mask: (H, W) bool with at least one pixel set; size: side of the result, px.
-    Returns (size, size, 3) uint8, resized bilinearly, with antialiasing when shrinking. This is the crop of
-    the method's public code (LangSplat `preprocess.py`); an encoder must be trained with it, too. Raises
-    ValueError for an empty mask.
+    image: (H, W, 3) uint8; mask: (H, W) bool, ValueError if empty. Returns (size, size, 3) uint8, resized
+    bilinearly, with antialiasing when shrinking. This is the crop of the method's public code (LangSplat
+    `preprocess.py`); an encoder must be trained with it, too.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if rows.size == 0:

@@ -361,6 +361,7 @@ def test_words_taught_at_once_are_all_kept(described, into):
         ("inspect a.ply --jsn", "--jsn; did you mean --json?"),
         ("query a.ply mug --instances 1e3", "--instances: expected a whole number, got '1e3'"),
         ("transform a.ply b.ply --rotate q 3", "--rotate: expected one of 'x', 'y', 'z' and a number"),
+        ("transform a.ply b.ply --rotate x nan", "--rotate x nan: must be -360 to 360"),
         ("train loop --out b.ply --clip.model demo", "loop does not exist"),
         ("convert b.ply", "name what to read"),
         ("convert a.ply out --to nothing", "choose one of scene"),

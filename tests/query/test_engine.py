@@ -19,7 +19,7 @@ from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import ClipConfig, TrainConfig
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.io.sidecar import write_words
+from langsplat_core.io.sidecar import read_words, write_words
 from langsplat_core.pipeline.notebook import draw
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.query.compose import check_phrase, run_phrase
@@ -149,14 +149,16 @@ def test_answers_reach_other_processes_and_say_where_in_the_world():
 
 def test_wrong_kinds_are_named_and_arrays_are_not_printed():
     scene = blob_scene()
-    engine = QueryEngine(scene, FakeEncoder())
+    engine, demo = QueryEngine(scene, FakeEncoder()), TrainConfig(clip=ClipConfig(DEMO))
     for wrong, said in (
         (lambda: render(scene, 0), "expected a Camera, got int; scene.cameras has those of a scene"),
         (lambda: render("a.ply", scene.cameras[0]), "expected a Scene, got str; load_scene"),
         (lambda: save_scene("a.ply", scene.gaussians), "expected a Scene, got Gaussians; Scene\\(gaussians"),
         (lambda: Scene("a.ply"), "expected a Gaussians, got str; load_scene"),
         (lambda: Scene(scene.gaussians, scene.gaussians), "LanguageField.*, got Gaussians; a scene"),
+        (lambda: Scene(scene.gaussians, cameras=scene.cameras[0]), "got Camera; say cameras=\\(camera,"),
         (lambda: load_scene(3), "got int; name the file"),
+        (lambda: read_words(3), "got int; name a file that write_words"),
         (lambda: save_scene(scene, "a.ply"), "got Scene; say save_scene\\(path, scene"),
         (lambda: load_text_encoder(3), "got int; a folder, a file, a hub id"),
         (lambda: render(scene, scene.cameras[0], np.full((len(scene.gaussians), 1), np.nan)), "not finite"),
@@ -166,10 +168,7 @@ def test_wrong_kinds_are_named_and_arrays_are_not_printed():
         (lambda: run_phrase(engine, "mug left of book", viewpoint=0), "Camera.*, got int"),
         (lambda: train_scene("p", "a.ply", {}), "expected settings such as TrainConfig.*, got dict"),
         (lambda: write_words({}, "a.safetensors"), "got str; say write_words"),
-        (
-            lambda: train_scene("absent", "a.ply", TrainConfig(clip=ClipConfig(DEMO)), "w"),
-            "absent does not exist",
-        ),
+        (lambda: train_scene("absent", "a.ply", demo, "w"), "absent does not exist"),
         (lambda: train_scene("p", "a.ply", {}, until="masks"), "until 'masks': no stage .*'language"),
     ):
         with pytest.raises(InputError, match=said):

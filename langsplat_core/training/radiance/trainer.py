@@ -38,9 +38,8 @@ class Schedule:
 
     At the reference budget this is the INRIA schedule (arguments/__init__.py and train.py of the public
     code). A smaller budget shortens every interval in proportion, but not below what it needs to make sense.
-    Positions, scales and rotations then learn faster, by the square root of the missing factor: 600 steps at
-    rates meant for 30 000 leave Gaussians where they began (held-out SSIM of 12 photographs at 320 px: 0.58
-    as published, 0.73 so).
+    Positions, scales and rotations then learn faster, by the square root of the missing factor: else 600
+    steps leave Gaussians where they began (held-out SSIM of 12 photographs at 320 px: 0.58, 0.73 so).
     """
 
     steps: int  # in all
