@@ -85,10 +85,9 @@ class Capture:
     def digest(self, indices: Sequence[int]) -> str:
         """Return a digest of all that a training on the photographs at `indices` sees.
 
-        That is these in their order, their cameras, and the points. Structure from motion run again may place
-        the same photographs in another world, so names alone do not identify a capture. Poses and points
-        count to `DECIMALS`, so that a work folder also resumes on another processor, whose products of
-        matrices differ in their last digits.
+        That is these in their order, their cameras, and the points, as structure from motion run again may
+        place them in another world. Poses and points count to `DECIMALS`: on another processor their last
+        digits differ, and a work folder resumes all the same.
         """
         digest = hashlib.blake2b(digest_size=16)
         length = near_power(self.extent())

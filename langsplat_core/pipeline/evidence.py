@@ -180,15 +180,6 @@ def _alike(cameras: Sequence[Camera], trained: Sequence[Camera]) -> bool:
     return bool(turns) and bool(np.ptp(turns, 0).max() < SAME)  # one and the same for all
 
 
-def is_kept(path: Path, scene: Scene) -> bool:
-    """Return whether masks of all photographs of a scene are beside it."""
-    try:
-        kept_features(path, scene)
-    except InputError:
-        return False
-    return True
-
-
 def kept_photographs(
     path: Path,
     scene: Scene,
@@ -201,27 +192,35 @@ def kept_photographs(
     From `dataset`, or from where the report of the training says; InputError where some are not those.
     """
     from langsplat_core.datasets import load_photographs
+    from langsplat_core.datasets.photos import content, photo_folder
+    from langsplat_core.datasets.workspace import MATCHES
 
     if not scene.cameras:
         raise InputError(f"{path}: has no cameras, which photographs belong to; keep .cameras.json beside it")
     work = work or work_folder(path)
     stated = stated_figures(work / REPORT)
     place, known = dataset or stated.get("dataset"), stated.get("contents")
+    trained = known if isinstance(known, dict) else {}
     if not isinstance(place, str | Path) or not str(place) or not (dataset or exists(place)):
         where = f"not in {place}" if isinstance(place, str) and place else f"not named in {work / REPORT}"
         raise InputError(f"{path}: its photographs are {where}; name their folder with --photographs")
-    most = max(max(camera.width, camera.height) for camera in scene.cameras)
-    config = DatasetConfig(max_side=most, allow_few_cameras=True)
-    capture = load_photographs(Path(place), config, work, progress)
-    found = {camera.name: image for camera, image in zip(capture.cameras, capture.images, strict=True)}
-    if isinstance(known, dict):
+    other: list[str] = []
+    if not dataset and any(work.glob(f"sfm-*/{MATCHES}")):  # else other photographs are located first
+        here = {content(photo)[:16] for photo in photo_folder(Path(place))[1]}
+        other = [name for name, content in trained.items() if here and content not in here]
+    if not other:
+        most = max(max(camera.width, camera.height) for camera in scene.cameras)
+        config = DatasetConfig(max_side=most, allow_few_cameras=True)
+        capture = load_photographs(Path(place), config, work, progress)
         now = capture.contents().items()
-        other = shortened(name for name, content in now if known.get(name, content) != content)
-        said = f"{place}: not the files that were trained on, so that masks may be of something else: {other}"
-        if other and not dataset:  # others may be copies, of other sizes for example
+        other = [name for name, content in now if trained.get(name, content) != content]
+    if other:
+        said = "not the files that were trained on, so that masks may be of something else"
+        said = f"{place}: {said}: {shortened(other)}"
+        if not dataset:  # others may be copies, of other sizes for example
             raise InputError(f"{said}; train again, or name a folder of the earlier ones with --photographs")
-        if other:
-            report_loss("%s", said)
+        report_loss("%s", said)
+    found = {camera.name: image for camera, image in zip(capture.cameras, capture.images, strict=True)}
     photographs = {}
     for camera in scene.cameras:
         if camera.name not in found:

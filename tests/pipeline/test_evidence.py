@@ -254,6 +254,15 @@ def test_missing_masks_are_one_line(trained, capsys, spoil):
     assert not (trained / out).exists()
 
 
+def test_changed_photographs_are_refused_before_they_are_located(trained, scene):
+    (trained / "a.work" / "sfm-0").mkdir()
+    (trained / "photographs" / "transforms.json").rename(trained / "a.work" / "sfm-0" / "matches.json")
+    stated = {"dataset": str(trained / "photographs"), "contents": {"photo_3": "another"}}
+    (trained / "a.work" / "report.json").write_text(json.dumps(stated))
+    with pytest.raises(InputError, match=r"not the files that were trained on.*: photo_3;"):
+        kept_photographs(trained / "a.ply", scene)
+
+
 @pytest.mark.long
 def test_a_training_keeps_all_that_is_needed(tmp_path):
     """Also for masks of no segmenter, which agree later."""

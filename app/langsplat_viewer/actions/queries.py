@@ -3,17 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError, UnknownWordError
-from langsplat_core.pipeline.evidence import (
-    draw_evidence,
-    find_evidence,
-    is_kept,
-    kept_features,
-    kept_photographs,
-)
+from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import Progress
 from langsplat_core.query.answers import QueryResult, place_of
 from langsplat_core.query.compose import ComposedResult, run_phrase
@@ -22,7 +17,7 @@ from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.inventory import Suggestions, completions, composed_examples, corrected, suggest
 from langsplat_core.query.rule import Verdict
-from langsplat_core.scene import TaughtWord
+from langsplat_core.scene import Scene, TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.session import Query, Things, pack
@@ -78,7 +73,7 @@ def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = (), *, alike
             composed = run_phrase(engine, phrase, level, viewpoint, progress)
         except UnknownWordError as error:
             return QueryAnswer(problem=str(error), meant=corrected(phrase, error.near) or "")
-        return _answer_of(composed, members, is_kept(seen.path, engine.scene))
+        return _answer_of(composed, members, _can_explain(seen.path, engine.scene))
 
     def done(found: QueryAnswer) -> None:
         if phrase not in state.answers:  # the query was taken off meanwhile
@@ -94,6 +89,15 @@ def answer(viewer: Viewer, phrase: str, shown_with: Sequence[str] = (), *, alike
 
     state.answers[phrase] = replace(state.answers.get(phrase, QueryAnswer()), pending=True)
     viewer.run(f"searching '{phrase}'", work, done, lambda reason: done(QueryAnswer(problem=reason)))
+
+
+def _can_explain(path: Path, scene: Scene) -> bool:
+    """Return whether masks of all photographs of a scene are beside it."""
+    try:
+        kept_features(path, scene)
+    except InputError:
+        return False
+    return True
 
 
 def _answer_of(composed: ComposedResult, members: Array | None, has_evidence: bool) -> QueryAnswer:
