@@ -254,9 +254,8 @@ def test_kernels_run_on_a_full_disk(tmp_path, monkeypatch, caplog):
         double = compiled.kernel(doubled)
         with files_of_at_most(size), caplog.at_level("WARNING", "langsplat"):
             assert double(2.5) == 5
-    assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
-        "kernels are compiled for this run only, which takes some seconds"
-    ]
+    (said,) = caplog.messages
+    assert said.startswith("kernels are compiled for this run only, which takes some seconds:")
     assert not list(tmp_path.rglob("*.nbc"))
     again = compiled.kernel(doubled)
     assert not is_compiled(again)
@@ -367,14 +366,12 @@ def test_names_taken_and_misfits_are_said(monkeypatch: pytest.MonkeyPatch, caplo
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
     monkeypatch.setattr(registry, "extensions", registry.extensions.__wrapped__)
     assert [*registry.extensions()] == ["a", "b"]
+    twice = "extension a has it among its commands, too; LANGSPLAT_WITHOUT=a hides that"
     assert [line.partition(" is left out: ")[::2] for line in caplog.messages] == [
         ("extension a (two:B)", "two:A has its name"),
         ("'query' of extension a", "the core has it among its commands"),
         ("'doctor who' of extension a", "the core has it among its commands"),
-        (
-            "'hail' of extension b",
-            "extension a has it among its commands, too; LANGSPLAT_WITHOUT=a hides that",
-        ),
+        ("'hail' of extension b", twice),
     ]
     assert registry.part("exporters", "own") is own
     for kind, name in (("commands", "hail"), ("exporters", "odd")):
@@ -481,8 +478,7 @@ def test_numbers_outside_their_range_are_refused_by_name(name: str, option: str,
 def test_numbers_of_commands_have_ranges() -> None:
     for name in command_names():
         for option, hint in get_type_hints(load_command(name), include_extras=True).items():
-            numeric = any(kind in (int, float) for kind in annotations(hint))
-            assert range_of(hint) or not numeric, f"{name} {option}"
+            assert range_of(hint) or not any(k in (int, float) for k in annotations(hint)), f"{name} {option}"
 
 
 @pytest.mark.parametrize(
