@@ -304,6 +304,7 @@ class Window:
 
     def drop(self, paths: list[str]) -> None:
         opening.open_dropped(self.viewer, [Path(path) for path in paths])
+        self._last = ()  # imgui hears of no event, and what is opened takes some frames
 
     def _gui(self) -> None:
         viewer = self.viewer
@@ -340,7 +341,7 @@ class Window:
         viewer, state = self.viewer, self.viewer.state
         idling = hello_imgui.get_runner_params().fps_idling
         news = (viewer.worker.delivered, viewer.recorder.delivered)
-        seen = (state.open, state.nothing, state.hover, state.leaving, state.may_close)
+        seen = (state.open, state.nothing, state.hover, state.leaving, state.may_close, state.messages)
         now = (news, seen, self.unfinished, viewer.watch.changed)
         heard = len(imgui.get_current_context().input_events_trail) > 0  # in this frame, however slow it is
         self._frames = AWAKE_FRAMES if heard or now != self._last else max(self._frames - 1, 0)

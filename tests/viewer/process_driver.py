@@ -18,6 +18,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 from imgui_bundle import imgui, immapp
@@ -198,11 +199,14 @@ def idle(path: Path) -> None:
         before = time.process_time()
         time.sleep(MEASURE)
         print(f"frames {frames - count} share {(time.process_time() - before) / MEASURE:.4f}")
-        is_slow, count = True, frames
-        imgui.get_io().add_mouse_pos_event(400, 300)
-        glfw.post_empty_event()
-        time.sleep(MEASURE)
-        print(f"awake {frames - count}", flush=True)
+        is_slow = True
+        moves = partial(imgui.get_io().add_mouse_pos_event, 400, 300)
+        for wake in (partial(window.drop, []), partial(window.viewer.say_error, "a line"), moves):
+            count = frames
+            wake()
+            glfw.post_empty_event()
+            time.sleep(MEASURE)
+            print(f"awake {frames - count}", flush=True)
         close()
 
     params.callbacks.show_gui = counted

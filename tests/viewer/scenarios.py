@@ -232,11 +232,6 @@ def around(s: Any, centre: np.ndarray) -> tuple[tuple[float, float], tuple[float
     return (x - half, y - half), (x + half, y + half)
 
 
-def looks_selected(colour: np.ndarray) -> bool:
-    """Return whether a colour of the picture, 0 to 255, has the tint."""
-    return bool(np.abs(colour - 255 * np.array(SELECTED)).max() < 0.55 * 255 and colour[2] > colour[1] + 60)
-
-
 def select_with_the_mouse(s: Any) -> None:
     """A rectangle, keys and buttons."""
     s.key("period")  # the camera in front: no blob hides another
@@ -252,7 +247,9 @@ def select_with_the_mouse(s: Any) -> None:
     assert s.state.open.view is before  # the drag turned nothing
     assert marked(s.viewer) == ("plant", "", "")
     chosen = s.shot("chosen")
-    assert looks_selected(s.at(chosen, PLANT))
+    colour = s.at(chosen, PLANT)
+    assert np.abs(colour - 255 * np.array(SELECTED)).max() < 0.55 * 255  # it has the tint
+    assert colour[2] > colour[1] + 60
     np.testing.assert_allclose(s.at(chosen, BOOK), s.at(plain, BOOK), atol=6)
 
     s.ctx.key_down(imgui.Key.mod_shift)
@@ -414,7 +411,6 @@ def use_the_mouse_alone(s: Any) -> None:
 
 
 def read_a_narrow_panel(s: Any) -> None:
-    """Its rows are below its header, into which no button fits."""
     settings.prefer(s.viewer, ui_scale=1.5)
     s.open_panel("Selection", frames=4)
     header, below = (s.ctx.item_info(f"//**/{name}").rect_full for name in ("Selection", "No tool"))

@@ -319,7 +319,7 @@ def test_idle_window_draws_nothing(display, tmp_path, blobs):
     words = run(display, tmp_path, "idle", "--scene", blobs).split()
     assert int(words[1]) <= 2  # one in a hundred seconds, and a late one
     assert float(words[3]) < 0.01
-    assert int(words[5]) >= 3  # after an event, however slow they are: widgets take their places
+    assert min(map(int, words[5::2])) >= 3  # after news, however slow they are: widgets take their places
 
 
 @pytest.mark.long
