@@ -90,7 +90,6 @@ def _problem(value: Any, hint: Any) -> str | None:
 
 
 def _flat(value: Any) -> Iterator[Any]:
-    """Return the values in tuples and lists of them, without absent ones."""
     if isinstance(value, tuple | list):
         for part in value:
             yield from _flat(part)

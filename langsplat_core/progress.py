@@ -164,7 +164,6 @@ class TerminalProgress:
             self._bar.stop()
 
     def _complete(self) -> None:
-        """Fill the bar of the last stage, which is over where the next one begins."""
         if self._stage in self._tasks:
             task, left = self._tasks[self._stage]
             left.hear(1.0)

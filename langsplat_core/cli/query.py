@@ -227,7 +227,6 @@ class QueryScene:
         return dict(zip(phrases, zip(shares.T, counts.tolist(), strict=True), strict=True))
 
     def _view(self, scene: Scene, camera: Camera | None, count: int) -> View | None:
-        """Return the view in which the pixels of `count` phrases are found; None where none is wanted."""
         if camera is not None and (self.camera is not None or count <= CHANNELS_AT_ONCE):
             return view_of(scene, camera)
         if camera is not None:

@@ -275,7 +275,6 @@ def develop(
 
 
 def _report(told: Sequence[tuple[str, str]], masks: Sequence[Array | None]) -> None:
-    """Say what was guessed, of which photographs, and where masks are missing."""
     for what in dict(told):
         labels = [label for said, label in told if said == what]
         report_loss("%d photographs: %s (%s)", len(labels), what, shortened(labels))

@@ -375,7 +375,6 @@ def read_words(path: Path | str) -> Words:
 
 
 def _narrow(tensor: Array) -> Array:
-    """Return floats as float16 if that is exact."""
     if tensor.dtype != np.float32:
         return tensor
     with np.errstate(over="ignore"):

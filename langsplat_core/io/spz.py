@@ -323,7 +323,6 @@ def _fractional_bits(drawn: Gaussians, path: Path) -> int:
 
 
 def _positions(header: _Header, data: Array) -> Array:
-    """Return (N, 3) positions in the axes of the file."""
     if header.version == 1:
         return np.ascontiguousarray(data).view("<f2").astype(np.float32)
     # 24 bits each, padded below to int32, which multiplies them by 256

@@ -192,7 +192,6 @@ def write_reports(
 
 
 def _text(text: object, limit: int = 120) -> str:
-    """Return untrusted text as HTML."""
     return html.escape(printable_line(text, limit))
 
 

@@ -14,7 +14,7 @@ import scipy
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import LevelChoice
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import EncoderError, InputError, expect
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.sidecar import SUFFIX, Words
 from langsplat_core.progress import Progress, silent
@@ -75,8 +75,12 @@ class QueryEngine:
         neither scene nor encoder has everyday phrases. words: the user's, before the scene's; EncoderError if
         they are of another encoder.
         """
-        if isinstance(scene, str | Path) or isinstance(load_encoder, str):
-            raise InputError("no name alone; say QueryEngine(load_scene(path), load_text_encoder(name))")
+        expect(scene, Scene, "load_scene(path) returns one")
+        expect(words, Words | None, "read_words(path) returns them")
+        if isinstance(load_encoder, str):
+            raise InputError("no name alone; say QueryEngine(scene, load_text_encoder(name))")
+        if rule not in ("regions", "peak"):
+            raise InputError(f"no rule {rule!r}; choose regions or peak")
         self.scene = scene
         self.exact = exact
         self._rule: AnswerRule = rule
@@ -176,6 +180,7 @@ class QueryEngine:
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """Return the instances among the members of an answer, best first, at most `at_most`."""
+        expect(result, QueryResult, "that of run_phrase(engine, text) is its answer")
         wholes, join = self.tree.voted_wholes, result.level == len(LEVELS) - 1
         members, even, gaussians = result.members, result.even, self.scene.gaussians
         if join and self.bars is not None:  # by the rule "peak", relevancies vary and need smoothing
@@ -216,7 +221,6 @@ class QueryEngine:
 
     @cached_property
     def _kept(self) -> Calibration | None:
-        """The user's own calibration for the scene's encoder."""
         return kept_calibration(self.field.encoder_id, self.field.canonical)
 
     @cached_property

@@ -97,8 +97,9 @@ class LiftingView(View):
     def check_labels(self, maps: Array, count: int) -> None:
         """Raise ValueError for maps that `gather_labels` cannot take."""
         check_array("maps", maps, ("L", self.camera.height, self.camera.width))
-        if maps.max(initial=-1) >= count or maps.min(initial=-1) < -1:
-            raise ValueError(f"maps: labels {maps.min()} to {maps.max()}, expected -1 to {count - 1}")
+        if maps.dtype.kind not in "iu" or maps.max(initial=-1) >= count or maps.min(initial=-1) < -1:
+            said = f"{maps.dtype} labels {maps.min()} to {maps.max()}"
+            raise ValueError(f"maps: {said}, expected whole numbers from -1 to {count - 1}")
 
     @property
     def nbytes(self) -> int:

@@ -82,7 +82,8 @@ def render(
     expect(camera, Camera, "scene.cameras has those of a scene, look_at makes one")
     expect(profile, RasterSettings | None, "config.INRIA is one")
     if values is not None:
-        check_array("values", np.asarray(values), ("N", "C"), {"N": len(scene.gaussians.means)})
+        values = np.asarray(values, np.float32)
+        check_array("values", values, ("N", "C"), {"N": len(scene.gaussians.means)})
         if not np.isfinite(values).all():
             raise InputError("values: some are not finite, and would spoil all that they blend with")
     rasterizer = _cpu() if backend == "cpu" else load_rasterizer(backend)

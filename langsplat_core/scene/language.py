@@ -48,7 +48,6 @@ def tokens(text: str) -> tuple[str, ...]:
 
 
 def _composed(text: str) -> str:
-    """Return `text` in Unicode's normal form NFKC, with ASCII apostrophes."""
     return unicodedata.normalize("NFKC", text.translate(_APOSTROPHES))
 
 

@@ -176,6 +176,8 @@ class PhraseEncoder:
         the phrase. Raises InputError for a phrase without a letter or digit or with more tokens than the
         model reads, UnknownWordError for words it was not taught, EncoderError for unreadable characters.
         """
+        if isinstance(texts, str) or not all(isinstance(text, str) for text in texts):
+            raise InputError("phrases are several texts, such as encode_texts(['blue gift'])")
         for text in texts:
             self._check(text)
         said = list(texts)

@@ -226,13 +226,13 @@ def test_small_weights_are_left_out_and_rows_keep_their_place():
     assert (abs(some - kept) > 0).nnz == 0
 
 
-@pytest.mark.parametrize("label", [-2, 3])
-def test_labels_out_of_range_are_refused(label: int) -> None:
-    maps = np.zeros((1, 45, 70), np.int32)
+@pytest.mark.parametrize("label", [-2, 3, 0.5])
+def test_labels_out_of_range_are_refused(label: float) -> None:
+    maps = np.zeros((1, 45, 70), type(label))
     maps[0, 3, 3] = label
     for rasterizer in (CPU, REFERENCE):
         view = rasterizer.view(random_gaussians(3), random_camera())
-        with pytest.raises(ValueError, match="expected -1 to 2"):
+        with pytest.raises(ValueError, match="expected whole numbers from -1 to 2"):
             view.gather_labels(maps, 3)
         with pytest.raises(ValueError, match="maps: expected shape"):
             view.gather_labels(maps[:, :5], 3)
