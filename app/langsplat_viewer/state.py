@@ -226,7 +226,8 @@ class Saved:
 
     def lacks_notes(self, session: Session) -> bool:
         """Return whether no project has the names, notes, bookmarks and keyframes of `session`."""
-        return any(getattr(session, name) != getattr(self.session, name) for name in OF_PROJECT)
+        held = (self.session,) if self.project else (self.session, Session())  # nothing needs no project
+        return any(all(getattr(session, n) != getattr(one, n) for one in held) for n in OF_PROJECT)
 
 
 @dataclass(eq=False)

@@ -331,9 +331,9 @@ def test_a_path_is_saved_loaded_and_dropped(opened, tmp_path, frames):
     record_three(opened)
     path = saving.save_path(opened, tmp_path)
     assert path.name == "blobs-001.path.json"
-    assert len(read_flight(path).keyframes) == 3
-    assert not opened.state.is_changed  # a file has it
+    assert (len(read_flight(path).keyframes), opened.state.is_changed) == (3, False)  # a file has it
     viewpoint.set_path(opened, ())
+    assert not opened.state.is_changed  # nothing is lost
     opening.open_dropped(opened, [path])
     assert times(opened) == [0, 2, 4]
     assert opened.state.wanted_panel == "Record"
