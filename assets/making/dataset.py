@@ -43,7 +43,7 @@ from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.ply import write_table
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.grammar import is_part
+from langsplat_core.query.grammar import is_part, singular
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Scene, look_at
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
@@ -103,8 +103,9 @@ class Truth:
             return np.asarray(stored["ids"]).astype(np.int64)
 
     def absent(self, things: Iterable[str]) -> list[str]:
-        """Words of `things` by which, or by whose synonyms, nothing in the room may be called."""
-        return sorted(thing for thing in things if self.words.isdisjoint(object_words(thing)))
+        """Words of `things` by which or by whose synonyms, in any number, nothing there may be called."""
+        called = set(map(singular, self.words))
+        return sorted(thing for thing in things if called.isdisjoint(map(singular, object_words(thing))))
 
 
 def read_truth(dataset: Path) -> Truth:

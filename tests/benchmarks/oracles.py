@@ -41,6 +41,7 @@ import numpy as np
 
 from assets.making.dataset import Region, Truth
 from assets.making.objects import EVERYTHING
+from assets.making.world import object_words
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.checkpoints.langsplat_files import autoencoder_from
@@ -512,7 +513,7 @@ class RealSpace(TruthEncoder):
         share = len(names) // 5
         regions = truth.regions.values()
         wholes = sorted({region.thing for region in regions if region.level == "whole" and region.thing})
-        absent = truth.absent(EVERYTHING)
+        absent = sorted(word for word in EVERYTHING if truth.words.isdisjoint(object_words(word)))
         things, parts, others = names[:share], names[share : 2 * share], names[2 * share :]
         for some in (things, parts, others):
             generator.shuffle(some)

@@ -247,6 +247,7 @@ def test_words_of_a_room_take_different_real_names(space, tmp_path):
     absent = [word for word in truth.absent(EVERYTHING) if not encoder.unknown_words(word)]
     everyday = [word for word in bundled_vocabulary("nouns") if word in set(encoder.names) - set(EVERYTHING)]
     told = [*things, "handle", "lid", "leg", *absent, *(word for word in everyday if word not in PARTS)]
+    assert truth.absent({f"{things[0]}s", "shoe"}) == ["shoe"]
     assert not encoder.unknown_words(f"{things[0]} lid")
     assert encoder.unknown_words(things[0] + " hologram") == ("hologram",)
     assert len({encoder.names[word] for word in told}) == len(told) > 40
