@@ -25,7 +25,7 @@ from langsplat_core.query.basis import Basis, basis_of
 from langsplat_core.query.grammar import STOP_WORDS, named, only, thing_and_part
 from langsplat_core.query.instances import Instance, find_instances, find_wholes
 from langsplat_core.query.lookup import Lookup, Relevancy, through_cells
-from langsplat_core.query.rule import Bars, bars_of, decide, on_things, scaling_of
+from langsplat_core.query.rule import Bars, bars_of, decide, on_things, scaling_of, with_pieces
 from langsplat_core.query.texts import LoadEncoder, TextVectors
 from langsplat_core.scene import LEVELS, Calibration, LanguageField, Scene, TaughtWord, Tree
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
@@ -165,17 +165,17 @@ class QueryEngine:
     def run_inside(
         self, names: Sequence[str], members: Array, level: LevelChoice, calibration: Calibration | None
     ) -> QueryResult:
-        """Answer a part, by the mean over its `names`, among the regions of an instance, `members` (N,) bool.
+        """Answer a part, by the mean over its `names`, among regions of `members` (N,) bool and their pieces.
 
         The verdict is by the first name, among these regions. Raises as `TextVectors.of` does.
         """
-        assert self.bars is not None
         assert self.chance is not None
         asked = list(self._lookup.relevancies(self.texts.of(names)))
         relevancy = replace(asked[0], values=np.mean([one.values for one in asked], axis=0))
-        fits, on, table = list(map(self._own_fits, asked)), self.regions.mostly(members), self.regions.table
-        bars = self.bars if calibration else bars_of(table, self.chance, on)
-        decision = decide(table, fits, "inside", level, bars, scaling_of(calibration, "inside", names[0]), on)
+        fits, table = list(map(self._own_fits, asked)), self.regions.table
+        on = with_pieces(table, self.regions.mostly(members), self.touching)
+        judged = bars_of(table, self.chance, on), scaling_of(calibration, "inside", names[0]), on
+        decision = decide(table, fits, "inside", level, *judged)
         return answers.by_regions(names[0], relevancy, decision, self.scene.gaussians.means, self.regions)
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
@@ -252,12 +252,8 @@ class QueryEngine:
     @cached_property
     def touching(self) -> Array:
         """The (P, 2) pairs of wholes that may be pieces of one thing, see `touching_wholes`."""
-        return self.touching_in(SAMPLE)
-
-    def touching_in(self, sample: int) -> Array:
-        """Return what `touching` has, by the surface of about `sample` of the Gaussians."""
         gaussians = self.scene.gaussians
-        some = np.arange(0, len(gaussians), len(gaussians) // sample + 1)
+        some = np.arange(0, len(gaussians), len(gaussians) // SAMPLE + 1)
         surface = self.surface if len(some) == len(gaussians) else build_surface(gaussians.take(some))
         return answers.touching_wholes(self.regions, surface.ends, some[surface.rows])
 

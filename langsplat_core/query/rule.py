@@ -104,18 +104,18 @@ def region_relevancies(fits: Array) -> Array:
 
 
 def on_things(table: RegionTable, thing: Array, touching: Array) -> Array:
-    """Return the (R,) bool regions in which parts of a thing may be, from its (R,) own fits.
+    """Return the (R,) bool regions of wholes that fit nearly best, and of their pieces; thing: own fits."""
+    fits = region_fits(table, thing)
+    best = float(fit_of(best_relevancies(table, region_relevancies(fits))[0, -1]))
+    wholes = np.arange(len(fits)) >= table.counts[0, :-1].sum()
+    return with_pieces(table, wholes & (fits >= RULE.least_fit(best, RULE.around)), touching)
 
-    They are the wholes that fit nearly as well as the best one, those that touch one of these, and all
-    regions below them. touching: (P, 2) pairs of wholes, see `answers.touching_wholes`.
-    """
-    last = len(LEVELS) - 1
-    whole, solid = table.level(last, region_fits(table, thing)), table.level(last, table.solid)
-    best = float(whole[solid if solid.any() else slice(None)].max(initial=RULE.nothing))
-    on = np.zeros(len(thing) + 1, bool)  # the last entry is what -1, no parent, indexes
-    wholes = on[len(thing) - len(whole) : -1]
-    wholes[:] = whole >= RULE.least_fit(best, RULE.around)
-    wholes[touching[wholes[touching[:, 1]], 0]] = True
+
+def with_pieces(table: RegionTable, on: Array, touching: Array) -> Array:
+    """Return the (R,) bool regions `on`, wholes that touch these (`touching_wholes`), and all below."""
+    on = np.append(on, False)  # which -1, no parent, indexes
+    piece, thing = touching.T + table.counts[0, :-1].sum()
+    on[piece[on[thing]]] = True
     for _ in LEVELS[1:]:
         on[:-1] |= on[table.parents]
     return on[:-1]

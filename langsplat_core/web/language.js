@@ -19,6 +19,7 @@ import {
   strongest,
   verdict,
   wholeOf,
+  withPieces,
 } from "./rule.js";
 import { Space } from "./space.js";
 import { namedBy, nearest, parse, phraseKey, splitPhrases, thingAndPart, tidy } from "./words.js";
@@ -186,18 +187,16 @@ export class Language {
   }
 
   // The answer to a part of a thing, within the answer to the thing; for a thing without adjectives, also within
-  // regions that fit it nearly as well.
+  // regions that fit it nearly as well; and within pieces of all these.
   part(name, thing, other, levelName) {
     const { rule, levels } = this.meta;
     const own = thing.text && !this.taught.has(phraseKey(thing.text));
     const phrase = own ? `${thing.text} ${name}` : name;
     const asked = [this.relevancies(this.vector(phraseKey(name))), this.known(phrase)].filter(Boolean);
-    const words = own ? thing.text.toLowerCase().split(" ") : [];
-    const plain = own && words.every((word) => !this.lists.adjectives.has(word));
+    const plain = own && !thing.text.split(" ").some((word) => this.lists.adjectives.has(word.toLowerCase()));
     const least = plain ? this.reached(other, rule.around) : Infinity;
     const near = regionsAt(this.regions, other.level).filter((region) => other.regionFits[region] >= least);
-    const among = new Set([...other.inside, ...near]);
-    const on = Array.from(this.regions.sizes, (_, region) => isWithin(this.regions, region, among));
+    const on = withPieces(this.regions, [...other.inside, ...near]);
     const fits = asked.map((one) => this.ownFits(one));
     const evidence =
       other.verdict.probability === null

@@ -99,17 +99,22 @@ export function isWithin(regions, region, others) {
   return region >= 0 && (others.has(region) || isWithin(regions, regions.parents[region], others));
 }
 
-// Whether parts of a thing may be in each region: in the wholes that fit nearly as well as the best, in those that
-// touch one of these, and below them.
+// Whether parts of a thing may be in each region: on the wholes that fit nearly as well as the best, or their pieces.
 export function onThings(rule, regions, own) {
   const thing = regionFits(rule, regions, own);
   const level = regions.counts.length - 1;
   const best = bestRelevancy(rule, regions, regionRelevancies(rule, thing), level);
   const least = leastFit(rule, fitOf(rule, best), rule.around);
-  const { touching } = regions;
-  const pieces = new Set(touching.filter((_, i) => i % 2 === 0 && thing[touching[i + 1]] >= least));
-  const on = (whole) => thing[whole] >= least || pieces.has(whole);
-  return Array.from(thing, (_, region) => on(wholeOf(regions, region)));
+  const wholes = regionsAt(regions, level).filter((whole) => thing[whole] >= least);
+  return withPieces(regions, wholes);
+}
+
+// Whether each region is one of others, a whole that touches one of them, or a part of these.
+export function withPieces(regions, others) {
+  const { sizes, touching } = regions;
+  const pieces = touching.filter((_, i) => i % 2 === 0 && others.includes(touching[i + 1]));
+  const on = new Set([...others, ...pieces]);
+  return Array.from(sizes, (_, region) => isWithin(regions, region, on));
 }
 
 // The least fit of a member of an answer. share: factor of the reach.

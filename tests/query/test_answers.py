@@ -337,14 +337,16 @@ def test_touching_wholes_share_a_fifth_of_their_borders():
     assert touching_wholes(regions, surface.ends, surface.rows).tolist() == [[1, 0], [2, 1]]
 
 
-def test_a_sample_finds_the_same_touching_wholes_as_all():
+def test_parts_are_searched_on_touching_wholes_found_by_a_sample(monkeypatch):
     at = np.random.default_rng(0).uniform(0, 24, (6_000, 2))
     things = np.select([at[:, 0] < 1, at[:, 0] < 4, at[:, 0] < 12, at[:, 0] > 18], [0, 1, 2, 3], NO_NODE)
     gaussians = unturned_gaussians(np.pad(at, ((0, 0), (0, 1))).astype(np.float32), -1.0, 5.0)
     field = replace(random_field(6_000, "codebook"), tree=tree_of_wholes(things))
-    engine = QueryEngine(Scene(gaussians, field))
-    assert engine.touching.tolist() == [[0, 1], [1, 2]]
-    assert engine.touching_in(1_500).tolist() == [[0, 1], [1, 2]]
+    for sample in (200_000, 1_500):
+        monkeypatch.setattr("langsplat_core.query.engine.SAMPLE", sample)
+        assert QueryEngine(Scene(gaussians, field)).touching.tolist() == [[0, 1], [1, 2]]
+    part = QueryEngine(Scene(gaussians, field)).run_inside(["red mug"], things == 1, "whole", None)
+    assert [part.even[things == thing].any() for thing in range(4)] == [True, True, False, False]
 
 
 def test_part_is_chosen_by_its_phrase_and_its_own_word():

@@ -148,7 +148,6 @@ def table() -> tuple[QueryEngine, dict[str, Array]]:
 ANSWERS = {  # phrase -> blocks that answer it
     "handle of the red mug": ["red handle"],
     "blue mug's handle": ["blue handle"],
-    "red mug handle": ["red handle"],
     "mug on the table": ["red mug", "red handle", "blue mug", "blue handle"],
     "mug below the table": ["far mug"],
     "mug near the book": ["red mug", "red handle"],
@@ -226,7 +225,6 @@ def test_phrasebook_answers_a_whole_phrase():
 def test_part_is_found_inside_at_the_wanted_level(table):
     result = run_phrase(table[0], "handle of the red mug")
     assert (result.answer.level, result.answer.phrase) == (1, "handle of the red mug")
-    assert result.reading == "handle  inside  red mug"
     assert run_phrase(table[0], "handle of the red mug", "whole").answer.level == 2
     with pytest.raises(EncoderError, match="spoon"):
         run_phrase(table[0], "book or spoon")
