@@ -1,6 +1,6 @@
 """Instances of an answer: its Gaussians, separated along the surface, with boxes and scores."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -103,11 +103,11 @@ BOXED = 2048  # members, at most, that a box is computed from
 class Instance:
     """One connected instance among the Gaussians that answer a phrase."""
 
-    members: Array  # (K,) int64 rows of the scene's N Gaussians, ascending; faint ones included
+    members: Array = field(repr=False)  # (K,) int64 rows of the scene, ascending; faint ones included
     score: float  # in [0, 1], peak of its smoothed relevancy
     mean: float  # in [0, 1], mean relevancy of its members on the surface, weighted by opacity
     centre: Array  # (3,) world units, mean position of the same, weighted by opacity
-    points: Array  # (P, 3) positions of at most `BOXED` of the same, for its boxes
+    points: Array = field(repr=False)  # (P, 3) positions of at most `BOXED` of the same, for its boxes
     share: float  # in [0, 1], of the answer's extent: opacity times cross-section, summed over members
 
     @property

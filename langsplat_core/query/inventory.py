@@ -7,8 +7,9 @@ candidates for the inventory. Candidates that claim the same features are two na
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import islice, permutations
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import chain, islice, permutations
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ class Spot:
 
     centre: Array  # (3,) world units
     box: Array  # (2, 3) lower and upper corner, world units, between 2 % and 98 % of its Gaussians
-    rows: Array  # (M,) int64 numbers of its Gaussians
+    rows: Array = field(repr=False)  # (M,) int64 numbers of its Gaussians
     share: float  # of the scene's surface, in [0, 1]
 
 
@@ -68,7 +69,8 @@ class _Claim:
     level: int
     phrases: tuple[str, ...]  # the largest claim first
     rows: Array  # (M,) int64 numbers of the Gaussians whose best word is one of them
-    probability: float
+    probability: float  # at least `LIKELY`
+    is_partial: bool  # unlikely features were left out to reach it
 
 
 def scene_inventory(
@@ -107,19 +109,19 @@ def _claims(describer: Describer, latents: Array, of: Array, level: int) -> Iter
     mass = np.bincount(best.ravel(), (surface[:, None] * shares).ravel())
     order = np.argsort(-mass, kind="stable")[:MOST]
     candidates = order[mass[order] >= least / 2]
-    names = np.zeros((len(surface), len(candidates)), np.float32)  # (M, C) probability of each candidate
-    for column, word in enumerate(candidates):
-        names[:, column] = np.where(best == word, shares, 0).sum(1)
+    claimed = [np.where(best == word, shares, 0).sum(1) for word in candidates]
+    names = np.array(claimed, np.float32).reshape(-1, len(surface)).T  # (M, C) probability of each candidate
     for group in synonym_groups(names, surface):
-        numbers = candidates[group]
-        winners = np.isin(best[:, 0], numbers)
+        phrases, likely = [words.phrases[number] for number in candidates[group]], names[:, group].sum(1)
+        winners = np.isin(best[:, 0], candidates[group])
+        is_partial = bool(surface[winners] @ (likely[winners] - LIKELY) < 0)
+        if is_partial:  # in a short vocabulary the best word of many features is wrong
+            winners &= likely >= LIKELY
         weight = surface[winners]
-        if weight.sum() < least:
-            continue
-        probability = float(weight @ names[winners][:, group].sum(1)) / float(weight.sum())
-        if probability >= LIKELY:
+        if weight.sum() >= least:
+            probability = float(weight @ likely[winners]) / float(weight.sum())
             rows = np.flatnonzero(has & winners[np.maximum(of, 0)])
-            yield _Claim(level, tuple(words.phrases[number] for number in numbers), rows, probability)
+            yield _Claim(level, tuple(phrases), rows, probability, is_partial)
 
 
 def synonym_groups(names: Array, surface: Array) -> list[list[int]]:
@@ -149,7 +151,8 @@ def _verified(describer: Describer, claim: _Claim, placed: bool) -> InventoryEnt
     engine, areas, level = describer.engine, describer.areas, claim.level
     for phrase in claim.phrases:
         result = engine.run(phrase, LEVELS[level])
-        agreed = claim.rows[result.relevancy[level, claim.rows] > FLOOR]
+        fits = result.members if claim.is_partial else result.relevancy[level] > FLOOR
+        agreed = claim.rows[fits[claim.rows]]
         if not result.found or 2 * areas[agreed].sum() < areas[claim.rows].sum():
             continue
         spots = _spots(describer, agreed) if placed else ()
@@ -312,13 +315,11 @@ class Suggestions:
 def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = silent) -> Suggestions:
     """Return queries that are found, in seconds: inventory words, or colours if answers are guesses."""
     here = taught = tuple[str, ...]()
-    try:
+    with suppress(LangSplatError):  # no encoder, or one that knows none of the words: the phrasebook remains
         describer = Describer(engine, progress=progress)
         taught = describer.words[0].phrases
         entries = scene_inventory(describer, progress, placed=False)
         here = tuple(entry.phrase for entry in sorted(entries, key=lambda entry: -entry.probability))
-    except LangSplatError:  # no encoder, or one that knows none of the words: the phrasebook remains
-        pass
     candidates = tuple(dict.fromkeys((*here, *engine.field.phrasebook)))
     asked = COLOURS if engine.basis.guesses else candidates[: TRIES * at_most]
     found = (phrase for phrase in asked if _is_found(engine, phrase))
@@ -330,10 +331,9 @@ def composed_examples(engine: QueryEngine, suggestions: Suggestions) -> tuple[st
     here = suggestions.phrases[: TRIES * EXAMPLES]
     parts = (phrase for phrase in here if " " in phrase and is_part(phrase.split()[-1]))
     pairs = (f"{thing} near the {other}" for thing, other in permutations(suggestions.examples, 2))
-    found: list[str] = []
-    for kind in (parts, islice(pairs, 12)):
-        found += islice((phrase for phrase in kind if _is_found(engine, phrase)), 1)
-    return tuple(found)
+    kinds = parts, islice(pairs, 12)
+    found = (islice((phrase for phrase in kind if _is_found(engine, phrase)), 1) for kind in kinds)
+    return tuple(chain.from_iterable(found))
 
 
 def _is_found(engine: QueryEngine, phrase: str) -> bool:

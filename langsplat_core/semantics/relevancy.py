@@ -115,13 +115,13 @@ def bundled_vocabulary(name: str) -> tuple[str, ...]:
 def read_vocabulary(path: Path) -> tuple[str, ...]:
     """Return the phrases of a text file, one a line, in lower case, each once, in the file's order.
 
-    Empty lines and lines that begin with # are skipped. Raises InputError for a file that cannot be read or
+    Empty lines and what follows a # are skipped. Raises InputError for a file that cannot be read or
     has no phrase, and names a line that is no phrase (without letter or digit, too long, unprintable).
     """
     phrases: dict[str, None] = {}
     for number, line in enumerate(read_text(path).split("\n"), 1):
-        text = " ".join(line.split())
-        if not text or text.startswith("#"):
+        text = " ".join(line.partition("#")[0].split())
+        if not text:
             continue
         phrase = phrase_key(text)
         if not (text.isprintable() and any(map(str.isalnum, phrase)) and len(phrase) <= LONGEST):

@@ -137,6 +137,8 @@ def test_synonyms_share_an_entry_and_places_are_spots():
     assert sorted(float(spot.centre[0]) for spot in mug.spots) == pytest.approx([-1.2, 1.2], abs=0.1)
     # The best word of a foreign list may still be wrong: the canonical phrases are nearer.
     assert scene_inventory(describer(named_scene(), ("wall",))) == []
+    # In a list of one word, it is the best of every feature, but likely of a mug's alone.
+    assert [entry.phrase for entry in scene_inventory(describer(named_scene(), ("mug",)))] == ["mug"]
 
 
 def test_bundled_parts_are_not_offered_for_wholes(monkeypatch):
@@ -195,10 +197,7 @@ def phrases() -> tuple[tuple[str, ...], Array]:
 def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, bank: Array) -> Array:
     """The formula of the module, one meaning and one word after the other, in float64."""
     every = [vector.astype(np.float64) for vector in (*vectors, *made.canonical)]
-    hub = []
-    for word in every:
-        cosines = sorted((float(word @ meaning) for meaning in bank.astype(np.float64)), reverse=True)
-        hub.append(np.mean(cosines[: describe.NEAREST]))
+    hub = [np.sort(bank.astype(np.float64) @ word)[-describe.NEAREST :].mean() for word in every]
     spreads = [np.std([float(word @ meaning) for word in every[: len(vectors)]]) for meaning in bank]
     rows, scale = [], describe.WORD_SCALE / np.median(spreads)
     for vector in made.codec.decode(latents).astype(np.float64):

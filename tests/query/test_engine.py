@@ -181,6 +181,7 @@ def test_wrong_kinds_are_named_and_arrays_are_not_printed():
     shown = repr((scene.gaussians, scene.language, render(scene, scene.cameras[0])))
     parts = scene.language.codec, tree_of_wholes(np.zeros(360, int)), engine.surface, scene.cameras
     assert "array" not in shown + repr(parts)
+    assert "members" not in repr(engine.instances(found.answer))  # thousands of numbers
     assert repr(parts[0]) == "<linear codec of 4, for vectors of 8 numbers>"
     assert "<360 Gaussians, SH degree 0>, <language field of 360 Gaussians" in shown
 

@@ -431,7 +431,7 @@ def test_asking_names_a_configuration_that_does_not_fit(tmp_path: Path) -> None:
 def test_vocabulary_files_are_read_leniently(tmp_path):
     """A byte order mark, lines ended as on Windows, capitals, spaces, doubles, comments, other scripts."""
     path = tmp_path / "mine.txt"
-    path.write_bytes("\ufeffRed  Mug\r\n# kitchen\r\n\r\n  cup \r\nred mug\r\nтарелка\r\n".encode())
+    path.write_bytes("\ufeffRed  Mug\r\n# kitchen\r\n\r\n  cup # chipped\r\nred mug\r\nтарелка\r\n".encode())
     assert read_vocabulary(path) == ("red mug", "cup", "тарелка")
     assert min(len(bundled_vocabulary(name)) for name in BUNDLED) > 10
 
