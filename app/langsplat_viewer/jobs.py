@@ -187,8 +187,8 @@ def one_line(error: BaseException) -> str:
     A class that no user causes is named, so that it can be reported.
     """
     text = " ".join(str(error).split())
-    if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if isinstance(error, LangSplatError | OSError):
         return text or type(error).__name__
     if isinstance(error, MemoryError):
