@@ -23,7 +23,7 @@ import numpy as np
 from msgspec import Meta
 
 from langsplat_core.config import check_settings
-from langsplat_core.errors import FormatError, InputError, printable_line, quoted
+from langsplat_core.errors import FormatError, InputError, malformed, printable_line, quoted
 from langsplat_core.io.files import locked, write_whole
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.scene import FARTHEST, Intrinsics, is_rotation
@@ -44,7 +44,6 @@ from langsplat_viewer.session import (
 
 T = TypeVar("T")
 SIZE_LIMIT = 64 * 1024 * 1024  # bytes of any of these files
-NONSENSE = InputError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError
 
 
 def plain(value: object) -> Any:
@@ -99,9 +98,16 @@ def _read(path: Path, what: str, decode: Callable[[Any], T]) -> T:
     top = read_json_file(path, SIZE_LIMIT)
     try:
         return decode(top)
-    except NONSENSE as error:
-        reason = printable_line(error if isinstance(error, InputError | ValueError) else f"{error!r}", 120)
-        raise FormatError(f"{path}: no {what} ({reason}); save it anew") from None
+    except FormatError:
+        raise
+    except (InputError, ValueError) as error:
+        raise malformed(path, f"no {what} ({printable_line(error, 120)})", "save it anew") from None
+
+
+def _check_version(path: Path, what: str, stated: object, *known: int) -> None:
+    if isinstance(stated, bool) or stated not in known:
+        of_version = f"{what} of version {quoted(stated, 20)}; this program reads"
+        raise malformed(path, f"{of_version} {' and '.join(map(str, known))}", "update it")
 
 
 def _write(path: Path, content: object) -> None:
@@ -124,9 +130,9 @@ def _flat(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def _nested(entry: Any) -> dict[str, Any]:
-    pose = {name: entry[name] for name in POSE if name in entry}
-    rotation = np.transpose(pose["rotation"]).tolist()
-    return {**{k: v for k, v in entry.items() if k not in POSE}, "pose": {**pose, "rotation": rotation}}
+    others = msgspec.convert(entry, dict[str, Any])
+    pose = {name: others.pop(name) for name in POSE if name in others}
+    return {**others, "pose": {**pose, "rotation": np.transpose(pose.get("rotation", ())).tolist()}}
 
 
 def _check_pose(pose: Pose) -> None:
@@ -155,8 +161,7 @@ def read_flight(path: Path | str) -> Flight:
     def decode(top: Any) -> Flight:
         if not isinstance(top, dict) or PATH_MARK not in top:
             raise ValueError(f'expected an object with "{PATH_MARK}": {PATH_VERSION}')
-        if top[PATH_MARK] != PATH_VERSION or isinstance(top[PATH_MARK], bool):
-            raise ValueError(f"of version {quoted(top[PATH_MARK], 20)}; this program reads {PATH_VERSION}")
+        _check_version(Path(path), "camera path", top[PATH_MARK], PATH_VERSION)
         entries = top.get("keyframes")
         if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_KEYFRAMES:
             raise ValueError(f"'keyframes' is not a list of 1 to {MOST_KEYFRAMES}")
@@ -198,13 +203,14 @@ PROJECTS = ".langsplat"  # suffix of project files
 FORMAT, VERSION = "langsplat-project", 2
 NOT_COMPARED = "canonical phrases of one's own are left out: this version has none"
 NO_GROUPS = "groups and locks of the outline are left out: this version has none"
+Count = Annotated[int, Meta(ge=0, le=1_000_000_000)]
 
 
 class Project(msgspec.Struct, omit_defaults=True):
     """The content of a project file."""
 
     scene: Annotated[str, Meta(pattern=r"\A[^\0]+\Z", max_length=4096)]
-    gaussians: Annotated[int, Meta(ge=0, le=1_000_000_000)]
+    gaussians: Count
     view: Bookmark
     session: Session
     intrinsics: Intrinsics | None = None  # of the view, where the field of view does not say all
@@ -231,7 +237,8 @@ def write_project(
     known: the digest as it was last read or written here. What another window has written since then is kept
     under the name that `apart` gives, asked while no other window writes; else nothing is kept, None.
     """
-    project = msgspec.structs.replace(project, session=checked(project.session))
+    own = {"version": VERSION, "left_out": ()}
+    project = msgspec.structs.replace(project, session=checked(project.session), **own)
     folder, scene = _folder_of(path), Path(project.scene)
     named = scene.relative_to(folder).as_posix() if scene.is_relative_to(folder) else str(scene)
     kept = None
@@ -249,11 +256,14 @@ def read_project(path: Path) -> Project:
     def decode(top: Any) -> Project:
         if not isinstance(top, dict) or top.get("format") != FORMAT:
             raise ValueError(f'"format" is not "{FORMAT}"')
-        if top.get("version") not in (1, VERSION) or isinstance(top.get("version"), bool):
-            raise ValueError(f"of another version; this program reads {VERSION}")
-        top = _from_version_1(top) if top["version"] == 1 else top
-        count = top["gaussians"] if isinstance(top["gaussians"], int) else 0
-        project: Project = _converted(top, Project, min(max(count, 0), 1_000_000_000))
+        _check_version(path, "project", top.get("version"), 1, VERSION)
+        if top["version"] == 1:
+            try:
+                top = _from_version_1(top)
+            except (AttributeError, LookupError, TypeError) as error:  # it checks nothing
+                raise ValueError(repr(error)) from None
+        count = _converted(top.get("gaussians"), Count)
+        project: Project = _converted(top, Project, count)
         _check_pose(project.view.pose)
         if project.intrinsics is not None:
             _check_pose(replace(project.view.pose, fov_degrees=project.intrinsics.fov_degrees))

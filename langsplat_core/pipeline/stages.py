@@ -53,8 +53,7 @@ def kept(path: Path, make: Callable[[], Arrays]) -> Arrays:
     if path.exists():
         log.debug("%s: kept from an earlier run", path.name)
         found = dict(read_arrays(path))
-        stated = str(found.pop(DIGEST, ""))  # none in work folders of earlier versions
-        if stated and stated != _digest(found.values()):
+        if str(found.pop(DIGEST, "")) != _digest(found.values()):
             raise changed(path)
         return found
     made = make()
@@ -79,8 +78,8 @@ def open_array(path: Path) -> Array:
             return np.load(path, allow_pickle=False)
         with path.open("rb") as file:
             file.seek(array.offset + array.nbytes)
-            stated = file.read().hex()  # nothing in work folders of earlier versions
-    if stated and stated != _digest([array]):
+            stated = file.read().hex()
+    if stated != _digest([array]):
         raise changed(path)
     return np.asanyarray(array)
 

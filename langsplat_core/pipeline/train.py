@@ -303,10 +303,10 @@ def trained_gaussians(
     settings = replace(config, backend="auto", checkpoint_every=RadianceConfig.checkpoint_every)
     done = work / f"{stage_key('radiance', VERSION, settings, capture.digest(train))}.ply"
     stated = done.with_suffix(".digest")
-    if done.exists():
+    if done.exists() and stated.exists():
         log.debug("%s: kept from an earlier run", done.name)
         found = read_ply(done)
-        if stated.exists() and stated.read_bytes() != digest_of(found).encode():  # none in earlier versions
+        if stated.read_bytes() != digest_of(found).encode():
             raise changed(done)
         return found
     checkpoint = done.with_suffix(".checkpoint.safetensors")

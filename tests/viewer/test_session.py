@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.errors import InputError, LangSplatError
+from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.scene import Scene
 from langsplat_core.scene.transform import moving, place_scene
-from langsplat_viewer import options
+from langsplat_viewer import options, projects
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.camera.controls import orbit
@@ -150,9 +150,7 @@ def test_undo_restores_the_level_and_ends_with_the_scene(opened):
 
 
 SETTINGS = {
-    "picture": lambda v: settings.set_picture(
-        v, replace(v.state.session.picture, dim=0.2, background=(1.0, 1.0, 1.0))
-    ),
+    "picture": lambda v: settings.set_picture(v, replace(v.state.session.picture, dim=0.2)),
     "display": lambda v: settings.set_display(v, "depth"),
     "colour map": lambda v: settings.set_picture(v, replace(v.state.session.picture, colour_map="viridis")),
     "wipe": settings.toggle_wipe,
@@ -221,7 +219,6 @@ def test_undo_of_a_setting_keeps_the_same_mask_objects(opened):
 
 
 def changed(marks: Marks, rng: np.random.Generator, step: int) -> Marks:
-    """Selected and hidden in turn."""
     if step % 2:
         return replace(marks, selected=marks.selected & False, hidden=marks.hidden | marks.selected)
     return replace(marks, selected=(rng.uniform(size=len(marks.selected)) < 0.02) & marks.shown)
@@ -420,22 +417,21 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
     moved = state.open.scene.gaussians.means - SCENES["blobs.ply"].gaussians.means
     np.testing.assert_allclose(moved[blob("plant")], np.tile([0.0, 1.0, 0.0], (120, 1)), atol=1e-6)
     assert session.notes == (Note('a "note" <b>of</b> 1987', (0.0, 0.0, 0.0)),)
-    assert session.ruler.length == 1.0
+    assert (session.ruler.length, session.things) == (1.0, Things({3: "the atlas"}))
     assert [(key.seconds, key.pose.span is None) for key in session.keyframes] == [(0.0, True), (2.0, False)]
     assert [bookmark.name for bookmark in session.bookmarks] == ["from the left"]
     np.testing.assert_allclose(state.open.view.eye, [-3.551118, -1.122909, -3.418507], atol=1e-5)
     assert state.preferences.panels == ("Search", "Notes")
 
 
-def test_other_files_of_version_1_open_and_mean_the_same():
-    project = read_project(SAVED / "version1.langsplat")
-    assert project.session.things == Things({3: "the atlas"})
+def test_other_files_of_version_1_mean_the_same(tmp_path):
     first, second = read_flight(SAVED / "version1.path.json").keyframes
-    for pose in (first.pose, project.view.pose):
-        np.testing.assert_allclose(pose.position, [-3.551118, -1.122909, -3.418507], atol=1e-5)
-        np.testing.assert_allclose(pose.rotation[2], [0.702835, 0.222248, 0.675743], atol=1e-5)
+    np.testing.assert_allclose(first.pose.position, [-3.551118, -1.122909, -3.418507], atol=1e-5)
+    np.testing.assert_allclose(first.pose.rotation[2], [0.702835, 0.222248, 0.675743], atol=1e-5)
     assert second.seconds == 2.0
     assert second.pose.span == pytest.approx(4.705585)
+    write_project(tmp_path / "a.langsplat", read_project(SAVED / "version1.langsplat"), Path)
+    assert read_project(tmp_path / "a.langsplat").version == 2
     assert load_preferences(SAVED) == Preferences(
         "light", 1.25, ("/scenes/blobs.ply",), ("Search", "Notes"), "viridis", ("things", "grid")
     )
@@ -508,11 +504,26 @@ def test_project_with_impossible_values_is_refused(saved):
     ]
     broken = [{**top, "session": {**session, **change}} for change in changes]
     endless = {"width": 160, "height": float("inf"), "fx": 128, "fy": 128, "cx": 80, "cy": 60}
-    broken.append({**top, "intrinsics": endless})
-    for content in ({"format": "other"}, {**top, "version": 3}, [], {**top, "gaussians": 10**12}, *broken):
+    others = {"intrinsics": endless}, {"view": None}, {"view": []}, {"version": 1}, {"gaussians": 10**12}
+    broken += [{**top, **change} for change in others]
+    for content in ({"format": "other"}, [], *broken):
         saved.write_text(json.dumps(content))
-        with pytest.raises(LangSplatError):
+        with pytest.raises(FormatError, match=r"no project .*; save it anew"):
             read_project(saved)
+
+
+def test_another_version_is_named_with_what_helps(saved):
+    saved.write_text(json.dumps(json.loads(saved.read_text()) | {"langsplat_flight": 2, "version": 3}))
+    with pytest.raises(FormatError, match="version 3; this program reads 1 and 2; update it"):
+        read_project(saved)
+    with pytest.raises(FormatError, match="version 2; this program reads 1; update it"):
+        read_flight(saved)
+
+
+def test_a_fault_of_the_program_is_no_fault_of_the_file(saved, monkeypatch):
+    monkeypatch.setattr(projects, "checked", lambda session: session.nothing)
+    with pytest.raises(AttributeError):
+        read_project(saved)
 
 
 def test_a_linked_project_names_its_scene_from_its_own_folder(opened, tmp_path):
