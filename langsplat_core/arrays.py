@@ -15,12 +15,13 @@ def check_array(
     shape: tuple[int | str, ...],
     dims: dict[str, int] | None = None,
     dtype: type | None = None,
+    finite: bool = False,
 ) -> dict[str, int]:
     """Require `array` to have `shape`; letters in the shape must agree with `dims`, or are bound now.
 
     Returns the letters bound so far, so that calls can be chained over the fields of one object. Raises
-    TypeError for a wrong dtype and ValueError for a wrong shape, both naming the array: ``scales: expected
-    shape (N, 3) with {'N': 6}, got (5, 3)``.
+    TypeError for a wrong dtype and ValueError for a wrong shape, and for numbers that are not finite where
+    they must be, all naming the array: ``scales: expected shape (N, 3) with {'N': 6}, got (5, 3)``.
     """
     dims = dict(dims or {})
     if not isinstance(array, np.ndarray):
@@ -34,6 +35,8 @@ def check_array(
     for size, actual in zip(shape, array.shape, strict=True):
         if dims.setdefault(size, actual) != actual if isinstance(size, str) else size != actual:
             raise ValueError(problem)
+    if finite and not np.isfinite(array).all():
+        raise ValueError(f"{name}: some are not finite, and would spoil all that they blend with")
     return dims
 
 

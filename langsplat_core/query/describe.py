@@ -172,8 +172,7 @@ class Describer:
 
         vocabulary: phrases for all levels, by default the bundled ones: everyday things, and below the level
         "whole" parts of things too. Phrases with words that the encoder was never taught are left out. Raises
-        InputError for a scene without a language field and if no phrase is left, EncoderError as
-        `TextVectors.of_known` does.
+        InputError without a language field or if no phrase is left, else as `TextVectors.of_known`.
         """
         things = tuple(vocabulary) if vocabulary is not None else bundled_vocabulary("things")
         parts = () if vocabulary is not None else bundled_vocabulary("parts")

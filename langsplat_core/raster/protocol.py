@@ -71,7 +71,7 @@ class LiftingView(View):
 
     @abstractmethod
     def gather(self, image: Array) -> Array:
-        """Return the (N, C) values ``W^T y`` of an (H, W, C) image."""
+        """Return the (N, C) values ``W^T y`` of a finite (H, W, C) image."""
 
     def contributions(self) -> Array:
         """Return (N,) blending weight of each Gaussian summed over the image, in pixels: ``W^T 1``."""

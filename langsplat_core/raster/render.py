@@ -76,16 +76,14 @@ def render(
     of `raster.BACKENDS` that needs no device handed to it ("cpu", "cuda", "reference"). profile: constants
     of image formation, such as `config.INRIA`; None: the published ones with the scene's own near plane. The
     scene's antialiasing applies to both. Raises InputError for an unknown backend, BackendError for one
-    that cannot load here, ValueError for values of another shape.
+    that cannot load here, ValueError for values of another shape or not finite.
     """
     expect(scene, Scene, "load_scene(path) returns one")
     expect(camera, Camera, "scene.cameras has those of a scene, look_at makes one")
     expect(profile, RasterSettings | None, "config.INRIA is one")
     if values is not None:
         values = np.asarray(values, np.float32)
-        check_array("values", values, ("N", "C"), {"N": len(scene.gaussians.means)})
-        if not np.isfinite(values).all():
-            raise InputError("values: some are not finite, and would spoil all that they blend with")
+        check_array("values", values, ("N", "C"), {"N": len(scene.gaussians.means)}, finite=True)
     rasterizer = _cpu() if backend == "cpu" else load_rasterizer(backend)
     view = rasterizer.view(scene.gaussians, camera, scene.raster_settings(profile))
     return splat_colours(view, scene.gaussians, values)

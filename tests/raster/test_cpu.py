@@ -165,8 +165,11 @@ def test_colours_of_invalid_and_coincident_rows():
     assert not sh_grad[0, :, 1].any()
 
 
-def test_wrong_shapes_are_named():
+def test_wrong_shapes_and_numbers_are_named():
     view = CPU.view(random_gaussians(5), PLAIN)
+    for blend, shape in ((view.splat, (5, 3)), (view.gather, (30, 40, 3))):
+        with pytest.raises(ValueError, match="some are not finite"):
+            blend(np.full(shape, np.nan))
     with pytest.raises(ValueError, match="values: expected shape"):
         view.splat(np.zeros((4, 3), np.float32))
     with pytest.raises(ValueError, match="image: expected shape"):

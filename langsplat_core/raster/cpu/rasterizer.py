@@ -298,7 +298,7 @@ class CpuView(LiftingView):
         return self.order
 
     def splat_rows(self, values: Array) -> tuple[Array, Array]:
-        check_array("values", values, (len(self.order), "C"))
+        check_array("values", values, (len(self.order), "C"), finite=True)
         size = self.camera.height, self.camera.width
         alpha, parts = np.empty((*size, 1), np.float32), []
         for start in range(0, max(values.shape[1], 1), CHANNELS_AT_ONCE):
@@ -314,7 +314,7 @@ class CpuView(LiftingView):
 
     def gather(self, image: Array) -> Array:
         """Return W^T image, (N, C) float32, summed in float64 over tiles."""
-        check_array("image", image, (self.camera.height, self.camera.width, "C"))
+        check_array("image", image, (self.camera.height, self.camera.width, "C"), finite=True)
         channels = image.shape[2]
         values = np.zeros((self.count, channels), np.float32)
         for start in range(0, channels, CHANNELS_AT_ONCE):
