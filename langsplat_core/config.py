@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
 
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, printable_line
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ def check_settings(settings: object, option: str = "--") -> None:
         raise InputError(f"expected settings such as TrainConfig(), got {type(settings).__name__}")
     for name, value, hint in named_values(settings, option):
         if problem := _problem(value, hint):
-            raise InputError(f"{name} {_shown(value)}: {problem}")
+            shown = printable_line(" ".join(map(_word, _flat(value))), 40)
+            raise InputError(f"{name} {shown}: {problem}")
 
 
 def range_of(hint: Any) -> Range | None:
@@ -97,11 +98,6 @@ def _flat(value: Any) -> Iterator[Any]:
         yield value
 
 
-def _shown(value: Any) -> str:
-    text = " ".join(map(_word, _flat(value)))
-    return text if len(text) <= 40 else f"{text[:36]} ..."
-
-
 def _word(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
@@ -150,16 +146,14 @@ GSPLAT = replace(INRIA, near=0.01)
 class DatasetConfig:
     """Settings for reading photographs and their cameras."""
 
-    max_side: Side = 800  # photographs are shrunk until their longer side has at most this many pixels
-    test_every: CountOrZero = 8  # one view in so many is held out from training; 0 holds out none
-    # chosen: views that others surround, none of fewer than six; every: each n-th by name, as benchmarks do
+    max_side: Side = 800  # pixels of a photograph's longer side: larger ones are shrunk
+    test_every: CountOrZero = 8  # one view in so many is held out from training; 0: none is
+    # which views are held out: chosen, those that others surround (none of fewer than six), or every n-th
     hold_out: Literal["chosen", "every"] = "chosen"
-    frames: FrameCount = 100  # photographs that a video is made into: the sharpest image of each such part
-    # what is transparent in photographs: pixels that do not count, an empty background, or that which most of
-    # a capture looks like
+    frames: FrameCount = 100  # parts of a video, of each of which the sharpest image is a photograph
+    # transparent pixels: mask, which do not count; background, which are empty; auto: as a capture looks
     alpha: Annotated[Literal["auto", "mask", "background"], tyro.conf.arg(aliases=["--alpha"])] = "auto"
-    metres_per_unit: Positive | None = None
-    """Scale of the dataset's world; None: as transforms.json says, or else the photographs' places (GPS)."""
+    metres_per_unit: Positive | None = None  # scale of the dataset; by default of transforms.json, else GPS
     # go on where fewer than half of the photographs, or fewer than three, have a camera
     allow_few_cameras: bool = False
 
@@ -172,46 +166,43 @@ class RadianceConfig:
     geometry learn faster (see `training.radiance.trainer`).
     """
 
-    steps: Count = 30_000  # of training
-    reference_steps: Count = 30_000  # of the schedules that follow
-    backend: Device = "auto"  # what rasterizes
+    steps: Count = 30_000  # number of training steps
+    reference_steps: Count = 30_000  # number of steps for which the step numbers of other options are meant
+    backend: Device = "auto"  # device that rasterizes
     sh_degree: Annotated[int, Range(0, 3)] = 3  # highest degree of the spherical harmonics, 0 to 3
-    sh_degree_every: Count = 1_000  # steps after which the degree grows by one
-    max_gaussians: Count = 1_000_000  # never more than so many
+    sh_degree_every: Count = 1_000  # steps after which the degree of the harmonics grows by one
+    max_gaussians: Count = 1_000_000  # largest number of Gaussians
     lambda_dssim: Share = 0.2  # share of 1 - SSIM in the loss; the rest is L1
-    # times the mean opacity, added to the loss (Kheradmand et al. 2024: 0.01; INRIA: 0): what the photographs
-    # do not need fades
+    # weight of the mean opacity in the loss: what no photograph needs fades (INRIA: 0; Kheradmand 2024: 0.01)
     opacity_decay: NotNegative = 0.0
-    position_lr_init: Rate = 1.6e-4  # times the cameras' extent
-    position_lr_final: Rate = 1.6e-6  # at the last step, times the cameras' extent
-    feature_lr: Rate = 2.5e-3  # higher SH coefficients: a twentieth
-    opacity_lr: Rate = 0.05  # of opacity logits
-    scale_lr: Rate = 5e-3  # of logarithms of scales
-    rotation_lr: Rate = 1e-3  # of quaternions
+    position_lr_init: Rate = 1.6e-4  # learning rate of positions at the first step, in extents of the cameras
+    position_lr_final: Rate = 1.6e-6  # learning rate of positions at the last step, in extents of the cameras
+    feature_lr: Rate = 2.5e-3  # learning rate of colours; of higher SH coefficients a twentieth
+    opacity_lr: Rate = 0.05  # learning rate of opacity logits
+    scale_lr: Rate = 5e-3  # learning rate of logarithms of scales
+    rotation_lr: Rate = 1e-3  # learning rate of rotation quaternions
     densify_from: CountOrZero = 500  # first step at which Gaussians are split, cloned and pruned
-    densify_until: CountOrZero = 15_000  # last step of that
-    densify_every: Count = 100  # steps between two of them
-    densify_grad: NotNegative = 2e-4  # mean norm of the gradient by the 2D mean, in NDC
-    percent_dense: Share = 0.01  # of the extent: larger Gaussians split, smaller ones are cloned
+    densify_until: CountOrZero = 15_000  # last step at which Gaussians are split, cloned and pruned
+    densify_every: Count = 100  # steps between two rounds of splitting, cloning and pruning
+    densify_grad: NotNegative = 2e-4  # least mean gradient by the 2D mean, in NDC, that densifies a Gaussian
+    percent_dense: Share = 0.01  # size, in extents of the cameras, above which Gaussians split; others clone
     opacity_reset_every: CountOrZero = 3_000  # steps between two resets of opacities to at most 0.01; 0: none
-    prune_opacity: Share = 5e-3  # fainter Gaussians are removed
-    coarse_fraction: Share = 1 / 3  # of the steps, at the start, on images of half the size; INRIA: 0
-    # up to so many training views: Gaussians begin at depths by stereo and leave the space before surfaces,
-    # opacities decay and are not reset; 0 (as published): never
+    prune_opacity: Share = 5e-3  # opacity below which a Gaussian is removed
+    coarse_fraction: Share = 1 / 3  # share of the steps, the first, on images of half the size; INRIA: 0
+    # most training views with which Gaussians begin at depths by stereo and leave the space before surfaces,
+    # and opacities decay and are not reset; 0 (as published): none
     few_views: CountOrZero = 50
-    # up to so many training views, 64 `steps` of each, 60 000 Gaussians and degree 1 are trained at most:
-    # more lose on views held out; 0: never
+    # most training views with which training is capped, at 64 steps of each, 60 000 Gaussians and degree 1:
+    # more lose on views held out; 0: none
     capped_views: CountOrZero = 24
-    # trainings from other random starts, merged and trained together; 0: two with capped views, else one
-    ensemble: Annotated[int, Range(0, 16)] = 0
+    ensemble: Annotated[int, Range(0, 16)] = 0  # trainings to merge; 0: two with capped views, else one
     # each photograph has an exposure and white balance of its own; auto: where that explains enough
     exposure: Literal["auto", "on", "off"] = "auto"
     # what moves in a photograph, such as people, does not count; auto: where it explains enough of the error
     transients: Literal["auto", "on", "off"] = "auto"
-    checkpoint_every: Count = 2_000  # steps of this run
-    # camera z up to which nothing is drawn, world units; None: it follows from the cameras and what they see
-    near: Positive | None = None
-    seed: Seed = 0  # of random numbers
+    checkpoint_every: Count = 2_000  # steps between two checkpoints of a training
+    near: Positive | None = None  # depth up to which nothing is drawn, units; by default from what is seen
+    seed: Seed = 0  # seed of the training's random numbers
 
     def formation(self, near: float) -> RasterSettings:
         """Return the constants of image formation; `near`: the plane that follows from what is seen."""
@@ -223,21 +214,19 @@ class MaskConfig:
     """Source of masks, and which are kept (paper section 3.1 and the method's public code)."""
 
     source: str = "auto"  # sam, graph or an extension's; auto: sam when `sam` names weights, else graph
-    # hub id, folder or file of SAM, SAM 2 or SAM 3 weights, e.g. facebook/sam-vit-huge
-    sam: str = ""
-    # layers of crops that SAM sees beside the whole image, 2 x 2 in the first: 0 as the paper's text,
-    # 1 as its code, which takes five times as long
+    sam: str = ""  # hub id, folder or file of SAM, SAM 2 or SAM 3 weights, e.g. facebook/sam-vit-huge
+    # layers of crops that SAM sees, too, 2 x 2 in the first; 0: as the paper's text; 1: its code, 5 x slower
     crop_layers: Annotated[int, Range(0, 4)] = 0
-    points_per_side: Annotated[int, Range(1, 1_024)] = 32  # of the grid that SAM is asked at
-    points_per_batch: Count = 64  # asked at a time
-    predicted_iou: Share = 0.7  # least quality that SAM says of a mask it keeps
+    points_per_side: Annotated[int, Range(1, 1_024)] = 32  # points on a side of the grid that SAM is asked at
+    points_per_batch: Count = 64  # points that SAM is asked at together
+    predicted_iou: Share = 0.7  # least quality, as SAM says it, of a mask that is kept
     stability: Share = 0.85  # least stability of a mask that is kept
-    stability_offset: NotNegative = 1.0  # of the two cuts whose overlap is the stability, in logits
-    box_nms: Share = 0.7  # overlap of boxes from which the worse mask goes
-    min_region: CountOrZero = 100  # px; smaller regions and holes are removed
-    nms_iou: Share = 0.8  # overlap of masks of a level from which the worse one goes
-    nms_score: Share = 0.7  # least score of a mask behind that
-    nms_inner: Share = 0.5  # how far inside another a mask may lie
+    stability_offset: NotNegative = 1.0  # logits between the two cuts whose overlap is a mask's stability
+    box_nms: Share = 0.7  # overlap of two masks' boxes from which the worse mask goes
+    min_region: CountOrZero = 100  # pixels of the smallest region, or hole, that a mask keeps
+    nms_iou: Share = 0.8  # overlap of two masks of a level from which the worse one goes
+    nms_score: Share = 0.7  # least score of a mask that stays when overlapping ones have gone
+    nms_inner: Share = 0.5  # how far, from 0 to 1, a mask may lie inside another of its level
 
 
 @dataclass(frozen=True)
@@ -245,8 +234,8 @@ class ClipConfig:
     """The vision-language encoder: CLIP, SigLIP, MetaCLIP 2 or TIPS v2."""
 
     model: str = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"  # hub id, folder, or "demo" for the bundled one
-    batch: Count = 32  # images per forward pass
-    device: Device = "auto"  # where it runs
+    batch: Count = 32  # images that the encoder sees together
+    device: Device = "auto"  # device that the encoder runs on
 
 
 CodecKind = Literal["codebook", "autoencoder", "linear"]
@@ -256,19 +245,16 @@ CodecKind = Literal["codebook", "autoencoder", "linear"]
 class CodecConfig:
     """Settings of the codec, by which a Gaussian keeps a CLIP vector; each kind has some of its own."""
 
-    # the number of a codeword, latents of the paper's autoencoder (section 3.2), or coordinates in a linear
-    # basis of the scene's vectors
+    # what is kept: a codeword's number, latents of the paper's autoencoder, or coordinates in a linear basis
     kind: CodecKind = "codebook"
-    # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
-    size: Annotated[int, Range(0, 65_535)] = 0
-    # mean over the scene's vectors and a few hundred phrases, of a codebook
+    size: Annotated[int, Range(0, 65_535)] = 0  # codewords of a codebook; 0: by --max-relevancy-error
+    # largest error of a codebook: the mean over the scene's vectors and a few hundred phrases
     max_relevancy_error: Annotated[Share, tyro.conf.arg(aliases=["--max-relevancy-error"])] = 0.006
-    # numbers per Gaussian and level, of an autoencoder and a linear basis
-    latent_dim: Annotated[int, Range(1, 4_096)] = 3
-    steps: Count = 4_000  # of an autoencoder's training
-    batch: SeveralCount = 256  # vectors per step of that
-    lr: Rate = 3e-3  # of that; 7e-4 in the public code: with as many steps a quarter more error
-    seed: Seed = 0  # of random numbers
+    latent_dim: Annotated[int, Range(1, 4_096)] = 3  # numbers kept by an autoencoder or a linear basis
+    steps: Count = 4_000  # number of training steps of an autoencoder
+    batch: SeveralCount = 256  # vectors in a training step of an autoencoder
+    lr: Rate = 3e-3  # learning rate of an autoencoder; 7e-4, as published, leaves a quarter more error
+    seed: Seed = 0  # seed of the codec's random numbers
 
     @property
     def own(self) -> dict[str, Any]:
@@ -290,12 +276,11 @@ class LiftConfig:
     # median, mean: of the CLIP vectors of the masks a Gaussian belongs to, then encoded;
     # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
     mode: Literal["median", "mean", "one-pass", "gradient"] = "median"
-    # what lifts; auto: cpu, which is faster but for gradient
-    backend: Device = "auto"
-    steps: Count = 30_000  # of mode gradient, as are the following
-    lr: Rate = 2.5e-3  # learning rate
-    start: Literal["one-pass", "zeros-as-published"] = "one-pass"  # what mode gradient starts from
-    seed: Seed = 0  # of random numbers
+    backend: Device = "auto"  # device that lifts; auto: cpu, which is faster but for mode gradient
+    steps: Count = 30_000  # number of training steps of mode gradient
+    lr: Rate = 2.5e-3  # learning rate of mode gradient
+    start: Literal["one-pass", "zeros-as-published"] = "one-pass"  # features that mode gradient starts from
+    seed: Seed = 0  # seed of mode gradient's random numbers
 
 
 @dataclass(frozen=True)
@@ -308,7 +293,7 @@ class TrainConfig:
     clip: ClipConfig = field(default_factory=ClipConfig)
     codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
-    phrases: tuple[str, ...] = ()  # stored encoded in the scene: they can be asked without any encoder
+    phrases: tuple[str, ...] = ()  # phrases stored encoded in the scene, to be asked without any encoder
 
 
 # The method as published (paper sections 3.1 to 3.3 and its public code): 2 x 2 crops beside the whole

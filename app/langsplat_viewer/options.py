@@ -65,7 +65,7 @@ class ViewerOptions:
     """Neither use nor change the remembered layout, settings and recent files."""
     headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Draw an image or a film without a window and print the answers."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE.png"), HEADLESS] = None
+    out: Annotated[Path | None, HEADLESS] = None
     """Where --headless writes: an image (.png); a film (.mp4) or a folder of its images."""
     path: Annotated[Path | None, tyro.conf.arg(metavar="PATH.json")] = None
     """A camera path: with --headless the film along it, else it is opened in the panel "Record"."""

@@ -12,12 +12,11 @@ from typing import Annotated, Any, Union, get_type_hints
 import tyro
 
 from langsplat_core import registry
-from langsplat_core.cli.arguments import Runnable, check_codec
+from langsplat_core.cli.arguments import PLACED, Runnable, check_codec, named
 from langsplat_core.cli.run import main, parsed
 from langsplat_core.config import annotations
 from langsplat_core.errors import InputError
 
-(PLACED,) = tyro.conf.Positional[str].__metadata__  # type: ignore[attr-defined]  # the mark that it is
 FLAGS = ("-q", "--quiet", "-v", "--verbose", "--strict")  # may precede a command
 # Name -> class, imported when the command line needs it; those of extensions follow.
 CORE: Mapping[str, str] = MappingProxyType({
@@ -45,12 +44,9 @@ def parse(args: list[str]) -> Runnable:
     elif name in command_names():
         check_codec(args)
         commands = {name: load_command(name)}
-        marks = annotations(get_type_hints(commands[name], include_extras=True).get("out"))
-        if "--out" in args and (PLACED in marks or name == "convert"):  # what others take as an option
-            at = args.index("--out")
-            args = [*args[:at], *args[at + 2 :], "--", *args[at + 1 : at + 2]]
+        args = _with_out(args, commands[name])
     elif name in groups:
-        commands = {name: _group(name, args[1:2])}
+        commands = {name: _group(name)}
     else:  # all of them, but for those of extensions that are broken
         commands = {one: load_command(one) for one in CORE}
         commands |= {one: kind for one, kind in registry.parts("commands").items() if " " not in one}
@@ -58,6 +54,15 @@ def parse(args: list[str]) -> Runnable:
     about = "Train, query, convert and measure 3D Gaussian scenes with a language field."
     found = parsed("langsplat", _union(commands), [*before, *args], about)
     return getattr(found, "command", found)  # of a group
+
+
+def _with_out(args: list[str], kind: type[Runnable]) -> list[str]:
+    """Return the words of a command, what --out or -o gives at the end where its place is there."""
+    hint = get_type_hints(kind, include_extras=True).get("out", Any)
+    if PLACED not in annotations(hint) and not isinstance(getattr(kind, "out", None), property):
+        return args
+    out, rest = named(args, "-o", "--out")
+    return rest if out is None else [*rest, *["--"][: "--" not in rest], out]
 
 
 def command_names() -> list[str]:
@@ -79,11 +84,8 @@ def _groups() -> Mapping[str, str]:
     return {**unsaid, **registry.references("groups")}
 
 
-def _group(name: str, words: Sequence[str] = ()) -> Any:
-    """Return a group's commands, or only the one that `words` begins with."""
-    members = _members(name)
-    named = [word for word in words if word in members] or members
-    made = _union({member: load_command(f"{name} {member}") for member in named})
+def _group(name: str) -> Any:
+    made = _union({member: load_command(f"{name} {member}") for member in _members(name)})
     group = make_dataclass("Group", [("command", Annotated[made, tyro.conf.arg(name="")])])
     group.__doc__ = _groups()[name]
     return group
@@ -107,10 +109,8 @@ def check_commands(args: Sequence[str]) -> None:
         if word.startswith("-"):
             return
         if word not in known:
-            near = get_close_matches(word, known, n=2)
-            hint = (
-                f"did you mean {' or '.join(map(repr, near))}?" if near else f"there are {', '.join(known)}"
-            )
+            near = " or ".join(map(repr, get_close_matches(word, known, n=2)))
+            hint = f"did you mean {near}?" if near else f"there are {', '.join(known)}"
             raise InputError(f"no command {' '.join(args[: place + 1])!r}; {hint}")
         if word not in groups:
             return

@@ -1,8 +1,8 @@
 """Arguments that several commands have, with their types, help and checks."""
 
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Protocol
 
@@ -11,6 +11,8 @@ import tyro
 from langsplat_core import config
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_file, check_output_folder
+
+(PLACED,) = tyro.conf.Positional[str].__metadata__  # type: ignore[attr-defined]  # the mark that it is
 
 
 class Runnable(Protocol):
@@ -35,16 +37,21 @@ class Needs:
     said: str = ""  # how that is given; "": by the option of its name
 
 
-OutFile = Annotated[Path, OutputPath("file")]
-OutFolder = Annotated[Path, OutputPath("folder")]
+# What these say holds in other types, too, as in `OutFile | None`.
+OutFile = Annotated[Path, OutputPath("file"), tyro.conf.arg(metavar="FILE")]
+OutFolder = Annotated[Path, OutputPath("folder"), tyro.conf.arg(metavar="FOLDER")]
+Photographs = Annotated[Path, tyro.conf.arg(metavar="PHOTOGRAPHS")]
+Texts = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TEXT ...")]
+EncoderName = Annotated[str, tyro.conf.arg(metavar="ID|FOLDER")]
 
 _trained = tyro.conf.arg(help="A trained scene, *.ply with its language field beside it.")
+_written = tyro.conf.arg(help="Scene to write: .ply, .spz ...; or --out OUT, -o OUT.")
 _taught = "Your own words, as `langsplat teach --into FILE` writes them, beside those of the scene."
 _encoder = tyro.conf.arg(help="Text encoder folder or hub id, in place of the one the scene names.")
 AnyScene = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Any readable scene.")]
 TrainedScene = Annotated[tyro.conf.Positional[Path], _trained]
-WrittenScene = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Scene to write: .ply, .spz ...")]
-EncoderOption = Annotated[str, _encoder]
+WrittenScene = Annotated[tyro.conf.Positional[Path], _written]
+EncoderOption = Annotated[EncoderName, _encoder]
 JsonOption = Annotated[bool, tyro.conf.arg(help="Print JSON, lengths in world units.")]
 _scale = tyro.conf.arg(help="Metres per world unit, in place of what the scene says.")
 ScaleOption = Annotated[config.Positive | None, _scale]
@@ -69,19 +76,17 @@ def check_arguments(command: object) -> None:
                 raise InputError(f"{option}: is only used with {other}; add that, or leave {option} out")
 
 
-def named(args: Sequence[str], option: str) -> str:
-    """Return the last value that `args` give for an option; "" where they give none."""
-    values = [
-        after if word == option else word.partition("=")[2]
-        for word, after in pairwise([*args, ""])
-        if word.partition("=")[0] == option
-    ]
-    return values[-1] if values else ""
+def named(args: Sequence[str], *option: str) -> tuple[str | None, list[str]]:
+    """Return the last value that words give for an option, by any of its names, and the other words."""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument(*option, dest="value", nargs="?", const="")
+    found, others = parser.parse_known_args(args)
+    return found.value, others
 
 
 def check_codec(args: Sequence[str], default: config.CodecKind = "codebook") -> None:
     """Raise InputError for a codec's setting among `args` that the kind which they choose has not."""
-    kind = named(args, "--codec.kind") or default
+    kind = named(args, "--codec.kind")[0] or default
     own = config.CODEC_SETTINGS.get(kind, ())  # type: ignore[call-overload]  # whatever was typed
     typed = {word.partition("=")[0].replace("_", "-").replace("--max-", "--codec.max-") for word in args}
     for name in sorted(set().union(*config.CODEC_SETTINGS.values()) - {*own} if own else ()):

@@ -40,8 +40,7 @@ class Describe:
     outline: bool = False
     """The scene as a tree: wholes, with their parts under them."""
     labels: Annotated[Path | None, tyro.conf.arg(metavar="OUT.ply")] = None
-    """Write the scene with instance, part and class of each Gaussian as properties, and OUT.labels.json with
-    the tree's nodes: words, boxes, counts."""
+    """Write instance, part and class of each Gaussian into this .ply, and OUT.labels.json about the nodes."""
     vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Your own list, one phrase per line, in place of the bundled everyday things and parts."""
     encoder: EncoderOption = ""

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from langsplat_core import registry
-from langsplat_core.cli.arguments import AnyScene, EncoderOption, WrittenScene
+from langsplat_core.cli.arguments import AnyScene, EncoderName, EncoderOption, WrittenScene
 from langsplat_core.config import CodecConfig, Coordinate, Degrees, Level, Positive
 from langsplat_core.errors import InputError
 from langsplat_core.io import scenes
@@ -32,7 +32,7 @@ class Export:
 
     scene: AnyScene
     out: tyro.conf.Positional[Path]
-    """Page to write, *.html."""
+    """Page to write, *.html; or --out OUT, -o OUT."""
     title: str = ""
     """Heading of the page, by default the scene's name."""
     view: str = ""
@@ -74,14 +74,12 @@ class Convert:
     source: tyro.conf.Positional[Path]
     """Scene to read, of any format; or the first of the files that another method has of one scene."""
     rest: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[MORE...] OUT")]]
-    """The other method's further files, in any order, and last the scene to write (.ply, .spz, .sog, .glb,
-    .gltf, .usdc, .usda or .splat); with --to the folder."""
-    rematch: Path | None = None
-    """A language sidecar (*.langsplat.safetensors) made before the Gaussians were edited: its field is
-    carried over to the Gaussians of SOURCE by nearest position."""
+    """Further files of that method, and last (or as --out OUT, -o OUT) the scene or folder to write."""
+    rematch: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A language sidecar of before the Gaussians were edited, carried over to those of SOURCE by position."""
     to: Annotated[str, tyro.conf.arg(metavar="scene|langsplat")] = "scene"
     """langsplat: a folder with LangSplat's three checkpoints and its autoencoder."""
-    encoder: str | None = None
+    encoder: EncoderName | None = None
     """Text encoder of the checkpoints' vectors: hub id, folder or "demo" (default: LangSplat's OpenCLIP,
     laion/CLIP-ViT-B-16-laion2B-s34B-b88K). With a single .ply: its semantic_* are read."""
     levels: tuple[Level, ...] = ()

@@ -4,6 +4,7 @@ import logging
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -157,15 +158,14 @@ class QueryScene:
     """Ask a scene for phrases: score, level, pixel, place in world units, box."""
 
     scene: arguments.TrainedScene
-    texts: tyro.conf.Positional[tuple[str, ...]] = ()
+    texts: arguments.Texts = ()
     """Phrases, each in quotes if it has several words; "," and ";" separate them too. What cannot be asked
     is named on stderr, and the rest is answered; with nothing left the exit code is 2."""
     taught: arguments.WordsOption = None
     level: LevelChoice = "auto"
     """Semantic level; auto takes the one that answers best, for a thing rather the whole."""
     mode: Literal["splat", "paper"] = "splat"
-    """splat: relevancy per Gaussian, then blended. paper: latents blended, every pixel decoded, and phrases
-    asked whole, without looking for structure such as "lid of the teapot"."""
+    """splat: relevancy per Gaussian, blended; paper: latents blended, pixels decoded, phrases asked whole."""
     camera: Annotated[CountOrZero | None, tyro.conf.arg(metavar="INDEX")] = None
     """Training view in which the pixel is reported: by default the first, and of up to 32 phrases."""
     encoder: arguments.EncoderOption = ""
@@ -173,14 +173,12 @@ class QueryScene:
     """How many of a phrase's things are listed, the best first."""
     scale: arguments.ScaleOption = None
     why: arguments.OutFile | None = None
-    """Draw the evidence here, *.png: the photographs and masks that the best region of each answer stands on,
-    best and worst. --json then has it, too."""
-    segmenter: str = ""
-    """Ask the photographs, too: hub id or folder of a model that outlines what phrases name, such as
-    facebook/sam3. Every answer then says who found it: the field, the photographs, or both."""
-    work: Annotated[Path | None, _PHOTOGRAPHS] = None
+    """Draw here, *.png, the best and worst photograph and mask behind each answer; --json has them, too."""
+    segmenter: arguments.EncoderName = ""
+    """Ask the photographs, too, by a model that outlines what phrases name, such as facebook/sam3."""
+    work: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), _PHOTOGRAPHS] = None
     """Folder of the training, with its masks (default: <scene>.work)."""
-    photographs: Annotated[Path | None, _PHOTOGRAPHS] = None
+    photographs: Annotated[arguments.Photographs | None, _PHOTOGRAPHS] = None
     """The dataset of the training, if it is elsewhere now."""
     json: arguments.JsonOption = False
 
@@ -319,17 +317,10 @@ class _Explainer:
         if found is None:
             return None
         self._sheets.append(draw_evidence(found, answer, engine.scene, self._features, self._photographs))
-        return {
-            "summary": str(found),
-            "phrase": found.phrase,
-            "node": found.node,
-            "for": len(found.votes),
-            "against": len(found.others),
-            "fitting": found.fitting,
-            "share": found.share,
-            "interval": list(found.interval),
-            "rows": [asdict(vote) | {"agrees": vote.agrees} for vote in (*found.votes, *found.others)],
-        }
+        kept = {name: getattr(found, name) for name in ("phrase", "node", "fitting", "share", "interval")}
+        rows = [asdict(vote) | {"agrees": vote.agrees} for vote in (*found.votes, *found.others)]
+        counts = {"for": len(found.votes), "against": len(found.others)}
+        return {"summary": str(found), **kept, **counts, "rows": rows}
 
     def write(self) -> None:
         """Write the sheets one below the other."""
@@ -341,17 +332,16 @@ class _Explainer:
 
 def once(load: LoadEncoder, instead: str = "") -> LoadEncoder:
     """Return `load`, or that of `instead`, called once for each encoder, also where a hub is out of reach."""
-    known: dict[str, TextEncoder | EncoderError] = {}
+
+    @cache
+    def tried(model: str) -> TextEncoder | EncoderError:
+        try:
+            return load(model)
+        except EncoderError as error:
+            return error
 
     def load_once(model: str) -> TextEncoder:
-        name = instead or model
-        if name not in known:
-            try:
-                known[name] = load(name)
-            except EncoderError as error:
-                known[name] = error
-        found = known[name]
-        if isinstance(found, EncoderError):
+        if isinstance(found := tried(instead or model), EncoderError):
             raise found
         return found
 
@@ -425,7 +415,7 @@ class Select:
     """
 
     scene: arguments.TrainedScene
-    texts: tyro.conf.Positional[tuple[str, ...]]
+    texts: arguments.Texts
     """Phrases, each in quotes if it has several words; what any of them names is taken."""
     out: arguments.OutFile
     """Scene to write: .ply, .spz, .sog, .glb, .gltf, .usdc, .usda or .splat."""

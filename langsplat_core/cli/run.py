@@ -18,14 +18,16 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, make_dataclass
+from dataclasses import dataclass, is_dataclass, make_dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 from langsplat_core import __version__
-from langsplat_core.cli.arguments import Runnable, check_arguments
+from langsplat_core.cli.arguments import PLACED, Runnable, check_arguments
+from langsplat_core.config import annotations
 from langsplat_core.errors import STRICTNESS, InputError, LangSplatError, optional_imports, printable_line
 from langsplat_core.interrupts import SAID, Terminated, raised
 from langsplat_core.io.files import NO_ROOM, shown
@@ -34,20 +36,18 @@ log = logging.getLogger("langsplat")
 HOME = re.compile(r"^(--[\w.-]+=|)~(?=/)")  # in quotes, after = or in a file, where a shell leaves it
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 _CONTINUES = "; the same command goes on from what was finished"
+_CONFIG = (tyro.conf.CascadeSubcommandArgs, tyro.conf.DisallowNone)
+ROLES, _ASKED = ConstructorRegistry(), object()  # the rule for help; the mark of what tyro itself is asked
 _ROOM = "make room, or choose another place; what was finished is kept"
-
-_Flag = Annotated[
-    tyro.conf.FlagCreatePairsOff[bool], tyro.conf.create_mutex_group(required=False, title="how much is said")
-]
 
 
 @dataclass(frozen=True)
 class Verbosity:
     """Options for the amount of messages on standard error."""
 
-    quiet: Annotated[_Flag, tyro.conf.arg(aliases=["-q"])] = False
+    quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(aliases=["-q"])] = False
     """Errors alone: no progress, notes or warnings."""
-    verbose: Annotated[_Flag, tyro.conf.arg(aliases=["-v"])] = False
+    verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(aliases=["-v"])] = False
     """Also what each step took, and what was taken from an earlier run."""
     strict: tyro.conf.FlagCreatePairsOff[bool] = False
     """Refuse files of which something would be skipped, padded, rounded or guessed, in place of saying so."""
@@ -77,7 +77,7 @@ def one_line(box: str) -> str:
     words = " ".join(" ".join(said).split()) or title.strip(" ╭╮─").lower()
     hint = r"\1 is missing; is there an unknown option, or a file '-NAME' in place of './-NAME'?"
     words = re.sub(r"Missing value for argument 'command\.(\w+)'.*", hint, words)
-    optional = r"Error parsing (\S+): no type .*?\|(.*?) could be instantiated from (\[.*?\])\. Got.*"
+    optional = r"Error parsing (\S+): no type matching (.*?) could be instantiated from (\[.*?\])\. Got.*"
     words = re.sub(optional, r"\1: expected \2, got \3", words)
     pair = r"Error parsing (\S+): .*? (\[.*?\]) into tuple type tuple\[typing\.Literal\[(.*?)\], .*?float.*\]"
     words = re.sub(pair, r"\1: expected one of \3 and a number, got \2", words)
@@ -86,6 +86,29 @@ def one_line(box: str) -> str:
         near = dict.fromkeys(line.split()[0].strip(",") for line in body if re.match("--[a-z]", line))
         words += f"; did you mean {' or '.join(near)}?"
     return f"{words or 'unusable arguments'} (see --help)"
+
+
+@ROLES.struct_rule
+def _with_roles(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Return the arguments that a dataclass has by tyro's own rule, each field as its role."""
+    if _ASKED in info.markers or not is_dataclass(info.type):
+        return None  # tyro's rules are next
+    made: Any = ROLES.get_struct_spec(replace(info, markers=(*info.markers, _ASKED)))
+    return replace(made, fields=tuple(map(_as_role, made.fields)))
+
+
+def _as_role(field: StructFieldSpec) -> StructFieldSpec:
+    """Return a field of which help names the role instead of the type, and no default that is nothing."""
+    said = list(annotations(field.type))
+    placed, several = PLACED in said, " ..." if Ellipsis in said else ""
+    role = field.name.upper() if placed else "TEXT" if str in said else None
+    marks = [tyro.conf.arg(metavar=role and role + several)]
+    if isinstance(field.default, bool) or field.default in (None, "", (), tyro.MISSING_NONPROP):
+        marks.append(tyro.conf.arg(help_behavior_hint=""))
+    marks += [part for part in said if isinstance(part, type(marks[0]))]  # also of the types in this one
+    if field.name == "out":
+        marks.append(tyro.conf.arg(metavar="OUT", aliases=None if placed else ["-o"]))
+    return replace(field, type=Annotated[(field.type, *marks)])  # type: ignore[arg-type]
 
 
 def parsed(program: str, kind: Any, args: Sequence[str], description: str | None = None) -> Any:
@@ -106,8 +129,10 @@ def parsed(program: str, kind: Any, args: Sequence[str], description: str | None
         namespace={"__doc__": getattr(kind, "__doc__", None)},
     )
     found: Any = tyro.cli(
-        line, prog=program, description=description, args=args, config=(tyro.conf.CascadeSubcommandArgs,)
+        line, prog=program, description=description, args=args, config=_CONFIG, registry=ROLES
     )
+    if found.verbosity.quiet and found.verbosity.verbose:
+        raise InputError("--quiet and --verbose: one says less, the other more; give one of them")
     log.setLevel(found.verbosity.level)
     STRICTNESS.on = found.verbosity.strict
     return found.command

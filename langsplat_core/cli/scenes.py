@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import tyro
 
 from langsplat_core import __version__
-from langsplat_core.cli.arguments import AnyScene, JsonOption, Needs, OutFolder
+from langsplat_core.cli.arguments import AnyScene, EncoderName, JsonOption, Needs, OutFolder
 from langsplat_core.cli.run import print_json
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, printable_line, remedy
 from langsplat_core.io.scenes import disk_bytes, load_scene, summarise
@@ -92,7 +92,7 @@ class Doctor:
     of what is there is found. With --json this is what to send back about weights of your own.
     """
 
-    encoder: str = ""
+    encoder: EncoderName = ""
     """Try this encoder: demo, a hub id, a folder or a file of weights."""
     calibrate: Annotated[bool, Needs("encoder")] = False
     """Keep the calibration that the room gives, for all scenes of this encoder that have none."""
@@ -178,7 +178,7 @@ class Demo:
     out: OutFolder = Path("demo_out")
     """Folder to write."""
     open: tyro.conf.FlagCreatePairsOff[bool] = True
-    """Open the page in the browser, where there is one with a window."""
+    """Leave the page closed; else it opens in the browser, where there is one with a window."""
 
     def run(self) -> None:
         from langsplat_core.cli.export import Export

@@ -43,23 +43,20 @@ class Train:
     dataset: tyro.conf.Positional[tuple[Path, ...]]
     """Folder of photographs, video, COLMAP project folder, or transforms.json; several make a scene each."""
     out: Path
-    """The scene to write, *.ply; its language field and cameras are written beside it. Of several datasets
-    the folder of the scenes."""
-    on: str = ""
+    """Scene to write, *.ply, with its language field and cameras beside it; of several datasets a folder."""
+    on: Annotated[str, tyro.conf.arg(metavar="WHERE")] = ""
     """What trains several datasets: local:N, N at a time on this machine, or the workers of dask://HOST:PORT."""
     work: OutFolder | None = None
     """Folder for intermediate results (default: <out>.work)."""
     profile: TrainProfile = "default"
     """"paper" starts from the published method's settings; options beside it still count."""
     preset: TrainPreset = "full"
-    """How much is spent: quick takes minutes on a CPU, good perhaps half an hour, full is as published and
-    for a GPU; options beside it still count."""
+    """quick: minutes on a CPU; good: half an hour; full: as published, for a GPU; options beside it count."""
     progress: Literal["bars", "lines"] = "bars"
-    """How progress is shown: as bars, or for other programs as lines of JSON (stage, fraction, note,
-    metrics), both on standard error."""
+    """How progress is shown on standard error: as bars, or for other programs as lines of JSON."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
     """A file of options, `preset = "good"` or `radiance.steps = 7000`; options beside it count more."""
-    gaussians: Path | None = None
+    gaussians: Annotated[Path | None, tyro.conf.arg(metavar="SCENE")] = None
     """Take the Gaussians of this scene, trained elsewhere from the same cameras, and describe them."""
     until: Until = "language field"
     """"gaussians" writes a scene without a language field; the same command without this adds that."""
@@ -150,7 +147,7 @@ class Train:
 
 def train_command(args: Sequence[str]) -> type[Train]:
     """Return `Train` with the settings of the profile and preset that `args` name as defaults."""
-    profile, preset = named(args, "--profile"), named(args, "--preset")
+    profile, preset = named(args, "--profile")[0], named(args, "--preset")[0]
     config = PAPER if profile == "paper" else TrainConfig()
     check_codec(args, config.codec.kind)
     if preset in get_args(TrainPreset):
@@ -166,7 +163,7 @@ def train_command(args: Sequence[str]) -> type[Train]:
 
 def with_file(args: Sequence[str]) -> list[str]:
     """Return the words of `langsplat train ...` behind those of --config's file; InputError names its key."""
-    if not (name := named(args, "--config")):
+    if not (name := named(args, "--config")[0]):
         return list(args)
     text, complaint = read_text(Path(name)), io.StringIO()
     try:

@@ -314,10 +314,9 @@ def fit_scaling(present: Array, absent: Array) -> PlattScaling:
         raise InputError("a calibration needs ten phrases for what is there and ten for what is not")
     fits = np.concatenate([present, absent])
     features = np.column_stack([fits[:, 2], fits[:, :2].max(axis=1), fits[:, 3:]])
-    targets = np.repeat(
-        [(len(present) + 1) / (len(present) + 2), 1 / (len(absent) + 2)], [len(present), len(absent)]
-    )
-    weights = np.repeat([1 / len(present), 1 / len(absent)], [len(present), len(absent)])
+    there, not_there = counts = len(present), len(absent)
+    targets = np.repeat([(there + 1) / (there + 2), 1 / (not_there + 2)], counts)
+    weights = np.repeat([1 / there, 1 / not_there], counts)
 
     def loss(parameters: Array) -> float:
         logits = parameters[0] + features @ parameters[1:]

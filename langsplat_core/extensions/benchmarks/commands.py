@@ -28,7 +28,7 @@ class _Eval:
     paths: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[SCENE] DATA")]]
     """A scene, or a folder with NAME.ply for each of the benchmark's scenes; then the folder of the
     benchmark, or of one of its scenes. With --maps only the latter."""
-    maps: Path | None = None
+    maps: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Score these maps of another system, files named VIEW/PHRASE.npy or .png, instead of a scene."""
     json: OutFile | None = None
     """Also write all figures to this file."""

@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import scipy.sparse
+import tyro
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import OutFolder
@@ -65,7 +66,7 @@ class BenchRaster:
     """Width and height of the image, pixels."""
     channels: Channels = 12
     """Values per Gaussian."""
-    scenes: tuple[Path, ...] = ()
+    scenes: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="SCENE ...")] = ()
     """Real scenes to measure beside the random ones, from their first camera, else one that frames them."""
     out: OutFolder = Path("bench_out")
     """Folder for raster.md and raster.json."""

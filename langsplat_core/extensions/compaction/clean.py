@@ -18,7 +18,6 @@ many as the loss, measured on other views, allows.
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -27,7 +26,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array, rotation_matrices
-from langsplat_core.cli.arguments import AnyScene, JsonOption, WrittenScene
+from langsplat_core.cli.arguments import AnyScene, JsonOption, Photographs, WrittenScene
 from langsplat_core.cli.run import print_json
 from langsplat_core.config import Count
 from langsplat_core.errors import InputError
@@ -264,7 +263,7 @@ class Clean:
 
     scene: AnyScene
     out: WrittenScene
-    photos: Path | None = None
+    photos: Photographs | None = None
     """Dataset the scene was trained on; removing true floaters then costs nothing, so more are removed."""
     json: JsonOption = False
     config: Annotated[CleanConfig, tyro.conf.arg(name="")] = field(default_factory=CleanConfig)

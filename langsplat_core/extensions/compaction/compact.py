@@ -42,7 +42,7 @@ import numpy as np
 import tyro
 
 from langsplat_core.arrays import Array, mean_squared_error, psnr
-from langsplat_core.cli.arguments import AnyScene, JsonOption, OutFile
+from langsplat_core.cli.arguments import AnyScene, JsonOption, OutFile, Photographs
 from langsplat_core.cli.run import print_json
 from langsplat_core.config import DatasetConfig, Decibels, Range, SeveralCount, Side, check_settings
 from langsplat_core.datasets import load_capture
@@ -393,7 +393,7 @@ class Compact:
     scene: AnyScene
     out: OutFile | None = None
     """The scene to write (default: SCENE with the ending .compact.ply)."""
-    photos: Path | None = None
+    photos: Photographs | None = None
     """Dataset the scene was trained on: the loss is then measured against its photographs."""
     json: JsonOption = False
     config: Annotated[BudgetConfig, tyro.conf.arg(name="")] = field(default_factory=BudgetConfig)

@@ -50,7 +50,7 @@ class WriteMesh:
 
     scene: AnyScene
     out: tyro.conf.Positional[OutFile]
-    """File to write: .ply in world units, .glb in metres with y up."""
+    """File to write: .ply in world units, .glb in metres with y up; or --out OUT, -o OUT."""
     phrase: str = ""
     """Write only what this names; the scene then needs a language field."""
     level: Annotated[LevelChoice, Needs("phrase")] = "auto"
@@ -209,7 +209,7 @@ class Map:
     scene: tyro.conf.Positional[Path]
     """A trained scene with its cameras; labels of voxels and goals need a language field."""
     out: tyro.conf.Positional[OutFolder]
-    """Folder to write."""
+    """Folder to write; or --out OUT, -o OUT."""
     resolution: Positive = 0.05
     """Side of a cell, metres."""
     goal: tuple[str, ...] = ()

@@ -128,7 +128,7 @@ class Changes:
     before: TrainedScene
     after: tyro.conf.Positional[Path]
     """Another scene of the same place."""
-    transform: Path | None = None
+    transform: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Transform of the second to the axes of the first, .json of `langsplat register`; by default both have
     the same axes."""
     register: bool = False
