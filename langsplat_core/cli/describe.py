@@ -75,7 +75,7 @@ class Describe:
         print(f"answers: {engine.basis.long}")
         if left_out:
             print(
-                f"{asked} phrases were compared; {len(left_out)} were left out, because the encoder was "
+                f"{asked} phrases compared, {len(left_out)} left out, because the encoder was "
                 f"never taught their words ({shortened(left_out, 3)})"
             )
 

@@ -466,5 +466,5 @@ class Select:
             print_json(in_world(content, unit.origin))
             return
         print("\n".join(instance_lines(listed(found)["instances"], unit)))
-        of = f"all but the {selected} selected" if self.remove else f"of {selected} selected Gaussians"
+        of = f"all but the {selected} selected" if self.remove else f"of {selected} selected"
         print(f"{self.out}: {written} Gaussians, {of}")

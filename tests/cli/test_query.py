@@ -246,7 +246,7 @@ def test_outline_and_inventory_are_printed_as_text_and_json(described, capsys):
         assert (np.diff(node["size"]) <= 0).all()
     words = words[:-1]
     said = "\n".join(lines(capsys, *words))
-    assert "4 phrases were compared; 1 were left out" in said
+    assert "4 phrases compared, 1 left out" in said
     found = answers(capsys, *words)
     assert (found["asked"], found["left_out"]) == (4, 1)
     assert {entry["phrase"] for entry in found["inventory"]} == {"mug", "book", "plant"}
