@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -41,13 +42,24 @@ from tests.support.tiny_models import tiny_clip
 EVERY = {"viewer": ViewerCommand} | {name: load_command(name) for name in command_names()}
 
 
+def parsed_as(name, words):
+    return viewer_parse(words) if name == "viewer" else parse([*name.split(), *words])
+
+
 @pytest.mark.parametrize("name", EVERY)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_every_option_is_described(name):
+def test_every_option_is_described(name, capsys):
+    """By phrases that need no other's, roles in place of types, and defaults that are some."""
     actions = get_parser(EVERY[name])._actions  # noqa: SLF001  argparse has no public list of them
     assert len(actions) > len(dataclasses.fields(EVERY[name])) // 2
     said = {one.dest: (one.help or "").partition("(default")[0].replace("(required)", "") for one in actions}
     assert [option for option, text in said.items() if len(text.strip()) < 3] == []
+    fragment = r"(of|times|at|asked) |.* (of|behind) that *$|.*between two of them|.*the following"
+    assert [text for text in said.values() if re.match(fragment, text)] == []
+    with pytest.raises(SystemExit):
+        parsed_as(name, ["--help"])
+    empty = r"\(default: (?:None|True|False|'')?\)|\{None|\bSTR\b|\bPATH\b(?!\.)|can be overridden"
+    assert re.findall(empty, " ".join(capsys.readouterr().out.split())) == []
 
 
 @pytest.mark.parametrize(
@@ -55,6 +67,7 @@ def test_every_option_is_described(name):
     [
         (["qurey", "a.ply"], "no command 'qurey'; did you mean 'query'?"),
         (["xyz"], "no command 'xyz'; there are train, query"),
+        (["-v", "doctor", "-q"], "--quiet and --verbose: one says less"),
         (["--tyro-print-completion", "ksh"], "--tyro-print-completion ksh: there is bash, zsh"),
     ],
 )
@@ -79,11 +92,8 @@ def test_home_is_meant_where_no_shell_says_so(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "a.toml").write_text('work = "~/w"\n')
     train = parse(["train", "~/photos", "--out=~/a.ply", f"--config={tmp_path / 'a.toml'}"])
-    assert (train.dataset, train.out, train.work) == (
-        (tmp_path / "photos",),
-        tmp_path / "a.ply",
-        tmp_path / "w",
-    )
+    assert (*train.dataset, train.out) == (tmp_path / "photos", tmp_path / "a.ply")
+    assert train.work == tmp_path / "w"
     assert viewer_parse(["~old.ply"]).scene == Path("~old.ply")
 
 
@@ -181,12 +191,11 @@ LINES = {  # words that work: positions, and options; what would take long ends 
     "describe": "s.ply -- --vocabulary v.txt",
     "select": "s.ply gift -- --out o.ply",
     "teach": "s.ply -- --name mine --at 20,20 --into w.safetensors",
-    "scale": "s.ply --",
+    **dict.fromkeys(("scale", "inspect", "serve"), "s.ply --"),
     "transform": "s.ply o.ply --",
     "crop": "s.ply o.ply -- --box -9 -9 -9 9 9 9",
     "export": "s.ply o.html --",
     "convert": "s.ply o.ply --",
-    "inspect": "s.ply --",
     "doctor": "--",
     "demo": "-- --out s.ply/demo",
     "find": "gift . --",
@@ -197,11 +206,8 @@ LINES = {  # words that work: positions, and options; what would take long ends 
     "merge": "s.ply t.ply -- --out o.ply --as-is",
     "clean": "s.ply o.ply -- --views 2",
     "compact": "s.ply -- --out o.ply --views 2",
-    "eval lerf-ovs": "s.ply . --",
-    "eval 3d-ovs": "s.ply . --",
-    "eval gr-lerf": "s.ply . --",
+    **{f"eval {one}": "s.ply . --" for one in ("lerf-ovs", "3d-ovs", "gr-lerf")},
     "bench raster": "-- --scenes absent.ply --out b",
-    "serve": "s.ply --",
 }
 
 
@@ -221,11 +227,22 @@ def corner(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", EVERY)
 def test_every_number_of_every_command_has_a_range(name):
-    words = LINES[name].replace("--", "", 1).split()
-    command = viewer_parse(words) if name == "viewer" else parse([*name.split(), *words])
+    command = parsed_as(name, LINES[name].replace("--", "", 1).split())
     without = {option for option, _, hint in numeric_settings(command) if range_of(hint) is None}
     assert without <= {"--rotate", "--start"}  # refused where they are used
     check_settings(command)
+
+
+WITH_OUT = [name for name, kind in EVERY.items() if "out" in {*dir(kind), *kind.__dataclass_fields__}]
+
+
+@pytest.mark.parametrize("name", WITH_OUT)
+def test_every_output_may_be_named_by_out_or_o(name):
+    whole = LINES[name].replace("--", "", 1).split()
+    words = [word for word in whole if word not in ("--out", str(parsed_as(name, whole).out))]
+    for given in (["--out", "new.ply"], ["--out=new.ply"], ["-o", "new.ply"]):
+        for line in ([*words, *given], [*given, *words]):
+            assert parsed_as(name, line).out == Path("new.ply")
 
 
 def odd_places(name: str) -> Iterator[tuple[list[str], list[str], int]]:
@@ -278,9 +295,7 @@ WRITING = [
     "convert s.ply {}.ply",
     "compact s.ply --out {}.ply",
     "demo --out {}",
-    "eval lerf-ovs s.ply d --json {}.json",
-    "eval 3d-ovs s.ply d --json {}.json",
-    "eval gr-lerf s.ply d --json {}.json",
+    *(f"eval {one} s.ply d --json {{}}.json" for one in ("lerf-ovs", "3d-ovs", "gr-lerf")),
     "bench raster --out {}",
 ]
 
