@@ -51,8 +51,8 @@ def parse(args: list[str]) -> Runnable:
         commands = {one: load_command(one) for one in CORE}
         commands |= {one: kind for one, kind in registry.parts("commands").items() if " " not in one}
         commands |= {one: _group(one) for one in groups}
-    about = "Train, query, convert and measure 3D Gaussian scenes with a language field."
-    found = parsed("langsplat", _union(commands), [*before, *args], about)
+    about = "Train, query, convert and measure 3D Gaussian scenes. OUT may also be --out OUT or -o OUT."
+    found = parsed("langsplat", _union(commands, len(commands) > 1), [*before, *args], about)
     return getattr(found, "command", found)  # of a group
 
 
@@ -95,9 +95,12 @@ def _members(group: str) -> list[str]:
     return [name.split(" ")[1] for name in registry.references("commands") if name.startswith(f"{group} ")]
 
 
-def _union(commands: Mapping[str, Any]) -> Any:
-    """Return the union of commands as subcommands of these names; tyro needs at least two."""
-    named = [Annotated[kind, tyro.conf.subcommand(name=name)] for name, kind in commands.items()]
+def _union(commands: Mapping[str, Any], brief: bool = False) -> Any:
+    """Return commands as subcommands, brief with the first line of their help; tyro needs at least two."""
+    named = []
+    for name, kind in commands.items():
+        about = (kind.__doc__ or "").split("\n")[0] if brief else None
+        named.append(Annotated[kind, tyro.conf.subcommand(name=name, description=about)])
     return Union[(*named, Annotated[None, tyro.conf.Suppress])]
 
 
