@@ -47,12 +47,7 @@ _HOMES = {
     for name in names.split()
 }
 
-__all__ = [
-    "Camera", "Gaussians", "Intrinsics", "LanguageField", "QueryEngine", "QueryResult", "Rendering",
-    "Scene", "TrainConfig", "Words", "draw", "load_lifting_rasterizer", "load_rasterizer", "load_scene",
-    "load_text_encoder", "look_at", "read_words", "render", "run_phrase", "save_scene", "show", "train_scene",
-    "view_of", "write_words",
-]  # fmt: skip
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

@@ -123,13 +123,6 @@ def test_gpu_run_without_a_gpu_writes_nothing(tmp_path, runner, monkeypatch, cap
     assert not out.exists()
 
 
-def test_gpu_sections_have_functions_and_docs(runner: ModuleType, sections: ModuleType) -> None:
-    page = (ROOT / "docs" / "speed.md").read_text()
-    for name, limit in runner.SECTIONS.items():
-        assert callable(getattr(sections, f"measure_{name}"))
-        assert f"| {name} | {limit} |" in page
-
-
 def test_container_has_what_the_makefile_installs_and_no_rights(monkeypatch):
     text = (PACKAGING / "Dockerfile").read_text()
     libraries = script("system_libraries", monkeypatch)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from langsplat_core import QueryEngine, load_scene, load_text_encoder, render
+from langsplat_core import QueryEngine, load_scene, load_text_encoder, render, run_phrase
 
 LEVELS = ("subpart", "part", "whole")
 
@@ -23,7 +23,7 @@ def main() -> None:
     scene = load_scene(Path(str(files("langsplat_assets"))) / "demo" / "scene.ply")
     engine = QueryEngine(scene, load_text_encoder)  # the encoder is loaded when a phrase first needs it
     for phrase in ("blue gift", "yellow banana"):
-        answer = engine.run(phrase)
+        answer = run_phrase(engine, phrase).answer
         verdict = "found" if answer.found else "not here"
         print(f"{phrase}: {verdict}, score {answer.peak:.2f}, level {LEVELS[answer.level]}")
         if answer.found and answer.place is not None:

@@ -386,11 +386,11 @@ def _lines(answer: dict[str, Any], unit: Unit, photographs: int) -> list[str]:
     best, least, most = count["best"], count["least"], count["most"]
     if most > 1 or (most and not answer["found"]):
         verdict += f", {best} of them" + ("" if least == most else f" ({least} to {most})")
-    place = "-" if answer["place"] is None else f"{unit.place(answer['place'])} {unit.name}"
-    lines = [
-        f"{answer['phrase']}: {verdict}, score {answer['score']:.3f} at level {answer['level']}, "
-        f"place {place}, pixel {answer['pixel']}"
-    ]
+    shown = None if answer["verdict"] == "not here" else answer["place"]
+    place = "none" if shown is None else f"{unit.place(shown)} {unit.name}"
+    pixel = "" if shown is None or answer["pixel"] is None else f", pixel {answer['pixel']}"
+    scored = f"score {answer['score']:.3f} at level {answer['level']}"
+    lines = [f"{answer['phrase']}: {verdict}, {scored}, place {place}{pixel}"]
     if answer["reading"] is not None:
         lines.append(f"  read as: {answer['reading']}")
     if "found_by" in answer:

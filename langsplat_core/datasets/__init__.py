@@ -42,14 +42,19 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     return add_points(capture, split_views(capture, config)[0], work, progress)
 
 
+def check_dataset(path: Path) -> None:
+    """Raise InputError unless a file, or a folder with something in it, lies at `path`."""
+    if not os.path.exists(path) or (path.is_dir() and not os.listdir(path)):  # Path.exists may raise
+        raise InputError(f"{shown(path)} does not exist or is empty; expected {ACCEPTED}")
+
+
 def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
     """Return what `load_capture` does, with the points and the scale that the dataset states, or none."""
     path = Path(path)
     STRICTNESS.said.clear()
     check_settings(config, "--dataset.")
-    if not os.path.exists(path):  # unlike Path.exists, also no for names that no file system could hold
-        raise InputError(f"{shown(path)} does not exist; expected {ACCEPTED}")
     try:
+        check_dataset(path)
         listed = [path] if path.suffix.lower() == ".json" else [path / name for name in TRANSFORMS]
         if (frames := next(filter(Path.is_file, listed), None)) is not None:
             return centred(load_nerfstudio(frames, config, progress))

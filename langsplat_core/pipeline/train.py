@@ -21,7 +21,7 @@ from uuid import uuid4
 import numpy as np
 
 from langsplat_core.config import QUICK_SIDE, RadianceConfig, TrainConfig, Until, check_settings
-from langsplat_core.datasets import load_capture
+from langsplat_core.datasets import check_dataset, load_capture
 from langsplat_core.datasets.capture import Capture, split_views
 from langsplat_core.datasets.photos import count_photographs
 from langsplat_core.errors import STRICTNESS, InputError, LangSplatError, optional_imports
@@ -138,6 +138,7 @@ def _train(
     config, processes = run.config, run.processes
     encoder, source = None, None
     with run.timed("photographs"):
+        check_dataset(run.dataset)
         if run.until != "gaussians":  # first: absent weights should not cost an hour
             encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
             source = None if masks_of else load_mask_source(config.masks, config.clip.device)

@@ -59,16 +59,10 @@ def run_phrase(
     """
     expect(engine, QueryEngine, "QueryEngine(scene, encoder) makes one")
     expect(viewpoint, Camera | None, "scene.cameras has those of a scene")
-    tree = grammar.parse(text, engine.taught)
+    tree = check_phrase(engine, text, viewpoint, progress)
     if isinstance(tree, grammar.Atom):
         return ComposedResult(engine.run(tree.text, level, progress), tree)
-    _check_viewpoint(tree, viewpoint)
-    try:
-        found = _Evaluator(engine, viewpoint, progress).answer(tree, level)
-    except EncoderError:
-        if phrase_key(text) not in engine.field.phrasebook:
-            raise
-        return ComposedResult(engine.run(text, level, progress), grammar.Atom(tidy(text)))
+    found = _Evaluator(engine, viewpoint, progress).answer(tree, level)
     # The position is that of the connected members with the highest relevancy.
     values = np.where(found.members, found.relevancy[found.level], 0).astype(np.float32)
     smoothed = engine.surface.smooth(values)
@@ -83,8 +77,8 @@ def encoded_texts(engine: QueryEngine, tree: grammar.Phrase) -> list[str]:
 
 def check_phrase(
     engine: QueryEngine, text: str, viewpoint: Camera | None = None, progress: Progress = silent
-) -> None:
-    """Raise what `run_phrase` would, without searching; the encoded vectors are kept."""
+) -> grammar.Phrase:
+    """Return the tree that `run_phrase` answers, or raise what it would; the encoded vectors are kept."""
     tree = grammar.parse(text, engine.taught)
     _check_viewpoint(tree, viewpoint)
     try:
@@ -92,6 +86,8 @@ def check_phrase(
     except EncoderError:
         if phrase_key(text) not in engine.field.phrasebook:
             raise
+        return grammar.Atom(tidy(text))
+    return tree
 
 
 def encode_phrases(engine: QueryEngine, texts: Sequence[str]) -> None:
@@ -107,12 +103,8 @@ def encode_phrases(engine: QueryEngine, texts: Sequence[str]) -> None:
 def _check_viewpoint(tree: grammar.Phrase, viewpoint: Camera | None) -> None:
     """Raise InputError for the first relation in the tree that needs a viewpoint, if there is none."""
     if viewpoint is None and isinstance(tree, grammar.Relation | grammar.Superlative):
-        free = (
-            isinstance(tree, grammar.Superlative)
-            and tree.kind in ("nearest", "farthest")
-            and tree.anchor is None
-        )
-        if free or tree.kind in NEED_VIEWPOINT:
+        from_here = tree.kind in ("nearest", "farthest") and tree.anchor is None
+        if from_here or tree.kind in NEED_VIEWPOINT:
             raise InputError(f"'{tree.kind}' depends on where one stands; give a camera, or say it otherwise")
     for child in grammar.children(tree):
         _check_viewpoint(child, viewpoint)

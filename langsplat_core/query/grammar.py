@@ -70,17 +70,19 @@ OWNERS = _words(
 def forms(word: str) -> tuple[str, ...]:
     """Return a word in lower case and its possible singulars."""
     low = word.lower()
-    return (low, low.removesuffix("s"), low.removesuffix("es"))
+    return (low, singular(low), low.removesuffix("s"), low.removesuffix("es"))
 
 
 PLURALS = {
     "men": "man", "women": "woman", "people": "person", "children": "child", "feet": "foot", "teeth": "tooth",
     "mice": "mouse", "geese": "goose", "leaves": "leaf", "loaves": "loaf", "knives": "knife",
-    "wolves": "wolf", "shelves": "shelf", "halves": "half", "scarves": "scarf", "shoes": "shoe",
+    "wolves": "wolf", "shelves": "shelf", "halves": "half", "scarves": "scarf", "hooves": "hoof",
+    "cookies": "cookie", "movies": "movie", "hoodies": "hoodie", "calves": "calf", "lenses": "lens",
 }  # fmt: skip
 ALWAYS_PLURAL = _words("scissors glasses jeans trousers headphones shorts pants pliers tongs binoculars")
 # Endings of regular plurals, and their replacement in the singular.
-ENDINGS = {"(?<=..)ies$": "y", "(?<=..ss|..ch|..sh)es$|(?<=..x)es$|(?<![sui])s$": ""}
+ENDINGS = {"(?<=..)ies$": "y", "(?<=..)(?<!sh|an)oes$": "o"}
+ENDINGS |= {"(?<=..ss|..ch|..sh)es$|(?<=[^o]us|..x)es$|(?<![sui])s$": ""}
 
 
 def singular(word: str) -> str:

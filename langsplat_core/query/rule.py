@@ -269,7 +269,8 @@ class Judged:
     def said(self) -> str:
         """The verdict with the percentage behind it, such as "found, 83 %" or "found, by chance 2 %"."""
         if self.probability is not None:
-            return f"{self.verdict}, {100 * self.probability:.0f} %"
+            elsewhere = "" if self.found or self.judgement.margin < 0 else " at another level"
+            return f"{self.verdict}, {100 * self.probability:.0f} %{elsewhere}"
         if (by_chance := self.judgement.by_chance) is None:
             return self.verdict
         share = 100 * max(by_chance, 0.001)  # never 0 %

@@ -107,8 +107,7 @@ def project(means: Array, camera: Camera) -> Projected:
 
 def in_rectangle(seen: Projected, corner: Array, opposite: Array) -> Array:
     """Return (N,) bool: centres between two opposite corners (2,), pixels, borders included."""
-    corners = np.stack([corner, opposite]).astype(np.float64)
-    low, high = corners.min(0), corners.max(0)
+    low, high = np.sort([corner, opposite], axis=0)
     return (seen.depths > 0) & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
 
 

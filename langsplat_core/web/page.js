@@ -325,11 +325,12 @@ class Page {
 
   // A verdict for the panel.
   said(answer) {
-    const { outcome, probability, byChance } = answer.verdict;
+    const { outcome, found, margin, probability, byChance } = answer.verdict;
     const { levels, guess } = this.meta.language;
     const share = 100 * Math.max(byChance ?? 0, 0.001); // never 0 %
     const chance = byChance === null ? "" : `, by chance ${share.toFixed(share >= 1 ? 0 : 1)} %`;
-    const sure = probability === null ? chance : `, ${Math.round(100 * probability)} %`;
+    const elsewhere = found || margin < 0 ? "" : " at another level";
+    const sure = probability === null ? chance : `, ${Math.round(100 * probability)} %${elsewhere}`;
     const { metres_per_unit: metres, radius } = this.meta;
     const [scale, unit] = metres ? [metres, "\u00a0m"] : [1, ""];
     const digits = Math.min(Math.max(2 - Math.floor(Math.log10(scale * radius)), 2), 20);

@@ -57,16 +57,24 @@ export function phraseKey(text) {
     .toLowerCase();
 }
 
+// The singular of a noun; a word that is not plural is unchanged.
+function singular(noun, { plurals, endings, always_plural: always }) {
+  const low = noun.toLowerCase();
+  const one = [...endings].reduce((word, [end, by]) => word.replace(RegExp(end, "i"), by), noun);
+  return plurals.get(low) ?? (always.has(low) ? noun : one);
+}
+
 // A word in lower case and its possible singulars.
-function forms(word) {
+function forms(word, lists) {
   const low = word.toLowerCase();
-  return [low, low.replace(/s$/, ""), low.replace(/es$/, "")];
+  return [low, singular(low, lists), low.replace(/s$/, ""), low.replace(/es$/, "")];
 }
 
 // The kind of a phrase: "thing", "part" or "part of a thing". lists: Sets of words by name.
-export function namedBy(phrase, { parts, adjectives, stop_words: stops }) {
+export function namedBy(phrase, lists) {
+  const { parts, adjectives, stop_words: stops } = lists;
   const words = phrase.toLowerCase().split(" ");
-  if (!forms(words.pop()).some((form) => parts.has(form))) {
+  if (!forms(words.pop(), lists).some((form) => parts.has(form))) {
     return "thing";
   }
   return words.every((word) => adjectives.has(word) || stops.has(word)) ? "part" : "part of a thing";
@@ -166,12 +174,7 @@ function oneOf(tree, lists) {
   if (tree.kind) {
     return { ...tree, what: oneOf(tree.what, lists) };
   }
-  const words = tree.text.split(" ");
-  const noun = words.pop();
-  const { plurals, endings, always_plural: always } = lists;
-  const one = [...endings].reduce((word, [end, by]) => word.replace(RegExp(end, "i"), by), noun);
-  const low = noun.toLowerCase();
-  return { text: [...words, plurals.get(low) ?? (always.has(low) ? noun : one)].join(" ") };
+  return { text: tree.text.replace(/[^ ]+$/, (noun) => singular(noun, lists)) };
 }
 
 // The first preposition relates all that follows it.
@@ -182,7 +185,7 @@ function related(text, lists) {
       const kind = lists.prepositions.get(words.slice(at, next).join(" ").toLowerCase());
       const [before, after] = [words.slice(0, at), words.slice(next)].map((side) => side.join(" "));
       const isOf = kind === "of";
-      const measures = isOf && forms(words[at - 1]).some((form) => lists.measures.has(form));
+      const measures = isOf && forms(words[at - 1], lists).some((form) => lists.measures.has(form));
       const holds = measures && !names(words.slice(0, at - 1).join(" "), lists, new Set());
       const named = names(before, lists) || (isOf && namedBy(before, lists) !== "thing");
       if (kind && named && names(after, lists) && !holds) {

@@ -140,7 +140,9 @@ def test_query_prints_the_probability(folder, capsys, logit, verdict, probabilit
     (answer,) = answers(capsys, "query", "b.ply", "book")
     assert answer["probability"] == pytest.approx(probability, abs=0.01)
     percent = f"{100 * answer['probability']:.0f}"
-    assert lines(capsys, "query", "b.ply", "book")[0].startswith(f"book: {verdict}, {percent} %, score ")
+    said = lines(capsys, "query", "b.ply", "book")[0]
+    assert said.startswith(f"book: {verdict}, {percent} %, score ")
+    assert said.endswith(", place none") == (verdict == "not here")
     assert (answer["verdict"], answer["found"]) == (verdict, verdict == "found")
     assert (answer["instances"] == []) == (verdict != "found")
 
@@ -333,16 +335,13 @@ def test_words_taught_at_once_are_all_kept(described, into):
         ("teach named.ply --name vase --remove --camera 1", "--camera: is only used with --at"),
         ("eval lerf-ovs . --maps . --encoder demo", "--encoder: is only used with a scene"),
         ("compact a.ply --photos . --assumed-psnr 30", "--assumed-psnr: the loss is measured"),
-        ("clean a.ply b.ply --photos . --assumed-psnr 30", "--assumed-psnr: the loss is measured"),
         ("convert a.ply b.spz --phrases mug", "are for checkpoints"),
         ("select a.ply spoon", "does not know 'spoon'"),
         ("select a.ply mug --instance 2", "--instance 2: there are 1, numbered from 1"),
         ("select a.ply mug book plant --remove", "the whole scene"),
-        ("select a.ply mug --out b.obj.gz", "scenes are written as"),
         ("select a.ply mug --out a.ply", "would replace the original"),
         ("select a.ply mug --out there/b.ply", "there: no such folder for b.ply"),
         ("scale a.ply --metres 1", "belong together"),
-        ("scale a.ply --metres x", "langsplat: --metres: expected FLOAT, got ['x'] (see --help)"),
         ("scale a.ply --metres 1 --between 0 0 0 0 0 0", "must be above 0"),
         ("scale a.ply --metres 1 --between 0 0 0 1 0 0 --metres-per-unit 1", "give either"),
         ("select plain.ply mug", "no language field (NAME.langsplat.safetensors) lies beside it"),
@@ -362,13 +361,12 @@ def test_words_taught_at_once_are_all_kept(described, into):
         ("query a.ply mug --instances 1e3", "--instances: expected a whole number, got '1e3'"),
         ("transform a.ply b.ply --rotate q 3", "--rotate: expected one of 'x', 'y', 'z' and a number"),
         ("transform a.ply b.ply --rotate x nan", "--rotate x nan: must be -360 to 360"),
-        ("train loop --out b.ply --clip.model demo", "loop does not exist"),
+        ("train loop --out b.ply", "loop does not exist"),
         ("convert b.ply", "name what to read"),
         ("convert a.ply out --to nothing", "choose one of scene"),
         *((f"{command} a.ply a.ply", "would replace") for command in ("convert", "transform", "clean")),
         ("export a.ply b.html --encoder ./absent", "absent: no such"),
         ("export a.ply room.png", "written as .html"),
-        ("crop a.ply a.ply --box -9 -9 -9 9 9 9", "would replace"),
         ("transform a.ply b.ply", "no step given"),
         ("transform a.ply b.ply --move 1e11 0 0", "move by less"),
         ("crop a.ply b.ply --box 100 0 0 101 1 1", "langsplat inspect a.ply"),

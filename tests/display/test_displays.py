@@ -99,10 +99,6 @@ def test_heat_of_a_level_and_of_everything_is_of_every_gaussian(level, of):
     assert (values <= 0).all()  # no pixel is inside of anything
 
 
-def test_segments_show_members():
-    assert_allclose(members(Subject(360, answers=(FOUND,)))[:, 0], FOUND.members)
-
-
 # To the cube roots of cones' answers, and from them to lightness, a and b (Ottosson 2020).
 CONES = np.array(
     [

@@ -260,6 +260,8 @@ def test_verdicts_by_chance_say_how_often_chance_fits_as_well(margin, said):
     answer = replace(calibrated(None).run("book"), judgement=verdict)
     assert answer.said == f"{verdict.outcome}, by chance {said}"
     assert verdict.absent.by_chance == 1
+    there = replace(answer, judgement=Verdict(False, "calibration", 0.5, 0.94))
+    assert there.said == "weak match, 94 % at another level"
     for other, told in (
         (Verdict(True, "calibration", 1.0, 0.83), "found, 83 %"),
         (Verdict(True, "example", 1.0), "found"),

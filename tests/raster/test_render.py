@@ -240,7 +240,6 @@ def test_backends_that_cannot_draw_or_lift_are_refused():
 
 
 def test_every_public_name_is_there():
-    assert set(langsplat_core.__all__) <= set(dir(langsplat_core))
     for name in langsplat_core.__all__:
         assert getattr(langsplat_core, name).__doc__
     with pytest.raises(AttributeError, match="nothing_like_it"):

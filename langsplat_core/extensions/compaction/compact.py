@@ -399,7 +399,7 @@ class Compact:
     config: Annotated[BudgetConfig, tyro.conf.arg(name="")] = field(default_factory=BudgetConfig)
 
     def run(self) -> None:
-        out = self.out or self.scene.with_name(self.scene.name.split(".")[0] + ".compact.ply")
+        out = self.out or self.scene.with_suffix(".compact.ply")
         with TerminalProgress() as progress:
             report = compact_scene(self.scene, out, self.config, self.photos, progress)
         if self.json:

@@ -24,7 +24,7 @@ from langsplat_core.query.inventory import NAMES
 from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import LEVELS, Scene
 from langsplat_core.scene.surface import surface_areas
-from langsplat_core.scene.transform import moving, similarity
+from langsplat_core.scene.transform import between_worlds, scaling, similarity
 from langsplat_core.semantics.encoders import same_vectors
 
 Kind = Literal["gone", "appeared", "moved", "recoloured"]
@@ -99,14 +99,12 @@ def changes(
 ) -> tuple[Change, ...]:
     """Return the changes from the first scene to the second, by `KINDS`, the largest first.
 
-    placed: (4, 4) similarity from the second scene's frame to the first one's; None: both have one world.
+    placed: (4, 4) similarity from the second scene's frame to the first one's; None: one world and its units.
     describers: of both, for names. Reports scenes in which most of the other's pixels are gone. Raises
     InputError if neither scene has cameras, if one has no language field, and for a matrix that is no
     similarity.
     """
-    if placed is None:
-        placed = moving(second.scene.origin - first.scene.origin).matrix
-    into = similarity(placed).matrix
+    into = _in_one_world(first.scene, second.scene) if placed is None else similarity(placed).matrix
     before, after = _evidence(first.scene, second.scene, into, progress)
     if all(sums[:, 0].sum() > sums[:, 1].sum() for sums in (before, after)):
         report_loss("most of each scene lies elsewhere in the other; align them by --register or --transform")
@@ -129,6 +127,13 @@ def changes(
             turned = replace(piece, colour=piece.other, other=piece.colour)
             found.append(_change("recoloured", turned, 1, describers))
     return tuple(sorted(found, key=lambda change: (KINDS.index(change.kind), -change.pixels)))
+
+
+def _in_one_world(first: Scene, second: Scene) -> Array:
+    """Return the (4, 4) similarity from the second scene's frame to the first one's by origins and units."""
+    metres = first.metres_per_unit, second.metres_per_unit
+    ratio = 1.0 if metres[0] is None or metres[1] is None else metres[1] / metres[0]
+    return between_worlds(scaling(ratio), -second.origin, -first.origin).matrix
 
 
 # Evidence: changed pixels of both scenes, summed over the Gaussians of each.

@@ -22,7 +22,7 @@ from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine, searchable
 from langsplat_core.scene import LEVELS
 from langsplat_core.scene.language import split_phrases
-from langsplat_core.scene.transform import IDENTITY, between_worlds
+from langsplat_core.scene.transform import between_worlds
 from langsplat_core.semantics.encoders import load_text_encoder
 
 
@@ -130,7 +130,7 @@ class Changes:
     """Another scene of the same place."""
     transform: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Transform of the second to the axes of the first, .json of `langsplat register`; by default both have
-    the same axes."""
+    the same axes, in the units that they state."""
     register: bool = False
     """Find the transform from the surfaces of both."""
     encoder: EncoderOption = ""
@@ -141,10 +141,10 @@ class Changes:
     def run(self) -> None:
         if self.register and self.transform is not None:
             raise InputError("--register finds what --transform gives; leave one of them out")
-        told = IDENTITY if self.transform is None else read_transform(self.transform)
+        told = None if self.transform is None else read_transform(self.transform)
         scenes = searchable(self.before), searchable(self.after)
         origin = scenes[0].origin
-        placed = between_worlds(told, -scenes[1].origin, -origin).matrix
+        placed = None if told is None else between_worlds(told, -scenes[1].origin, -origin).matrix
         unit = Unit(self.scale or scenes[0].metres_per_unit, origin)
         unsure = None in [scene.metres_per_unit for scene in scenes]
         first, second = (QueryEngine(scene, load_text_encoder, encoder_id=self.encoder) for scene in scenes)

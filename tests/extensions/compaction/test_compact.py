@@ -125,6 +125,12 @@ def test_a_scene_without_cameras_is_seen_from_a_ring(scene, tmp_path):
         np.testing.assert_allclose(pixel[0], (camera.width / 2, camera.height / 2), atol=1e-6)
 
 
+def test_scenes_with_dots_in_their_names_keep_them(scene, tmp_path):
+    save_scene(tmp_path / "a.v1.ply", scene)
+    compact.Compact(tmp_path / "a.v1.ply", config=CONFIG).run()
+    assert (tmp_path / "a.v1.compact.ply").exists()
+
+
 @pytest.mark.parametrize(
     ("loss", "out", "named"),
     [(0.3, "scene.ply", "scene.ply"), (0.3, "out.xyz", ".xyz"), (1e-6, "out.splat", "format")],

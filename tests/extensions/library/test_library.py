@@ -308,6 +308,8 @@ def test_another_frame_and_scale_change_nothing(scene):
     there = rotating(np.array([0.0, 1, 0]), 90.0).then(scaling(2.0)).then(moving(np.array([3.0, -1, 2])))
     second, into = replace(transform_scene(scene, there), cameras=()), there.inverse().matrix
     assert compared(scene, second, into) == ()
+    twice = replace(transform_scene(scene, scaling(2.0)), metres_per_unit=0.5)
+    assert compared(replace(scene, metres_per_unit=1.0), twice) == ()
     (change,) = compared(scene, without(second, MUG), into)
     np.testing.assert_allclose(change.centre, CENTRES[0], atol=0.1)
 
