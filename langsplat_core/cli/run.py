@@ -97,8 +97,8 @@ def _with_roles(info: StructTypeInfo) -> StructConstructorSpec | None:
     return replace(made, fields=tuple(map(_as_role, made.fields)))
 
 
-def _as_role(field: StructFieldSpec) -> StructFieldSpec:
-    """Return a field of which help names the role instead of the type, and no default that is nothing."""
+def _as_role(field: Any) -> StructFieldSpec:
+    """Return a field whose help names a role, not a type, nor an empty default, and has no line breaks."""
     said = list(annotations(field.type))
     placed, several = PLACED in said, " ..." if Ellipsis in said else ""
     role = field.name.upper() if placed else "TEXT" if str in said else None
@@ -108,7 +108,8 @@ def _as_role(field: StructFieldSpec) -> StructFieldSpec:
     marks += [part for part in said if isinstance(part, type(marks[0]))]  # also of the types in this one
     if field.name == "out":
         marks.append(tyro.conf.arg(metavar="OUT", aliases=None if placed else ["-o"]))
-    return replace(field, type=Annotated[(field.type, *marks)])  # type: ignore[arg-type]
+    typed: Any = Annotated[(field.type, *marks)]
+    return replace(field, type=typed, helptext=lambda: " ".join((field.helptext() or "").split()))
 
 
 def parsed(program: str, kind: Any, args: Sequence[str], description: str | None = None) -> Any:
