@@ -46,7 +46,7 @@ from langsplat_core.io.gltf import write_gltf
 from langsplat_core.io.hostile import picture_size
 from langsplat_core.io.scenes import formats, load_scene
 from langsplat_core.io.sidecar import Words, read_language, read_words, write_language, write_words
-from langsplat_core.pipeline.stages import kept, open_array
+from langsplat_core.pipeline.stages import kept, open_array, write_array
 from langsplat_core.progress import silent
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
@@ -580,7 +580,7 @@ def kept_stage(path: Path) -> float:
 
 def mapped_arrays(_: Path) -> list[bytes]:
     arrays = (np.ones((50, 3), np.float32), np.zeros(0, np.int32))
-    return [bytes_of(np.save, array, name="made.npy") for array in arrays]
+    return [bytes_of(write_array, array, name="made.npy") for array in arrays]
 
 
 def mapped(path: Path) -> float:
