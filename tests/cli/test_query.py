@@ -139,9 +139,8 @@ def test_query_prints_the_probability(folder, capsys, logit, verdict, probabilit
     save_fake(calibration=calibrated_for("book", logit))
     (answer,) = answers(capsys, "query", "b.ply", "book")
     assert answer["probability"] == pytest.approx(probability, abs=0.01)
-    percent = f"{100 * answer['probability']:.0f}"
     said = lines(capsys, "query", "b.ply", "book")[0]
-    assert said.startswith(f"book: {verdict}, {percent} %, score ")
+    assert said.startswith(f"book: {verdict}, {100 * answer['probability']:.0f} %, score ")
     assert said.endswith(", place none") == (verdict == "not here")
     assert (answer["verdict"], answer["found"]) == (verdict, verdict == "found")
     assert (answer["instances"] == []) == (verdict != "found")

@@ -779,6 +779,7 @@ def test_notebooks_show_a_page_that_was_asked(browser, demo, engine, tmp_path, p
     tab = browser.new_page(offline=True)
     tab.goto((tmp_path / "cell.html").as_uri())
     frame = tab.frames[1]
+    frame.wait_for_function("typeof langsplat !== 'undefined'")  # it may still hold no document
     said = run_phrase(engine, asked).answer.said
     assert said in frame.evaluate("async () => (await langsplat) && document.body.innerText")
     assert frame.evaluate("async () => (await langsplat).page.display") == "relevancy"
