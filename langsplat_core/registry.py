@@ -7,6 +7,7 @@ opens without the code of extensions. What cannot be loaded costs one warning an
 
 import logging
 import os
+import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
@@ -115,6 +116,24 @@ def parts(kind: Kind) -> Mapping[str, Any]:
     """Return all parts of one kind by their names; a broken one is left out with a warning."""
     found = {name: _imported(kind, name, where) for name, where in references(kind).items()}
     return {name: one for name, one in found.items() if one is not None}
+
+
+def failure(error: Exception) -> InputError | None:
+    """Return, as a line, an error that came through the code of an extension; None for any other."""
+    owners = {
+        where.partition(":")[0].partition(".")[0]: name
+        for name, extension in extensions().items()
+        for named in vars(extension).values()
+        for where in named.values()
+    }
+    for frame, line in reversed([*traceback.walk_tb(error.__traceback__)]):  # the innermost first
+        module = frame.f_globals.get("__name__", "")
+        package = module.partition(".")[0]
+        if package in owners and package != "langsplat_core":
+            where = f"extension {owners[package]} fails in {module}, line {line}"
+            remedy = f"mend that or hide it, {HIDDEN}={owners[package]}; -v prints the traceback"
+            return InputError(f"{where} ({type(error).__name__}: {printable_line(error, 300)}); {remedy}")
+    return None
 
 
 @cache

@@ -11,7 +11,7 @@ from contextlib import suppress
 from importlib.metadata import EntryPoint
 from itertools import product
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numba
@@ -31,7 +31,7 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics import encoders, sam
 from langsplat_viewer.panels.layout import CORE_PANELS
 from tests.support.fakes import numeric_settings
-from tests.support.processes import files_of_at_most, python, refusal
+from tests.support.processes import files_of_at_most, python, refusal, run
 from tests.support.scenes import random_gaussians
 
 
@@ -400,15 +400,22 @@ def test_failing_part_is_one_line_that_names_its_extension(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     empty = Importer((".few",), lambda *words: (None, ()))
     parts = SceneFormat(".odd", nothing, fails), Importer((".many",), nothing), empty, Exporter(nothing)
-    monkeypatch.setitem(sys.modules, "odd", SimpleNamespace(**dict(zip("fije", parts, strict=True))))
-    importers = {"many": "odd:i", "few": "odd:j"}
-    named = {"formats": {".odd": "odd:f"}, "importers": importers, "exporters": {"files": "odd:e"}}
+    odd = ModuleType("odd")
+    exec("def layout(*words):\n raise KeyError('lost')", vars(odd))
+    vars(odd).update(zip("fije", parts, strict=True))
+    monkeypatch.setitem(sys.modules, "odd", odd)
+    named = {"formats": {".odd": "odd:f"}, "exporters": {"files": "odd:e"}, "layouts": {"odd": "odd:layout"}}
+    named |= {"importers": {"many": "odd:i", "few": "odd:j"}}
     monkeypatch.setattr(registry, "extensions", lambda: {"oddity": registry.Extension(**named)})
     save_scene("a.ply", Scene(random_gaussians(3)))
-    for name in ("a.odd", "a.many", "a.few"):
+    for name in ("a.odd", "a.many", "a.few", "a.bin"):
         Path(name).touch()
     for words in ("a.odd b.ply", "a.many b.ply", "a.few b.ply", "a.ply b.odd", "a.ply b --to files"):
         assert "its extension's odd:" in refusal(capsys, "convert", *words.split())
+    said = refusal(capsys, "doctor", "--encoder", "a.bin")
+    assert "extension oddity fails in odd, line 2 (KeyError: 'lost')" in said
+    assert run("-v", "doctor", "--encoder", "a.bin") == 2
+    assert "Traceback" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("hidden", OWN)
@@ -422,8 +429,9 @@ def test_help_shows_the_rest_with_an_extension_hidden(hidden, monkeypatch, capsy
         with pytest.raises(SystemExit):
             parse(["--help"])
         listed = capsys.readouterr().out
+        assert "from extensions" not in listed  # each has another heading
         for name in every:
-            assert (f"• {name} " in listed) == (name not in own and " " not in name)
+            assert (f"\n  {name} " in listed) == (name not in own and " " not in name)
     finally:
         registry.extensions.cache_clear()
 

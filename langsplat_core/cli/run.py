@@ -1,6 +1,4 @@
-"""How commands run: they end with 0, with 2 and one line, or with 130 or 143 and one line.
-
-The line is on stderr and says what is wrong and how to mend it; 130 is of Ctrl-C, 143 of SIGTERM.
+"""How commands run: they end with 0, or with a line on stderr and 2, 130 (Ctrl-C) or 143 (SIGTERM).
 
 A command is a dataclass whose fields are its arguments (tyro derives the parser), checked before anything is
 done, and whose `run` does the work. The viewer's program ends the same way and uses this module too.
@@ -16,6 +14,7 @@ import re
 import signal
 import sys
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, is_dataclass, make_dataclass, replace
@@ -25,7 +24,7 @@ import numpy as np
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
-from langsplat_core import __version__
+from langsplat_core import __version__, registry
 from langsplat_core.cli.arguments import PLACED, Runnable, check_arguments
 from langsplat_core.config import annotations
 from langsplat_core.errors import STRICTNESS, InputError, LangSplatError, optional_imports, printable_line
@@ -148,6 +147,12 @@ def main(program: str, parser: Callable[[], Runnable]) -> int:
         sys.stdout.flush()  # now, while what goes wrong can still be said in a line
     except (LangSplatError, OSError, MemoryError, KeyboardInterrupt) as error:
         return _ended(program, error)
+    except Exception as error:
+        if (line := registry.failure(error)) is None:
+            raise
+        if log.isEnabledFor(logging.DEBUG):
+            traceback.print_exception(error)
+        return _ended(program, line)
     finally:
         STRICTNESS.on = False
         log.setLevel(level)
