@@ -67,8 +67,7 @@ silent = Progress(lambda report: None)
 class TimeLeft:
     """The time until a stage ends, by the work that it was seen to do; its text counts down.
 
-    The rate is that of the later half of the time since the first report: stages slow down, and what an
-    earlier run has done is passed at once.
+    The rate is that of the later half of the time: stages slow down, and pass at once what was done before.
     """
 
     clock: Callable[[], float] = time.monotonic

@@ -1,5 +1,4 @@
-"""Unusable names and places are refused before work begins; a full disk is one line for every kind of file,
-and what was there stays."""
+"""Unusable names and places are refused before work begins; a full disk is a line, what was there stays."""
 
 import errno
 import os

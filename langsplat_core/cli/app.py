@@ -1,7 +1,7 @@
 """`langsplat ...`: thin commands, each a dataclass of arguments and one call into the layers below."""
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import make_dataclass
 from difflib import get_close_matches
 from importlib import import_module
@@ -26,6 +26,17 @@ CORE: Mapping[str, str] = MappingProxyType({
     "export": "export.Export", "convert": "export.Convert",
     "inspect": "scenes.Inspect", "doctor": "scenes.Doctor", "demo": "scenes.Demo",
 })  # fmt: skip
+HEADINGS: Mapping[str, str] = MappingProxyType({  # of `langsplat --help`, with their commands
+    "begin": "demo train",
+    "ask": "query describe find changes teach serve",
+    "take apart, edit and join": "select crop clean compact transform scale register merge",
+    "write other files": "convert export mesh map",
+    "measure": "inspect eval bench doctor",
+})  # fmt: skip
+ABOUT = """usage: langsplat [-q | -v] [--strict] COMMAND ...    (langsplat-viewer opens a window)
+
+-q prints errors alone, -v what each step took; --strict refuses what would be skipped, padded or guessed.
+COMMAND --help lists what a command takes. OUT may also be --out OUT or -o OUT."""
 
 
 def parse(args: list[str]) -> Runnable:
@@ -33,6 +44,9 @@ def parse(args: list[str]) -> Runnable:
     before = list(takewhile(FLAGS.__contains__, args))
     args = args[len(before) :]
     args = [*args[1:], "--help"] if args[:1] == ["help"] else args
+    if args[:1] in ([], ["-h"], ["--help"]):
+        print(ABOUT, *_overview(), sep="\n")
+        raise SystemExit(0)
     check_commands(args)
     commands: dict[str, Any]
     groups, name = _groups(), args[0] if args else ""
@@ -47,13 +61,25 @@ def parse(args: list[str]) -> Runnable:
         args = _with_out(args, commands[name])
     elif name in groups:
         commands = {name: _group(name)}
-    else:  # all of them, but for those of extensions that are broken
-        commands = {one: load_command(one) for one in CORE}
-        commands |= {one: kind for one, kind in registry.parts("commands").items() if " " not in one}
-        commands |= {one: _group(one) for one in groups}
-    about = "Train, query, convert and measure 3D Gaussian scenes. OUT may also be --out OUT or -o OUT."
-    found = parsed("langsplat", _union(commands, len(commands) > 1), [*before, *args], about)
+    else:
+        commands = _all()
+    found = parsed("langsplat", _union(commands), [*before, *args])
     return getattr(found, "command", found)  # of a group
+
+
+def _all() -> dict[str, Any]:
+    """Return all commands and groups, but for those of extensions that are broken."""
+    alone = {name: kind for name, kind in registry.parts("commands").items() if " " not in name}
+    return {**{name: load_command(name) for name in CORE}, **alone, **{one: _group(one) for one in _groups()}}
+
+
+def _overview() -> Iterator[str]:
+    """Yield lines with the names of all commands, each with the first one of its help, under headings."""
+    kinds, listed = _all(), {*" ".join(HEADINGS.values()).split()}
+    for heading, names in {**HEADINGS, "from extensions": " ".join(sorted(kinds.keys() - listed))}.items():
+        there = [name for name in names.split() if name in kinds]
+        yield from ["", heading] if there else []
+        yield from (f"  {name:<9}  {(kinds[name].__doc__ or '').partition(chr(10))[0]}" for name in there)
 
 
 def _with_out(args: list[str], kind: type[Runnable]) -> list[str]:
@@ -62,6 +88,8 @@ def _with_out(args: list[str], kind: type[Runnable]) -> list[str]:
     if PLACED not in annotations(hint) and not isinstance(getattr(kind, "out", None), property):
         return args
     out, rest = named(args, "-o", "--out")
+    if out == "":
+        raise InputError("--out: names nothing; put behind it what to write")
     return rest if out is None else [*rest, *["--"][: "--" not in rest], out]
 
 
@@ -95,12 +123,9 @@ def _members(group: str) -> list[str]:
     return [name.split(" ")[1] for name in registry.references("commands") if name.startswith(f"{group} ")]
 
 
-def _union(commands: Mapping[str, Any], brief: bool = False) -> Any:
-    """Return commands as subcommands, brief with the first line of their help; tyro needs at least two."""
-    named = []
-    for name, kind in commands.items():
-        about = (kind.__doc__ or "").split("\n")[0] if brief else None
-        named.append(Annotated[kind, tyro.conf.subcommand(name=name, description=about)])
+def _union(commands: Mapping[str, Any]) -> Any:
+    """Return commands as subcommands; tyro needs at least two."""
+    named = (Annotated[kind, tyro.conf.subcommand(name=name)] for name, kind in commands.items())
     return Union[(*named, Annotated[None, tyro.conf.Suppress])]
 
 
@@ -122,4 +147,4 @@ def check_commands(args: Sequence[str]) -> None:
 
 def entry() -> None:
     """Run the `langsplat` console script."""
-    sys.exit(main("langsplat", lambda: parse(sys.argv[1:] or ["--help"])))
+    sys.exit(main("langsplat", lambda: parse(sys.argv[1:])))

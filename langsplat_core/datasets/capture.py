@@ -85,9 +85,8 @@ class Capture:
     def digest(self, indices: Sequence[int]) -> str:
         """Return a digest of all that a training on the photographs at `indices` sees.
 
-        That is these in their order, their cameras, and the points, as structure from motion run again may
-        place them in another world. Poses and points count to `DECIMALS`: on another processor their last
-        digits differ, and a work folder resumes all the same.
+        That is these in their order, their cameras, and the points, which structure from motion may place
+        elsewhere. Poses and points count to `DECIMALS`, as processors differ in their last digits.
         """
         digest = hashlib.blake2b(digest_size=16)
         length = near_power(self.extent())
@@ -399,8 +398,7 @@ def metres_per_unit(eyes: Array, places: Array) -> float | None:
 
     It is taken over pairs that are at least half as far apart as the farthest ones. eyes: (K, 3) camera
     positions; places: (K, 2) latitudes and longitudes, degrees. None where the middle half of the ratios
-    spans more than a fifth of the median. Heights are left out, as most cameras know them badly: for a climb
-    as steep as a stair that is an eighth too little.
+    spans more than a fifth of the median. Heights, which most cameras know badly, are left out.
     """
     apart = scipy.spatial.distance.pdist(eyes)
     if not apart.any():
@@ -450,8 +448,7 @@ def random_points(
     """Draw (count, 3) points in view of the cameras at `indices`, with (count, 3) uint8 colours of pixels.
 
     known: (M, 3) points whose depths tell where the scene is, M may be 0. Depths are uniform in 1/z, so that
-    near and far are equally dense in the images. Twice as many are drawn and those in sight of at least half
-    the cameras preferred: one view alone teaches no depth.
+    near and far are equally dense in the images. Of twice as many, those seen by half the cameras go first.
     """
     cameras = [capture.cameras[index] for index in indices]
     near, far = 0.3 * look_distance(cameras), 3 * look_distance(cameras)

@@ -177,9 +177,8 @@ _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of the unit
 def optics(path: Path) -> Image.Exif:
     """Return only those EXIF data that tell the focal length.
 
-    Other tags, orientation first of all, would be wrong for a copy of the photograph. Where a camera gives
-    pixels per inch of its sensor, the length on film is computed from them: COLMAP would compare them with
-    the size of the image, which is another for a copy.
+    Other tags, such as the orientation, would be wrong for a copy. Pixels per inch of a sensor become the
+    length on film: COLMAP would compare them with the size of the image, which is another for a copy.
     """
     kept = Image.Exif()
     with suppress(hostile.PictureError), hostile.opened(path) as image:

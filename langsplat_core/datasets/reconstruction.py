@@ -3,9 +3,8 @@
 pycolmap may abort the process that it runs in, so this module is imported in a process of its own
 (`workspace.run_apart`). The database of a workspace keeps what was computed, so an interrupted run goes on,
 and within one machine ends with the same cameras, byte for byte: photographs are numbered in the order of
-their names, every random choice has its seed, and what adds up over photographs runs on one thread.
-Extraction and matching use all cores: one thread does a whole photograph or pair, and the database is the
-same. Another processor may round otherwise, and find other matches.
+their names, every random choice has its seed, and what adds up over photographs runs on one thread. Others do
+whole photographs or pairs, on all cores. Another processor may find other matches.
 """
 
 import itertools

@@ -26,9 +26,8 @@ ALLOWED = {"format_whitelist": "mov,matroska,avi,mpegts", "protocol_whitelist": 
 def kept_frames(video: Path, count: int, work: Path, progress: Progress = silent) -> Path:
     """Return the folder in `work` with the sharpest image of each of `count` equal spans of a video's time.
 
-    They are frame_0001.jpg ..., turned as the video is shown, and made where the folder is not whole already.
-    Spans without an image are left out. Raises InputError where too little is left, and FormatError for a
-    file that cannot be read as a video.
+    They are frame_0001.jpg ..., turned as the video is shown; spans without an image are left out. Raises
+    InputError where too little is left, FormatError for a file that cannot be read as a video.
     """
     file, _ = open_for_reading(video)
     with file:

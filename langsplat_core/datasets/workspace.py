@@ -1,8 +1,7 @@
-"""Workspaces of structure from motion: folders in the work folder, filled by processes of their own.
+"""Workspaces of structure from motion: folders that processes of their own fill, and later runs take up.
 
-A workspace holds small copies of the photographs (``images``), COLMAP's ``database.db`` and, in the end, the
-model (``sparse``) and the graph of matches (``matches.json``). It is named by a digest of all that it is made
-from, and taken up again by a later run.
+A workspace, named by a digest of its inputs, holds small copies of the photographs (``images``), COLMAP's
+``database.db`` and, in the end, the model (``sparse``) and the graph of matches (``matches.json``).
 """
 
 import errno
@@ -170,8 +169,7 @@ class Matches:
     def gap(self) -> tuple[int, int] | None:
         """Rows of two photographs, one in the first group, between which more would join another group.
 
-        That is the pair that shares most, or the neighbours in name order where none shares enough.
-        Photographs without features have no part in it.
+        Of those with features, the pair that shares most, or neighbours by name where none shares enough.
         """
         first, *others = (
             [row for row in group if self.features[row] >= FEWEST_FEATURES] for group in self.groups or [[]]

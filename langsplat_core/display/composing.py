@@ -1,7 +1,6 @@
 """Composition of images from channels on the CPU: compiled kernels in float32.
 
-`compose.frag.glsl` does the same on a graphics device; software OpenGL would take longer for it than the
-rasterizer does.
+`compose.frag.glsl` does the same on a graphics device; software OpenGL takes longer than the rasterizer.
 """
 
 from typing import Any, NamedTuple

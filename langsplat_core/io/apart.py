@@ -1,13 +1,11 @@
 """A function call in a process of its own, for native libraries that abort instead of raising.
 
-The process is a fresh interpreter. It gets the function, by module and name, the arguments, pickled, the log
+The process, a fresh interpreter, gets the function, by module and name, the arguments, pickled, the log
 level, and whether a loss is an error (--strict). Progress and messages come back while it runs. It ends with
-this process, however that ends (after a call of native code that holds the interpreter lock), and at once if
-the work is cancelled.
+this process, even from native code that holds the interpreter lock, and at once if the work is cancelled.
 
-`concurrent.futures.ProcessPoolExecutor` is not used: its processes import the caller's ``__main__`` again,
-which breaks scripts without a guard; it does not report how a process ended, nor its last output; and its
-processes outlive a caller that is killed.
+A `ProcessPoolExecutor` would import the caller's ``__main__`` again, which breaks scripts without a guard,
+not say how a process ended, and leave processes behind where the caller is killed.
 """
 
 import contextlib
@@ -43,9 +41,8 @@ def run(
 ) -> Any:
     """Return what ``function(*arguments, progress)`` returns, or raise what it raises, in another process.
 
-    environment: additional variables of that process. Raises AbortedError if the process ends without a
-    result. An exception in `progress` ends the process. In a frozen program there is no interpreter to start,
-    and the function runs in this process.
+    environment: additional variables of that process. Raises AbortedError if it ends without a result. An
+    exception in `progress` ends it. A frozen program, without an interpreter, calls the function itself.
     """
     if getattr(sys, "frozen", False) or not sys.executable:
         return function(*arguments, progress)

@@ -8,8 +8,7 @@ A JSON list with one object per camera:
     position      [x, y, z] of the camera in the world
     rotation      camera-to-world, three rows; OpenCV axes (x right, y down, z forward)
     fx, fy        pixels
-    cx, cy        pixels, principal point from the top left corner, by default the centre; INRIA's own files
-                  do not have it
+    cx, cy        pixels, principal point from the top left corner; absent, as in INRIA's files: the centre
 """
 
 import json

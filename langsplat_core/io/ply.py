@@ -12,8 +12,7 @@ blue. Normals are zeros and not used. In a scene with an origin ``x y z`` are do
 Reading accepts properties in any order and of any scalar type, any byte order, ascii, LF or CR LF in the
 header, files without normals, further elements (ignored and reported; in binary files with lists only after
 the vertices) and further properties (kept as `Scene.extras`). Rows are kept as they are, NaN included;
-doubles other than positions are rounded to float32. Two kinds of header comments are read; the last one of a
-kind counts:
+doubles other than positions are rounded to float32. Of header comments these are read, the last of each:
 
     metres_per_unit 0.25        length of the world's unit; no positive number: unknown
     SplatRenderMode: mip        trained with Mip-Splatting's compensation: Brush, splat-transform, gsplat
@@ -278,8 +277,7 @@ def write_table(
 ) -> None:
     """Write a binary little-endian PLY, atomically.
 
-    columns: of the element `vertex`, name -> (N,) of a type in `TYPE_NAMES`. faces: (F, 3) numbers of
-    vertices. comments: of one line each.
+    columns: of `vertex`, name -> (N,) of a type in `TYPE_NAMES`; faces: (F, 3) vertices; comments: lines.
     """
     count = len(next(iter(columns.values())))
     kinds = {name: column.dtype.str[1:] for name, column in columns.items()}
@@ -351,8 +349,7 @@ def read_ply_scene(path: Path | str) -> Scene:
     """Return the scene in a 3DGS PLY file, plain or compressed.
 
     `extras` are the scalar properties of a plain file that are not in the layout, in order, each in its own
-    type. Ignored content is reported. Raises InputError if the file cannot be opened and FormatError if it
-    breaks a rule of the format or has no Gaussians.
+    type. Ignored content is reported. FormatError for a file that breaks a rule or has no Gaussians.
     """
     extras, told = dict[str, Array](), list[str]()
     with open_ply(Path(path)) as ply:
@@ -400,8 +397,7 @@ def _read_plain(ply: PlyFile, vertex: PlyElement, tell: Tell) -> tuple[Gaussians
 def write_ply(path: Path | str, content: Scene | Gaussians) -> None:
     """Write Gaussians, or a scene without language field and cameras, as a plain INRIA PLY, atomically.
 
-    Extras become properties after those of the layout, which other readers ignore. Raises InputError for
-    names and types that no PLY can hold.
+    Extras become properties after those of the layout; InputError for names and types that no PLY can hold.
     """
     scene = Scene(content) if isinstance(content, Gaussians) else content
     gaussians = scene.gaussians

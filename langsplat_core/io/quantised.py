@@ -98,8 +98,7 @@ _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1"
 def read_splat_scene(path: Path | str) -> Scene:
     """Return the Gaussians of a .splat file, of SH degree 0, as a scene.
 
-    A file that is cut off between two Gaussians cannot be recognised. Raises InputError if the file cannot be
-    opened and FormatError if it is no .splat.
+    A file that is cut off between two Gaussians cannot be recognised. FormatError if it is no .splat.
     """
     path = Path(path)
     file, size = open_for_reading(path)

@@ -1,10 +1,9 @@
 """Scenes on disk: formats and companion files.
 
-`formats()` is the table behind the loader, `langsplat convert`, file dialogs, the desktop entry and the tests
-of round trips and damaged files. A scene is `scene.ply` with the optional companions
-`scene.langsplat.safetensors` and `scene.cameras.json` beside it. A compressed PLY and a SOG folder have
-companions of the same names. Those of other formats keep the suffix, `scene.spz.langsplat.safetensors`: the
-sidecar belongs to the rounded positions of that file and not to those of a `scene.ply` in the same folder.
+`formats()` is the table behind the loader, `langsplat convert`, file dialogs and the desktop entry. A scene
+is `scene.ply`, a compressed PLY or a SOG folder with the optional companions `scene.langsplat.safetensors`
+and `scene.cameras.json` beside it. Those of other formats keep the suffix, `scene.spz.cameras.json`: a
+sidecar belongs to the rounded positions of that file, not to a `scene.ply` in the same folder.
 """
 
 import logging
@@ -122,11 +121,10 @@ class PlacedOrigin(Struct):
 def load_scene(path: Path | str, read: Reader | None = None) -> Scene:
     """Return a scene with its language field and cameras, if they are beside it.
 
-    Cameras are `<scene>.cameras.json`, or for a PLY in the folder structure of the INRIA code
-    (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. A companion that is unusable or
-    belongs to other Gaussians is left out, with the reason in `Scene.unread`. Raises InputError for a file
-    that cannot be opened or is of no supported kind, FormatError for one that breaks the rules of its format.
-    read: in place of the format's reader.
+    Cameras are `<scene>.cameras.json`, or for a PLY in folders as of the INRIA code
+    (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. A companion that is unusable or of
+    other Gaussians is left out, with the reason in `Scene.unread`. read: in place of the format's reader.
+    Raises InputError for a file that cannot be opened or is of no known kind, FormatError for a damaged one.
     """
     scene = load_without_language(path, read)
     sidecar = companion_path(path, language_files.SUFFIX)
@@ -161,8 +159,9 @@ def _read(path: Path, read: Reader | None = None) -> Scene:
     if not os.path.exists(path):
         raise InputError(f"{path}: no such file; check the spelling and the folder")
     if (row := format_of(path)) is None and path.is_dir():
-        inside = sorted(path.glob("**/*.ply"))
-        hint = f"; perhaps {inside[-1]}" if inside else ""
+        levels = (list(path.glob(f"{'*/' * depth}*.ply")) for depth in range(3))  # INRIA's lies two deeper
+        inside: list[Path] = next(filter(None, levels), [])
+        hint = f"; perhaps {max(inside, key=lambda file: (len(str(file)), file))}" if inside else ""
         raise InputError(f"{path}: a folder without {META_NAME} is not a scene{hint}")
     if row is None:
         kinds = ", ".join(row.suffix for row in formats())
@@ -267,12 +266,11 @@ def report_left_out(path: Path, scene: Scene, kind: str, loses: Sequence[str], k
 def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer | None = None) -> None:
     """Write `scene` in the format of its name, with its companions; old ones it lacks are removed and named.
 
-    Only the PLY keeps everything: see `SceneFormat.loses`. All formats keep the order of rows. All files are
-    first written under temporary names. Then the old companions are removed, the scene's file is renamed into
-    place, and last the new companions. An interruption leaves the old scene or the new one, perhaps without
-    companions, but never with companions of another scene. Raises InputError as `check_writable`, and for a
-    scene with companions that could not be read, which would be removed. tell: report what the format loses,
-    see `report_left_out`. write: in place of the format's writer.
+    Only the PLY keeps everything: see `SceneFormat.loses`. All formats keep the order of rows. Files are
+    written under temporary names; then old companions are removed, and the scene and last the new companions
+    renamed into place. An interruption leaves the old scene or the new one, perhaps without companions, never
+    with those of another. InputError as of `check_writable`, and for companions that could not be read, which
+    would be removed. tell: report what the format loses (`report_left_out`). write: in place of its writer.
     """
     expect(path, str | os.PathLike, "say save_scene(path, scene)")
     expect(scene, Scene, "Scene(gaussians) makes one")

@@ -7,9 +7,8 @@ executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and 
     codes            uint16   (3, N)     number of the codeword at subpart, part, whole: of a codebook
     latents          float    (3, N, d)  instead, of another codec; zero where never observed
     confidence       float    (3, N)     total blending weight of the observations, >= 0; 0 for no feature
-    tree.leaves      uint16   (N,)       smallest node that a Gaussian is in, 65535 for none; uint32 and
-                                         4294967295 if there are more nodes. All tensors of a tree are
-                                         absent without one
+    tree.leaves      uint16   (N,)       smallest node of a Gaussian, 65535 for none; uint32 and 4294967295
+                                         if there are more nodes. All of a tree are absent without one
     tree.parents     uint32   (K,)       node that each is part of, a later one; 4294967295 for none
     tree.levels      uint8    (K,)       0, 1, 2: subpart, part, whole
     tree.votes       uint16   (K, 2)     photographs with a mask of exactly this node; those without one
@@ -386,8 +385,7 @@ def read_language(path: Path | str, means: Array, origin: Array = NO_ORIGIN) -> 
     """Return the field in the sidecar `path`, which must belong to the Gaussians at `means` (N, 3) float32.
 
     origin: (3,), of their scene; sidecars from before origins existed have the checksum of positions in the
-    world. Raises InputError if it cannot be opened and FormatError if it breaks a rule of the layout or
-    belongs to other Gaussians.
+    world. FormatError if it breaks a rule of the layout or belongs to other Gaussians.
     """
     path = Path(path)
     stored = read_stored(path)

@@ -1,7 +1,6 @@
 """SOG version 2 (PlayCanvas "spatially ordered Gaussians"): images of quantised columns.
 
-`meta.json` names the images; they lie beside it in a folder, or with it in one `.sog` (zip). Pixel i, row
-by row, belongs to Gaussian i:
+`meta.json` names the images, beside it in a folder or one `.sog` (zip). Pixel i, row by row, is Gaussian i's:
 
     means[0], means[1]   low and high bytes of 16-bit fractions between `mins` and `maxs`, of
                          sign(x) log(1 + |x|) per axis
@@ -97,8 +96,7 @@ ENTRIES = {*_Meta.__struct_encode_fields__, "version", "asset"}
 def read_sog_scene(path: Path | str) -> Scene:
     """Return the Gaussians of a SOG folder, its `meta.json` or a `.sog` file.
 
-    `antialiased` is set as in the file. Raises InputError if a file cannot be opened and FormatError if it
-    breaks a rule of the format.
+    `antialiased` is set as in the file. FormatError for a file that breaks a rule of the format.
     """
     path = Path(path)
     if path.is_dir():
@@ -307,8 +305,7 @@ def _coded(values: Array, counts: Array) -> tuple[Array, Array]:
 def _palette(values: Array, counts: Array) -> tuple[Array, Array]:
     """Return the (N,) palette entry of each row, and the (P, D) entries.
 
-    Up to 65536 rows of `counts` have an entry each; else entries are means of groups by median cut, along
-    the axis of largest variance.
+    Up to 65536 rows of `counts` have one each; else entries are means by median cut of the widest axis.
     """
     rows = values[counts]
     squares, own = rows**2, np.zeros(len(rows), np.int64)

@@ -1,8 +1,7 @@
 """Test of an encoder on the bundled room: its geometry, the accuracy of its verdicts, and a calibration.
 
 The regions of the room's tree are cut out of rendered images, as training cuts masks out of photographs, and
-encoded. Their names are known (`assets/demo/names.json`), so that phrases for what is present,
-and phrases for what is absent, can be asked.
+encoded. Their names are known (`assets/demo/names.json`), and so is what is present and what is absent.
 """
 
 import time
@@ -307,8 +306,7 @@ REJECTED = 0.95  # of what is absent, among the phrases that a calibration is fi
 def fit_scaling(present: Array, absent: Array) -> PlattScaling:
     """Fit to (P, 3) fits of present phrases and (A, 3) of absent ones; both sets have the same weight.
 
-    A fourth column, the mean fits of phrases, counts too. Raises InputError where there are fewer than ten of
-    either, or the fits do not separate them.
+    A fourth column, mean fits, counts too. InputError for fewer than ten of either, or fits that are alike.
     """
     if min(len(present), len(absent)) < FEWEST:
         raise InputError("a calibration needs ten phrases for what is there and ten for what is not")

@@ -1,8 +1,7 @@
 """From masks with vectors to a language field: mask weights, groups of masks, codec, latents, tree.
 
-Each is kept in the work folder. Mask weights are kept view by view and latents block by block, so that an
-interrupted run, or one that is shared by several processes, repeats little, and so that what is held in
-memory depends on a block of Gaussians and not on all of them times all photographs.
+Each is kept in the work folder, mask weights view by view and latents block by block: an interrupted or
+shared run repeats little, and memory depends on a block of Gaussians, not on all times all photographs.
 """
 
 import shutil
@@ -352,8 +351,7 @@ def _node_vectors(
 ) -> Array:
     """Return (P + K, D) unit vectors of `nodes`, seen alone in their `best_views`; 0 for other nodes.
 
-    A vector is the mean of those views' that agree most with all. eyes: (V, 3) positions of cameras; drawn:
-    files of the (H, W) patches of each view.
+    A vector is the mean of those views' that agree most. eyes: (V, 3); drawn: files of (H, W) patches.
     """
     encoder, seen = stages.encoder, [open_array(path) for path in drawn]
     pixels = tree.totals(np.stack([np.bincount(one[one >= 0], minlength=tree.count) for one in seen], 1)).T

@@ -126,9 +126,8 @@ def _digest(arrays: Iterable[Array]) -> str:
 def sole_use(folder: Path) -> Iterator[None]:
     """Hold `folder` for one training, as two would write each other's stages.
 
-    It is made if it is missing, and removed again if nothing came into it. The lock is the operating
-    system's and ends with its process, however that ends; on file systems without locks nothing is held.
-    Raises InputError where another process, or another training in this one, holds the folder.
+    It is made if missing, and removed if nothing came into it. The lock is the operating system's and ends
+    with its process; file systems without locks hold nothing. InputError where another training holds it.
     """
     if fcntl is None:
         folder.mkdir(parents=True, exist_ok=True)

@@ -71,9 +71,8 @@ class QueryEngine:
 
         load_encoder: an encoder or a function that loads one; without it, only phrases of the scene's
         phrasebook are answered. encoder_id: in place of the one that the scene names. exact: compare every
-        latent itself instead of its cell, as a reference for the cells. rule: "regions" becomes "peak" if
-        neither scene nor encoder has everyday phrases. words: the user's, before the scene's; EncoderError if
-        they are of another encoder.
+        latent itself and not its cell. rule: "regions" becomes "peak" if neither scene nor encoder has
+        everyday phrases. words: the user's, before the scene's; EncoderError if they are of another encoder.
         """
         expect(scene, Scene, "load_scene(path) returns one")
         expect(words, Words | None, "read_words(path) returns them")

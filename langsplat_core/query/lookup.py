@@ -97,8 +97,7 @@ def sphere_cells(latents: Array, most: int = CELLS) -> tuple[Array, Array]:
     """Divide (M, 3) non-zero latents among at most `most` cells: (M,) numbers, (K, 3) float32 unit centres.
 
     A cell is a square of an octahedral map, as small as `most` filled cells allow; its centre is the mean of
-    its latents. Up to `most` latents are a cell each. Relevancies change smoothly over the sphere, so their
-    error falls with the side of a cell.
+    its latents. Up to `most` latents are a cell each. The error of relevancies falls with a cell's side.
     """
     directions = unit(latents.astype(np.float64), 1e-30)
     if len(directions) <= most:

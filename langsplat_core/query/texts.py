@@ -72,8 +72,7 @@ class TextVectors:
     def of(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
         """Return (Q, D) vectors of phrases; those that are not yet known are encoded together.
 
-        Raises InputError for an empty phrase and one of stop words alone, UnknownWordError for words that the
-        encoder was never taught, and as `encoder` does.
+        InputError for stop words alone, UnknownWordError for words it was not taught; else as `encoder`.
         """
         keys = list(map(phrase_key, phrases))
         fresh = [key for key in dict.fromkeys(keys) if key not in self._vectors]

@@ -61,8 +61,7 @@ FARTHEST = 1e9  # largest coordinate of cameras in files, world units: float32 s
 class Camera(Intrinsics):
     """A pinhole camera without distortion, or an orthographic one, whose rays are parallel to its z axis.
 
-    Pixel (0, 0) is the top left one and its centre lies at (0.5, 0.5). Focal lengths of an orthographic
-    camera are pixels per world unit.
+    The centre of the top left pixel is (0.5, 0.5). An orthographic camera's focal lengths are px per unit.
     """
 
     width: int  # pixels, >= 1

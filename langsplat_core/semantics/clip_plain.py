@@ -1,7 +1,6 @@
 """A small CLIP with a closed vocabulary in NumPy, from the files of its weights and tokenizer.
 
-It lets the bundled encoder run without torch, transformers and tokenizers, which take seconds to import and
-hundreds of megabytes to install; training needs no transformers.
+It spares the bundled encoder torch, transformers and tokenizers: seconds to import, hundreds of megabytes.
 
 The network is that of Radford et al. 2021: token and position embeddings, residual layers of causal
 self-attention and a two-layer perceptron, each with a layer norm before it, a final norm, and a projection of

@@ -301,8 +301,7 @@ _LONG = re.compile(rb'(?<!"precompiled_charsmap":)(?<!"precompiled_charsmap": )"
 class TorchText:
     """A `TextTower` computed by torch.
 
-    The folder's tokenizer.json is read by the `tokenizers` library and not by classes of transformers, whose
-    versions differ in padding and end tokens.
+    tokenizer.json is read by `tokenizers`, as versions of transformers differ in padding and end tokens.
     """
 
     ends = True  # a token marks the end of every phrase
@@ -447,8 +446,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.
 def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
     """Load the text half of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
 
-    The device is the CPU by default, where a phrase takes a few milliseconds. Raises EncoderError if the
-    weights are missing or of an unknown family.
+    A phrase takes milliseconds of a CPU. EncoderError for weights that are missing or of no known family.
     """
     weights = models.open_weights(model, model_path(model, "--encoder"), device)
     return PhraseEncoder(weights, models.family_of(weights, FAMILIES, "encoders").text(weights))

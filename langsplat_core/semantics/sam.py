@@ -244,8 +244,7 @@ def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
     return SamMasks(load_segmenter(config.sam, device), config, half_on)
 
 
-# The grid of points, and layers of crops: parts of a photograph that are encoded by themselves, for masks of
-# small things.
+# The grid of points, and layers of crops: parts of a photograph encoded by themselves, for small things.
 
 OVERLAP = 512 / 1500  # of neighbouring crops, as a share of the image's shorter side, in the first layer
 EDGE = 20.0  # px: largest distance at which a box touches an edge

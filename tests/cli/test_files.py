@@ -117,8 +117,7 @@ def assert_companions(made: Scene, scene: Scene, rows) -> None:
 
 
 def test_transform_moves_everything(scene, source, tmp_path, capsys):
-    """A quarter turn about z, twice the size, and a move, in that order, whatever the order of options; then
-    the printed matrix, one row by row, and an axis."""
+    """A quarter turn about z, twice the size, a move, in any order of options; its matrix; an axis."""
     out = tmp_path / "out.ply"
     assert run("transform", source, out, "--move", 1, 2, 3, "--scale", 2, "--rotate", "z", 90) == 0
     made = load_scene(out)

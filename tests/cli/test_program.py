@@ -1,5 +1,4 @@
-"""The command line as a whole: its commands, their options, what it says of those that do not exist; and
-whatever happens to a command, it ends with one line."""
+"""The command line as a whole: commands, options, those that do not exist; each ends in a line."""
 
 import contextlib
 import dataclasses
@@ -67,6 +66,7 @@ def test_every_option_is_described(name, capsys):
     [
         (["qurey", "a.ply"], "no command 'qurey'; did you mean 'query'?"),
         (["xyz"], "no command 'xyz'; there are train, query"),
+        (["convert", "a.ply", "--out"], "--out: names nothing"),
         (["-v", "doctor", "-q"], "--quiet and --verbose: one says less"),
         (["--tyro-print-completion", "ksh"], "--tyro-print-completion ksh: there is bash, zsh"),
     ],

@@ -37,8 +37,7 @@ SCENE = named_scene()
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working folder, with a scene of a mug, a book and a plant. In its phrasebook are also "pair", both
-    mug and plant, and "void", which is nothing."""
+    """A folder with a scene of a mug, a book and a plant; "pair" is mug and plant, "void" nothing."""
     pair = ((axis(0) + axis(2)) / np.sqrt(2)).astype(np.float32)
     field = replace(language(), phrasebook={"book": axis(1), "pair": pair, "void": axis(6)})
     extras = {"label": np.arange(3 * PER_BLOB, dtype=np.int32)}

@@ -102,8 +102,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def located(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Path, list[str]]:
-    """The capture, its work folder, the warnings given. The run is cancelled once, after
-    features were found, and then repeated."""
+    """The capture, work folder and warnings of a run that was cancelled after features, and repeated."""
     work = tmp_path_factory.mktemp("work")
 
     def stop(at: Report) -> None:

@@ -232,11 +232,13 @@ def test_loader_refuses_what_is_no_scene(tmp_path):
             load_scene(tmp_path / nowhere)
     write_ply(tmp_path / ("n" * 240 + ".ply"), random_gaussians(1))  # its companions' names would be too long
     assert load_scene(tmp_path / ("n" * 240 + ".ply")).language is None
-    write_ply(tmp_path / "model" / "iteration_7" / "point_cloud.ply", random_gaussians(1))
-    (tmp_path / "empty").mkdir()
+    for number in (7000, 30000):
+        write_ply(tmp_path / f"model/point_cloud/iteration_{number}/point_cloud.ply", random_gaussians(1))
+    write_ply(tmp_path / "a/b/c/d/too_far.ply", random_gaussians(1))
     said = {
-        "model": r"perhaps .*model/iteration_7/point_cloud\.ply",
-        "empty": r"without meta\.json is not a scene$",
+        "model": r"perhaps .*model/point_cloud/iteration_30000/point_cloud\.ply$",
+        ".": r"perhaps .*/n{240}\.ply$",
+        "a": r"without meta\.json is not a scene$",
     }
     for name, message in said.items():
         with pytest.raises(InputError, match=message):

@@ -70,8 +70,7 @@ def test_boolean_rows_and_weights_are_accepted():
 
 @pytest.mark.parametrize("codebook", [True, False])
 def test_pixel_words_follow_the_rows_of_w(codebook):
-    """Against float64: the reference's weights at the pixel, and every Gaussian's own words and relevancy.
-    The surface is at the median of their depths."""
+    """Against float64: the reference's weights at the pixel, every Gaussian's words; the median of depths."""
     scene = named_scene(codebook)
     asked, camera = describer(scene), scene.cameras[1]
     engine, names = asked.engine, asked.words[2]

@@ -280,8 +280,7 @@ def test_gradients_are_slopes_of_the_reference(seed, orthographic):
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_clamped_coordinates_have_no_gradient(antialiased):
-    """Large Gaussians beside the field of view. Without perspective none is clamped, and a Gaussian's depth
-    changes nothing but the order."""
+    """Large Gaussians beside the field of view: none is clamped, and depth changes nothing but the order."""
     settings = replace(INRIA, antialiased=antialiased)
     gaussians, camera = random_gaussians(50, 3, radius=2.0), random_camera(3, 40, 27, distance=1.5)
     in_camera = gaussians.means @ camera.rotation.T + camera.world_to_camera[:3, 3]

@@ -280,8 +280,7 @@ def reference_gradients(
     alpha_grad: Array,
     rows: Array | None = None,
 ) -> dict[str, Array]:
-    """Gradients of <image, image_grad> + <alpha, alpha_grad> by the parameters, values and pixel means of the
-    Gaussians at `rows`, by default of all.
+    """Gradients of <image, image_grad> + <alpha, alpha_grad> by parameters, values, pixel means at `rows`.
 
     Pixels at a cut-off must carry no loss: there the image jumps.
     """

@@ -350,8 +350,7 @@ def splat_bytes(g: Gaussians) -> bytes:
 
 
 def turned_coefficients(sh: Array, turn: Array) -> Array:
-    """(N, K, 3) coefficients of the same colours after the world was multiplied by `turn` (3, 3), found by
-    least squares over directions instead of from symmetries."""
+    """(N, K, 3) coefficients of the same colours after a `turn` (3, 3), by least squares over directions."""
     directions = unit(np.random.default_rng(0).normal(size=(400, 3)))
     count = sh.shape[1]
     matrix = np.linalg.lstsq(sh_basis(directions @ turn.T, count), sh_basis(directions, count), rcond=None)[0]

@@ -139,8 +139,7 @@ def play(display: str, arguments: list[str], folder: Path, timeout: float, **env
 
 
 class Cast:
-    """A process that has imported a module that calls `serve`, and plays it in forks of itself: what takes
-    seconds to import is imported once."""
+    """A process that imports a module that calls `serve` once, and plays it in forks of itself."""
 
     def __init__(self, module: str, display: str) -> None:
         self._process = subprocess.Popen(
@@ -387,8 +386,7 @@ STEPS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.chmod", "
 def killed_everywhere(work: Callable[[], int | None], folder: Path) -> Iterator[int]:
     """Do `work` in forks of this process, each killed at another of its steps in `folder`.
 
-    Steps are what opens, makes, renames or removes a file. Yields the exit codes, the last of which is of a
-    fork that ended otherwise.
+    Steps open, make, rename or remove a file. Yields exit codes, the last of a fork that ended otherwise.
     """
 
     def killed(left: Iterator[int]) -> int | None:

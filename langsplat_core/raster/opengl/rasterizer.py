@@ -5,8 +5,7 @@ then draws one quad per Gaussian, and the fixed-function blender composes back t
 is that of `raster/reference.py` but for one thing: blending back to front cannot stop at T <= 1e-4, so a
 pixel may differ by up to 1e-2 of the largest value behind.
 
-From top to bottom: a context without a window or a display, tools for drawing with moderngl, the textures of
-a scene, and the rasterizer.
+From top to bottom: a context without a window, tools for moderngl, a scene's textures, the rasterizer.
 """
 
 import math
@@ -144,8 +143,7 @@ class SceneTextures:
 
     def sort(self, camera: Camera, settings: RasterSettings) -> None:
         """Fill `order` with the texels between near and far, back to front, ties by index."""
-        # Term by term, as in the reference: a matrix product may round equal rows differently, and equal
-        # depths must tie.
+        # Term by term, as in the reference: a matrix product may round equal rows, which must tie, apart.
         x, y, z = self._means
         a, b, c, d = camera.world_to_camera[2]
         depths = x * a + y * b + z * c + d

@@ -43,8 +43,7 @@ def _coefficients(parameters: dict[str, Tensor], sh_degree: int) -> Tensor:
 class _CpuImage(torch.autograd.Function):
     """(means, log scales, quaternions, opacity logits, sh, means_px probe) -> (image, alpha, visible).
 
-    The probe is not read: it is an input only so that autograd hands out the gradient by the projected
-    means, which densification needs.
+    The probe, which is not read, gets the gradient by the projected means, which densification needs.
     """
 
     @staticmethod

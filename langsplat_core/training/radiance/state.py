@@ -37,8 +37,7 @@ def initial_gaussians(
     """Return isotropic Gaussians at the capture's points (Kerbl et al. 2023, section 5.1).
 
     Each is as large as the mean distance to three neighbours. Points that no training camera sees, repeated
-    points and isolated outliers are left out. Too few points are topped up with random ones from the volume
-    that the training cameras see.
+    points and isolated outliers are left out. Too few are topped up with random ones that the cameras see.
     """
     rng = np.random.default_rng(seed)
     cameras = [capture.cameras[i] for i in train_indices]

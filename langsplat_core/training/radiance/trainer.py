@@ -1,8 +1,7 @@
 """Radiance training: Gaussians fitted to photographs as in 3D Gaussian Splatting (Kerbl et al. 2023).
 
-One step renders one photograph's view, compares, and moves every parameter by Adam; density control and
-opacity resets follow the `Schedule`. On the CPU a run is deterministic given its seed, and resumes from a
-checkpoint exactly where it stopped.
+One step renders a photograph's view, compares, and moves every parameter by Adam; density control and opacity
+resets follow the `Schedule`. On the CPU a run is determined by its seed, checkpoints included.
 """
 
 import math
@@ -131,9 +130,8 @@ def train_radiance(
 
     `progress` gets the mean PSNR of up to `JUDGED` views at `held_out`. With a `checkpoint` path the run
     continues from that file if it exists, and writes it every `config.checkpoint_every` steps, at the end,
-    and when it is interrupted (Ctrl-C, or an error of `progress`). Raises InputError when a setting is out of
-    its range, there is nothing to train on or the checkpoint belongs to another run, BackendError when the
-    chosen backend does not work.
+    and when it is interrupted (Ctrl-C, or an error of `progress`). InputError for a setting out of its range,
+    nothing to train on or a checkpoint of another run, BackendError for a backend that does not work.
     """
     check_settings(config, "--radiance.")
     if not train_indices:
