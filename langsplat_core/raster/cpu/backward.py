@@ -1,8 +1,8 @@
 """Gradients of blending on the CPU: from an image's gradient to each footprint.
 
-A tile is walked front to back once, as in `walk`, and alpha and T of every row touched are written to
-a tape. The tape is then read from its end. With weight w_i = alpha_i T_i, s_i = <image gradient, x_i> +
-alpha gradient (per pixel), and behind_i = sum over j > i of w_j s_j,
+A tile is walked front to back once, and alpha and T of every row touched are written to a tape, which is
+then read from its end. With weight w_i = alpha_i T_i, s_i = <image gradient, x_i> + alpha gradient (per
+pixel), and behind_i = sum over j > i of w_j s_j,
 
     d loss / d alpha_i = T_i s_i - behind_i / (1 - alpha_i),
 
@@ -27,45 +27,31 @@ from langsplat_core.raster.cpu.tiles import PIXELS, TILE, Tiles
 Q, QW, QV, QWW, QWV, QVV = range(6)
 MOMENTS = 8
 _ENTRY = 2 * TILE  # numbers of tape per row: alpha and T
-_TAPE = 128 * TILE * _ENTRY  # initial length of a tape: 128 Gaussians that fill the tile
 
 
 @helper
-def _record(tile: int, tiles: Tiles, state: Array, spans: Array, tape: Array) -> tuple[Array, int, int]:
-    """Blend a tile as `walk` does, and write alpha and T of every row to the tape.
+def _next_entry(work: Any, rank: int, later: int) -> int:
+    """Return where the tape goes on."""
+    return work[2][0]
 
-    Return the tape (a longer copy if it was full), its used length and the end of the intersections visited.
 
-    spans[s - first] <- rows [low, high) of each intersection that were blended; low = high where no pixel got
-    any weight, and nothing is on the tape.
-    """
-    x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
-    first, last = tiles.starts[tile], tiles.starts[tile + 1]
-    used, rows = 0, np.empty(3 * TILE, np.float32)
-    top, bottom = 0, TILE
-    for s in range(first, last):
-        if (s - first) % tiling.CHECK_EVERY == tiling.CHECK_EVERY - 1:
-            top, bottom = tiling.running_rows(state, top, bottom)
-            if top >= bottom:
-                return tape, used, s
-        if used + TILE * _ENTRY > tape.shape[0]:
-            tape = tiling.grown(tape, used)
-        low, high = tiling.rows_to_blend(tiles, s, top, bottom)
-        rank, _ = tiling.enter(tiles, s, min(s + tiling.AHEAD, last - 1))
-        steps = tiling.begin_rows(tiles.geometry[rank], x, y + low, rows)
-        start, most = used, ln.lanes(np.float32(0))
-        for row in range(low, high):
-            w, peak = steps + rows[row - low], rows[TILE + row - low]
-            added, before = tiling.blend_row(state, row * TILE, w, peak, tiles.cutoffs)
-            ln.store(tape, used, added)
-            ln.store(tape, used + TILE, before)
-            most = ln.where_at_least(added, most, added, most)
-            used += _ENTRY
-        if ln.largest(most) > 0:
-            spans[s - first, 0], spans[s - first, 1] = low, high
-        else:
-            used = start
-    return tape, used, last
+@helper
+def _record_row(work: Any, start: int, s: int, row: int, low: int, alpha: Lanes, before: Lanes) -> None:
+    at = start + (row - low) * _ENTRY
+    ln.store(work[0], at, alpha)
+    ln.store(work[0], at + TILE, before)
+
+
+@helper
+def _keep_entry(work: Any, start: int, s: int, low: int, high: int) -> None:
+    """Note the rows of an intersection, and keep what is on the tape, if any pixel got weight."""
+    tape, spans, used, first = work
+    most = ln.lanes(np.float32(0))
+    for row in range(high - low):
+        most = max(most, ln.load(tape, start + row * _ENTRY))
+    if ln.largest(most) > 0:
+        spans[s - first, 0], spans[s - first, 1] = low, high
+        used[0] = start + (high - low) * _ENTRY
 
 
 @kernel
@@ -86,34 +72,37 @@ def backward(
     image_grad, alpha_grad = grads
     channels, columns = values.shape[1], partial.shape[1]
     lines = tiling.padded_inside(channels)
-    tape = np.empty(_TAPE, np.float32)
+    # Room for the fullest tile; of memory that is not touched the system takes none.
+    tape = np.empty(np.diff(tiles.starts).max() * TILE * _ENTRY, np.float32)
+    used = np.zeros(1, np.int64)
     for i in range(first, last):
         tile = tiling.tile_at(i, tiles)
         left, top = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
         start, stop = tiles.starts[tile], tiles.starts[tile + 1]
-        state = tiling.start_tile(tile, tiles)
-        spans = np.zeros((stop - start, 2), np.int64)
-        tape, used, end = _record(tile, tiles, state, spans, tape)
+        spans = np.zeros((stop - start, 2), np.int64)  # rows with weight of each intersection
+        used[0] = 0
+        work = ln.borrowed((tape, spans, used, start))
+        behind, end = tiling.walk(tile, tiles, work, _next_entry, _record_row, _keep_entry)
+        behind[:] = 0
         reached[end:stop] = False
         planes, plane = np.empty(PIXELS * lines, np.float32), np.empty(PIXELS, np.float32)
         tiling.load_tile(planes, image_grad, tile, tiles)
         tiling.load_tile(plane, alpha_grad, tile, tiles)
         weights, at_row = np.empty(PIXELS, np.float32), np.empty(3 * TILE, np.float32)
-        behind = state
-        behind[:] = 0
+        place = used[0]  # on the tape, read from its end
         for s in range(end - 1, start - 1, -1):
             low, high = spans[s - start, 0], spans[s - start, 1]
             reached[s] = low < high
             if low >= high:
                 continue
-            used -= (high - low) * _ENTRY
+            place -= (high - low) * _ENTRY
             rank, _ = tiling.enter(tiles, s, max(s - tiling.AHEAD, start))
             x = values[rank]
             steps = tiling.begin_rows(tiles.geometry[rank], left, top + low, at_row)
             q0 = qw = qv = qww = qwv = qvv = none = ln.lanes(np.float32(0))
             for row in range(low, high):
                 w, v = steps + at_row[row - low], at_row[2 * TILE + row - low]
-                at = used + (row - low) * _ENTRY
+                at = place + (row - low) * _ENTRY
                 alpha, before = ln.load(tape, at), ln.load(tape, at + TILE)
                 weight = alpha * before
                 ln.store(weights, (row - low) * TILE, weight)

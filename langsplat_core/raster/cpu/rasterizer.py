@@ -38,9 +38,9 @@ def _fetch_values(work: Any, rank: int, later: int) -> Array:
 
 
 @helper
-def _add_values(work: Any, x: Array, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
+def _add_values(work: Any, x: Array, s: int, row: int, low: int, alpha: Lanes, before: Lanes) -> None:
     channels = x.shape[0]
-    tiling.add_weighted(work[1], row * tiling.padded_inside(channels) * TILE, channels, weight, x)
+    tiling.add_weighted(work[1], row * tiling.padded_inside(channels) * TILE, channels, alpha * before, x)
 
 
 @kernel
@@ -59,8 +59,8 @@ def splat_tiles(first: int, last: int, tiles: Tiles, values: Array, image: Array
 
 
 @helper
-def _store_weight(work: Any, mine: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
-    ln.store(work[0], (row - low) * TILE, weight)
+def _store_weight(work: Any, mine: Any, s: int, row: int, low: int, alpha: Lanes, before: Lanes) -> None:
+    ln.store(work[0], (row - low) * TILE, alpha * before)
 
 
 @helper
@@ -103,10 +103,10 @@ def _fetch_depth(work: Any, rank: int, later: int) -> Any:
 
 
 @helper
-def _note_half(work: Any, depth: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
+def _note_half(work: Any, depth: Any, s: int, row: int, low: int, alpha: Lanes, before: Lanes) -> None:
     found, at, half = work[1], row * TILE, np.float32(0.5)
     passed = ln.where_at_least(half, before, ln.load(found, at), ln.lanes(depth))
-    ln.store(found, at, ln.where_at_least(half, before - weight, passed, ln.load(found, at)))
+    ln.store(found, at, ln.where_at_least(half, before - alpha * before, passed, ln.load(found, at)))
 
 
 @kernel

@@ -394,7 +394,7 @@ def correlate(
 # What an operation does on the way is given as three helpers, compiled into the walk:
 #
 # open_(work, rank, later)                     before an intersection's rows: its Gaussian, one to prefetch
-# row_(work, mine, s, row, low, weight, before)  at each row, the first is `low`: weight alpha T, T before it
+# row_(work, mine, s, row, low, alpha, before)  at each row, the first is `low`: its alpha, T before it
 # close_(work, mine, s, low, high)             after rows [low, high)
 #
 # A row is sixteen lanes, without branches. A tile's state is one flat float32 array, sixteen numbers a row. A
@@ -503,8 +503,8 @@ def walk(
         steps = begin_rows(tiles.geometry[rank], x, y + low, rows)
         for n in range(high - low):
             row, w, peak = low + n, steps + rows[n], rows[TILE + n]
-            added, before = blend_row(transmittance, row * TILE, w, peak, tiles.cutoffs)
-            row_(work, mine, s, row, low, added * before, before)
+            alpha, before = blend_row(transmittance, row * TILE, w, peak, tiles.cutoffs)
+            row_(work, mine, s, row, low, alpha, before)
         close_(work, mine, s, low, high)
     return transmittance, last
 
