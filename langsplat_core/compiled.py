@@ -2,13 +2,11 @@
 
 A kernel works on items [first, last) of something and releases Python's lock; `Workers` cuts the range into
 pieces and hands them to threads. Compared with numba's own parallel loops this compiles twice as fast,
-balances uneven pieces, and two Python threads may render at the same time (one of numba's threading layers
-aborts the process then).
+balances uneven pieces, and lets two Python threads render at the same time.
 
 Machine code is kept by numba's own cache: in `$NUMBA_CACHE_DIR` where that is set, else beside the source,
-else in the user's cache folder. numba notices a change in a kernel's own file only, and a kernel is made of
-helpers and constants of other files too: here code is stale once any file of this package changes that the
-kernel's imports, directly or not.
+else in the user's cache folder. numba looks at a kernel's own file only; here code is stale once any file of
+this package changes that the kernel imports, directly or not.
 """
 
 import hashlib

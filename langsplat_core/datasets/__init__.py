@@ -65,7 +65,7 @@ def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Pr
         folder, photos = photo_folder(path)
         if not photos:
             raise InputError(f"{path} is no dataset; expected {ACCEPTED}")
-        say_unread(folder, photos)
+        say_unread(path, folder, photos)
         return load_photos(folder, photos, config, work, progress)
     except PermissionError as error:
         raise InputError(f"{error.filename}: may not be read ({error.strerror}); see to its rights") from None

@@ -316,10 +316,9 @@ def split_views(capture: Capture, config: DatasetConfig) -> tuple[list[int], lis
 def surrounded_views(cameras: Sequence[Camera], every: int) -> list[int]:
     """Return ascending indices of one view in `every`, each surrounded by training views.
 
-    Views at the ends of a walk show what no other photograph does, and do not measure the training. Views are
-    taken one by one: each time the one closest to the middle of its nearest training views, in position and
-    direction, relative to their distance. Its own nearest views are then left to training, so that held-out
-    views come from all over the capture. Fewer than `FEWEST_VIEWS` cameras give none.
+    Views at the ends of a walk show what no other photograph does, and do not measure the training. Each time
+    the view closest to the middle of its nearest training views, relative to their distance, is taken, and
+    its own nearest views are left to training. Fewer than `FEWEST_VIEWS` cameras give none.
     """
     count = len(cameras)
     if every < 2 or count < FEWEST_VIEWS:

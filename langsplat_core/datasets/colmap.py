@@ -1,9 +1,8 @@
-"""COLMAP's sparse models, binary or text, and datasets with one in ``sparse/0`` or ``sparse``.
+"""COLMAP's sparse models, binary or text, and datasets with one in ``sparse/0``, ``sparse`` or their folder.
 
-Models are read here and not by pycolmap, which fills cameras of a truncated file with whatever lies in
-memory, cuts the names of a text model at their first blank, and refuses a model without points. So cameras
-open without the extra that brings pycolmap, too. Layout: https://colmap.github.io/format.html. Rigs and
-frames (COLMAP >= 3.12) add nothing here, because images.bin still carries every image's own pose.
+pycolmap fills cameras of a truncated file with whatever lies in memory, cuts the names of a text model at
+their first blank, refuses a model without points, and may not be installed. Rigs and frames (COLMAP >= 3.12)
+add nothing: images.bin still has every image's own pose. Layout: https://colmap.github.io/format.html
 """
 
 import os
@@ -297,11 +296,11 @@ def find_model(folder: Path) -> Path | None:
     Photographs that COLMAP cannot place together end in several models, of which the first is not always the
     largest. The model with most photographs is taken, the first of equal ones, and a warning names it.
     """
-    sparse = folder / "sparse"
+    sparse = next(filter(Path.is_dir, (folder / "sparse", folder / "colmap/sparse")), folder / "sparse")
     inside = sorted(sparse.iterdir(), key=lambda f: (len(f.name), f.name)) if sparse.is_dir() else []
     found = [f for f in inside if model_suffix(f)]
     if len(found) < 2:
-        return next((f for f in (*found, sparse) if model_suffix(f)), None)
+        return next((f for f in (*found, sparse, folder) if model_suffix(f)), None)
     best = max(found, key=_photographs_of)
     name = printable_line(best.name, 60)
     report_loss("%s has %d models; %s is taken, with most photographs", shown(sparse), len(found), name)

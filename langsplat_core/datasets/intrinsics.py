@@ -1,9 +1,8 @@
 """Lenses of photographs: their formulas, their inverses, and resampling to a pinhole.
 
-A point in the camera's frame has *normalised* coordinates (x/z, y/z). A distortion maps normalised to
-distorted coordinates, and the pixel position is ``(fx * x_d + cx, fy * y_d + cy)``, with pixel centres
-at +0.5. Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fisheye camera model".
-Positions are float64; only the pixels that are interpolated at them are not.
+A point in the camera's frame has *normalised* coordinates (x/z, y/z), float64. A distortion maps these to
+distorted ones, and the pixel position is ``(fx * x_d + cx, fy * y_d + cy)``, with pixel centres at +0.5.
+Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fisheye camera model".
 """
 
 from dataclasses import dataclass

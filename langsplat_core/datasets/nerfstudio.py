@@ -30,6 +30,7 @@ from langsplat_core.scene import FARTHEST
 DISTORTING = ("k1", "k2", "k3", "k4", "p1", "p2")
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "orthographic")  # instant-ngp's keys
 JSON_LIMIT = 256 * 1024 * 1024  # bytes; a frame takes about 700
 Json = dict[str, Any]
 
@@ -37,8 +38,8 @@ Json = dict[str, Any]
 def load_nerfstudio(file: Path, config: DatasetConfig, progress: Progress) -> Capture:
     """Return the photographs and cameras that `file` lists; points only if it names a PLY.
 
-    Of the synthetic scenes of NeRF, which list photographs apart, those of transforms_test.json, or of
-    transforms_val.json for want of it, are held out from the training on those of transforms_train.json.
+    Those that are not among its "train_filenames" are held out from training. So are, of the synthetic scenes
+    of NeRF, which list photographs apart, those of transforms_test.json, or else of transforms_val.json.
     """
     top = _content(file)
     if os.path.islink(file) and _photo_file(finder(file.parent), top["frames"][0]["file_path"]) is None:
@@ -78,6 +79,7 @@ def _photos(file: Path, top: Json, held_out: bool) -> dict[str, Photo]:
     missing: list[str] = []
     guessed: set[str] = set()
     find = finder(file.parent)
+    training = _training_photos(file, top, find)
     for number, frame in enumerate(top["frames"]):
         where = f"{file}: frame {number}"
         label = frame["file_path"]
@@ -95,7 +97,8 @@ def _photos(file: Path, top: Json, held_out: bool) -> dict[str, Photo]:
         except ValueError as error:
             raise FormatError(f"{where} ({printable_line(label, 60)}): {error}") from None
         guessed.update(_guesses({**top, **frame}))
-        photo = Photo(path, label, lens, pose, mask=mask, held_out=held_out)
+        apart = held_out or (bool(training) and path not in training)
+        photo = Photo(path, label, lens, pose, mask=mask, held_out=apart)
         if not np.array_equal(photos.setdefault(label, photo).world_to_camera, pose):
             guessed.add("photographs are listed twice, of which the last counts")
         photos[label] = photo
@@ -109,6 +112,17 @@ def _photos(file: Path, top: Json, held_out: bool) -> dict[str, Photo]:
     for what in sorted(guessed):
         report_loss("%s: %s", file, what)
     return photos
+
+
+def _training_photos(file: Path, top: Json, find: Callable[[str], Path]) -> set[Path | None]:
+    """Return the photographs that a file lists for training; none: all are. FormatError."""
+    names = top.get("train_filenames") or []
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise FormatError(f'{file}: "train_filenames" is no list of names')
+    found = {_photo_file(find, name) for name in names}
+    if names and found.isdisjoint(_photo_file(find, frame["file_path"]) for frame in top["frames"]):
+        raise FormatError(f'{file}: "train_filenames" names none of its frames; mend or remove it')
+    return found
 
 
 def _without_camera(photos: Mapping[str, Photo], frames: Sequence[Json]) -> set[str]:
@@ -192,6 +206,8 @@ def _focal(values: Json, axis: str, side: int, default: float | None) -> float:
 def _distortion(values: Json) -> Distortion:
     model = values.get("camera_model", "OPENCV")
     k1, k2, k3, k4, p1, p2 = (_number(values, key, 0.0) for key in DISTORTING)
+    if others := [key for key in OTHER_LENSES if values.get(key, False) is not False]:
+        raise ValueError(f'"{others[0]}" is of a lens that is not read; undistort the photographs first')
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
         return FisheyeDistortion(k1, k2, k3, k4)
     if model not in PERSPECTIVE:

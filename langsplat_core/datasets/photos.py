@@ -46,18 +46,20 @@ class Photo:
 # Finding them.
 
 
+CAMERA_FILES = ("images.txt", ".bin", ".csv", ".json", ".npy", ".nvm", ".out", ".xml")  # ends of names
+NAMED, MASKS = ("images", "photos"), ("masks", "mask")  # folders of a dataset
 DEEP = 3  # levels of folders: a phone's photographs lie in DCIM/100APPLE
 
 
-def find_photos(folder: Path, below: int = 0) -> list[Path]:
-    """Return photographs in `folder`, by name, and in so many levels of folders `below` it; none hidden."""
+def find_photos(folder: Path, below: int = 0, ends: tuple[str, ...] = hostile.PHOTO_SUFFIXES) -> list[Path]:
+    """Return photographs (`ends` of names) in `folder`, by name, and in levels `below` it; none hidden."""
     if not folder.is_dir():
         return []
     listed = sorted(path for path in folder.iterdir() if path.name[0] != ".")
-    found = [path for path in listed if path.suffix.lower() in hostile.PHOTO_SUFFIXES and path.is_file()]
+    found = [path for path in listed if path.name.lower().endswith(ends) and path.is_file()]
     # Work folders hold copies of photographs.
-    inside = (path for path in listed if below and path.name != "masks" and path.suffix != ".work")
-    return found + [photo for path in inside for photo in find_photos(path, below - 1)]
+    inside = (path for path in listed if below and path.name not in MASKS and path.suffix != ".work")
+    return found + [photo for path in inside for photo in find_photos(path, below - 1, ends)]
 
 
 def content(path: Path) -> str:
@@ -74,7 +76,7 @@ def photo_folder(folder: Path) -> tuple[Path, list[Path]]:
 
     That is `folder` itself or a folder "images" or "photos" in it; else photographs lie in folders of those.
     """
-    named = folder / "images", folder / "photos"
+    named = [folder / name for name in NAMED]
     for below, candidates in ((0, (folder, *named)), (DEEP, (*named, folder))):
         for candidate in candidates:
             if photos := find_photos(candidate, below):
@@ -92,8 +94,8 @@ def count_photographs(dataset: Path) -> int:
     return 0
 
 
-def say_unread(folder: Path, photos: Sequence[Path]) -> None:
-    """Say which photographs and videos among `photos`, and in folders of `folder`, are not read."""
+def say_unread(dataset: Path, folder: Path, photos: Sequence[Path]) -> None:
+    """Say which cameras of a dataset, and photographs and videos in and beside `folder`, are not read."""
     known, stems = set(photos), {photo.with_suffix("") for photo in photos}
     more = [path.relative_to(folder).as_posix() for path in find_photos(folder, DEEP) if path not in known]
     beside = [path for at in {photo.parent for photo in photos} for path in at.iterdir()]
@@ -101,6 +103,9 @@ def say_unread(folder: Path, photos: Sequence[Path]) -> None:
     videos = sorted(path.name for path in beside if hostile.is_video(path) and path not in live)
     if lost := sorted(path.name for path in beside if path.name[0] != "." and not os.path.exists(path)):
         report_loss("%d links beside the photographs lead nowhere: %s", len(lost), shortened(lost))
+    if given := [path.relative_to(dataset).as_posix() for path in find_photos(dataset, DEEP, CAMERA_FILES)]:
+        what = "may hold cameras and are not read; cameras are found anew, in a world of their own"
+        log.warning("%d files %s: %s", len(given), what, shortened(given))
     if live:
         log.info("%d videos of Live Photos are not read, their stills are", len(live))
     if videos:
@@ -137,20 +142,22 @@ def finder(folder: Path) -> Callable[[str], Path]:
 
 
 def mask_beside(photo: Path) -> Path | None:
-    """Return the mask of a photograph: masks/NAME.jpg.png or masks/NAME.png, in its folder or beside that."""
-    folders = (photo.parent / "masks", photo.parent.parent / "masks")
+    """Return a photograph's mask: NAME.jpg.png or NAME.png in masks or masks/FOLDER, in or beside FOLDER."""
+    folder, above = photo.parent, photo.parent.parent
+    places = [(at, folder.name) for at in (above.parent, above)] + [(folder, ""), (above, "")]
+    folders = [at / word / inside for at, inside in places for word in MASKS]
     candidates = (folder / name for folder in folders for name in (f"{photo.name}.png", f"{photo.stem}.png"))
     # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
     return next((path for path in candidates if path != photo and os.path.isfile(path)), None)
 
 
 def stray_masks(photos: Sequence[Photo]) -> list[str]:
-    """Return the names of images in folders "masks" that belong to no photograph."""
+    """Return the names of images in folders of masks that belong to no photograph."""
     folders = {photo.path.parent for photo in photos}
-    beside = {folder / "masks" for folder in folders}
-    beside |= {folder.parent / "masks" for folder in folders if folder.name in ("images", "photos")}
+    named = {at.parent for folder in folders for at in (folder, folder.parent) if at.name in NAMED}
+    beside = [folder / word for folder in folders | named for word in MASKS]
     used = {photo.mask for photo in photos} | {photo.path for photo in photos}
-    unused = [mask for folder in beside for mask in find_photos(folder) if mask not in used]
+    unused = [mask for folder in beside for mask in find_photos(folder, 1) if mask not in used]
     alike = (photo for folder in folders if unused for photo in find_photos(folder))
     known = {name for photo in alike for name in (photo.name, photo.stem)}
     return [mask.name for mask in unused if mask.suffix != ".png" or mask.stem not in known]
@@ -158,6 +165,7 @@ def stray_masks(photos: Sequence[Photo]) -> list[str]:
 
 def unique_names(labels: Sequence[str]) -> list[str]:
     """Return file stems where those differ, else paths with "_" for "/" and for the suffix's dot."""
+    labels = [label.replace("\\", "/") for label in labels]
     stems = [PurePosixPath(label).stem for label in labels]
     paths = [str(PurePosixPath(label).with_suffix("")).replace("/", "_") for label in labels]
     for names in (stems, paths):
@@ -320,6 +328,8 @@ def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
 def _read_mask(path: Path, size: tuple[int, int]) -> Image.Image:
     """Return the mask of a photograph of `size` pixels, resized to it; InputError if its shape differs."""
     mask = over_black(read_photo(path, upright=False))
+    if np.asarray(mask).max(initial=0) == 1:  # of 0 and 1
+        mask = mask.point(lambda value: 255 * value)
     if abs(mask.width * size[1] / (mask.height * size[0]) - 1) > ASPECT_TOLERANCE:
         raise InputError(
             f"{path}: is {mask.width}x{mask.height} pixels, its photograph {size[0]}x{size[1]}; a mask has "

@@ -1,9 +1,8 @@
 """Displays: one table of what can be shown, and the values per Gaussian that each shows.
 
 A rasterizer delivers premultiplied channels (colours, and the one further channel of the display) and alpha,
-which become what a person sees in one of six drawings: on the CPU by `composing`, on a graphics device by
-`compose.frag.glsl`. Constants reach the shader by `shader_defines`, and a test compares the images. Buttons,
-keys, options, channels and drawings come from `DISPLAYS`.
+of which one of six drawings makes what a person sees: on the CPU `composing`, on a graphics device
+`compose.frag.glsl`. Buttons, keys, options, channels and drawings come from `DISPLAYS`.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -7,11 +7,8 @@ Nodes place primitives; all Gaussians of the default scene are read, in the orde
 may hold an .spz file instead (KHR_gaussian_splatting_compression_spz and _spz_2).
 
 In files of this program the node turns the scene upright, y up, and scales it to metres if the scale is
-known. Its extras have what is needed to undo that, which is done unless the node was moved.
-
-Drafts of the extension stored SCALE as logarithms: a negative scale marks such a file. All other content is
-ignored and reported.
-Source: Khronos' public specification of the extension, as ratified in 2026.
+known; its extras undo that unless the node was moved. In drafts SCALE, then partly negative, is a logarithm.
+All other content is ignored and reported. Source: Khronos' specification as ratified in 2026.
 """
 
 import base64

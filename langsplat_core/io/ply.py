@@ -426,13 +426,12 @@ def _said(comments: Sequence[str], tell: Tell) -> tuple[bool, float | None]:
     """Return whether comments say antialiased, and metres per unit if that is a positive number."""
     marks, lengths = list[bool](), list[float]()
     for comment in comments:
-        match comment.replace(":", " ").split():
+        match comment.lower().replace(":", " ").split():
             case [key, *texts] if key == METRES:
                 try:
                     lengths.append(float(" ".join(texts)))
                 except ValueError:
                     lengths.append(math.nan)
-        match comment.lower().replace(":", " ").split():
             case ["splatrendermode", ("mip" | "default") as mode, *_]:
                 marks.append(mode == "mip")
             case ["antialiased", ("0" | "1") as value]:

@@ -7,9 +7,8 @@ A .splat is 32 bytes per Gaussian and nothing else:
     colour     4 uint8: red, green, blue and opacity, as fractions of 255
     rotation   4 uint8: w x y z as (value - 128) / 128
 
-Little endian, no header, no spherical harmonics beyond the base colour. Other writers sort the rows by size
-times opacity, so that a viewer can show the first part; here the order is kept, because the language field
-is stored by rows. Source of the layout: antimatter15/splat; the code here is our own.
+Little endian, no header, no spherical harmonics beyond the base colour. Other writers sort the rows; here
+their order is that of the language field. Source of the layout: antimatter15/splat; the code is our own.
 """
 
 from dataclasses import replace

@@ -188,7 +188,7 @@ def _about_origin(path: Path, scene: Scene) -> Scene:
         return replace(scene, unread=(str(error),))
     if named is not None:
         metres = named.metres_per_unit or scene.metres_per_unit
-        return replace(scene, origin=np.array(named.origin), metres_per_unit=metres)
+        return replace(scene, origin=scene.origin + named.origin, metres_per_unit=metres)
     if not scene.origin.any():
         means, origin = about_origin(scene.gaussians.means)
         if not origin.any():
@@ -302,7 +302,7 @@ def save_scene(path: Path | str, scene: Scene, tell: bool = True, write: Writer 
             # The sidecar belongs to the positions as they are read back: rounded, or with another origin.
             again = row.read(new_file) if "precision" in row.loses or scene.origin.any() else scene
             if beside:
-                again = replace(again, origin=scene.origin)
+                again = replace(again, origin=scene.origin + again.origin)
             language_files.write_language(new_sidecar, scene.language, again.gaussians.means, again.origin)
         # Locked, else two processes that write one scene could mix their files.
         lock.enter_context(locked(path.parent))

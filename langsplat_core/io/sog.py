@@ -21,6 +21,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,7 +35,7 @@ from langsplat_core.errors import malformed, quoted, report_losses, unread
 from langsplat_core.io import hostile
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.quantised import check_steps, smallest_three, to_bytes, without_largest
-from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+from langsplat_core.scene import SH_COUNTS, Gaussians, Scene, about_origin
 
 META_NAME = "meta.json"
 META_LIMIT = 1024 * 1024  # bytes; a real file has three codebooks, 15 kB
@@ -123,7 +124,7 @@ def _decode(fetch: Fetch, meta_path: Path, size: int, files: Iterable[str]) -> S
     hostile.Allowance(meta_path, size, hostile.SMALL_RATIO).take_gaussians(meta.count, degree)
     antialiased = meta.model == "antialiased" or meta.antialias is True
     planes = _Planes(fetch, meta_path, meta.count)
-    scene = Scene(_gaussians(planes, meta), antialiased=antialiased)
+    scene = replace(_scene(planes, meta), antialiased=antialiased)
     told = [*planes.told, hostile.other_entries(text, ENTRIES, meta_path)]
     if planes.beyond:
         told.append(f"pixels of {planes.beyond} Gaussians behind its {meta.count} not read")
@@ -134,7 +135,7 @@ def _decode(fetch: Fetch, meta_path: Path, size: int, files: Iterable[str]) -> S
     return scene
 
 
-def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
+def _scene(planes: "_Planes", meta: _Meta) -> Scene:
     low, high = (planes.of_gaussians(name) for name in meta.means.files[:2])
     fractions = (low[:, :3] + high[:, :3].astype(np.uint32) * 256) / 65535
     mins, maxs = np.array(meta.means.mins), np.array(meta.means.maxs)
@@ -153,8 +154,8 @@ def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
             raise malformed(planes.path, f"a label of 'shN' is beyond the {len(palette)} of its palette")
         rest = np.array(meta.higher.codebook, np.float32)[palette[entry]]
     with np.errstate(over="ignore"):  # rows that overflow to infinity are dropped later
-        means = np.sign(logs) * np.expm1(np.abs(logs))
-    return Gaussians(
+        means, origin = about_origin(np.sign(logs) * np.expm1(np.abs(logs)))
+    gaussians = Gaussians(
         means=means,
         log_scales=np.array(meta.scales.codebook, np.float32)[
             planes.of_gaussians(meta.scales.files[0])[:, :3]
@@ -165,6 +166,7 @@ def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
         opacity_logits=logit(sh0[:, 3] / 255),
         sh=np.concatenate([base[:, None], rest], axis=1),
     )
+    return Scene(gaussians, origin=origin)
 
 
 class _Planes:
@@ -218,8 +220,7 @@ def write_sog(path: Path | str, scene: Scene) -> None:
 
     Positions are rounded to 1/65535 of the scene's extent in sign(x) log(1 + |x|), quaternions and opacities
     to 1/255; scales, colours and higher coefficients to the nearest of 256 values each, fitted to the scene.
-    With more than 65536 Gaussians several share a palette entry of higher coefficients. A row that cannot be
-    drawn gets opacity 0. Raises InputError if the steps of positions are larger than most Gaussians.
+    A row that cannot be drawn gets opacity 0. InputError if steps of positions exceed most Gaussians.
     """
     gaussians = scene.gaussians
     valid, count = gaussians.valid(), len(gaussians)

@@ -1,9 +1,8 @@
 """Evidence of an answer: the photographs that show it, with the mask of each that overlaps most with it.
 
-The language features of a region are a mean over masks, in which a wrong one hides, and which looks as sure
-for three photographs as for thirty. So every photograph is one vote: for the region if it has a mask of just
-that region, else against it. The share of votes for the region has a beta distribution. A wrong vote shows in
-the fit of the phrase to its mask.
+A wrong mask hides in a region's features, a mean as sure of three photographs as of thirty. So every
+photograph is one vote, for the region if it has a mask of just that region, and the share of votes has a beta
+distribution. A wrong vote shows in the fit of the phrase to its mask.
 """
 
 from collections.abc import Mapping, Sequence

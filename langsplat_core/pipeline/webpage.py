@@ -1,9 +1,8 @@
 """A scene as one HTML file that a browser draws and searches without a network: `make_page`.
 
 The file holds a compressed safetensors file (Gaussians of 8 and 16 bits, codes, codebook, words, regions)
-and the modules of `langsplat_core/web`. A phrase is answered there by the rule of `query.rule`:
-what does not depend on the phrase is computed here, so that little more than a product with the codebook is
-left. Gaussians that can never be drawn are left out; the others lie along a curve, to compress well.
+and the modules of `langsplat_core/web`, which answer by the rule of `query.rule`; what does not depend on the
+phrase is computed here. Gaussians that are never drawn are left out; along a curve the others compress well.
 """
 
 import base64

@@ -2,12 +2,10 @@
 
     p(word | x)  =  softmax over words of  scale * (cos(x, word) - hub(word) / 2)
 
-The hub of a word is its mean cosine with the features of the scene that are nearest to it. Some words lie
-near every image and would be the answer everywhere; subtracting the hub leaves how much better a word fits
-here than at its nearest features. This is cross-domain similarity local scaling ("Word translation without
-parallel data", Conneau et al. 2018, equation 3): 2 cos(x, w) - hub(w) - hub(x), halved, without hub(x), which
-is the same for all words. The canonical phrases ("object", "things", "stuff", "texture") compete too: their
-share is the probability that no word of the vocabulary fits.
+The hub of a word is its mean cosine with the features of the scene that are nearest to it: some words lie
+near every image and would be the answer everywhere. This is cross-domain similarity local scaling (Conneau et
+al. 2018, equation 3), halved, without hub(x), which is the same for all words. The canonical phrases compete
+too: their share is the probability that no word of the vocabulary fits.
 """
 
 from collections.abc import Sequence

@@ -56,10 +56,7 @@ FLOOR = np.array([[3.0, 0.2 * index + 1.5, 0.0] for index in range(10)])  # poin
 def write_dataset(
     folder: Path, form: str = "bin", subfolder: str = "sparse/0", views: int = 3, at: Array = NO_ORIGIN
 ) -> None:
-    """Photographs of the room through an OPENCV lens, and a model with points on its floor.
-
-    at: where in the world its zero is.
-    """
+    """Photographs of the room, whose zero is `at`, by an OPENCV lens; a model with points on its floor."""
     matrices = poses(views)
     names = write_photos(folder / "images", LENS, matrices)
     # Listed backwards: the order of the file must not matter.
@@ -131,7 +128,7 @@ def test_the_model_with_most_photographs_is_taken(tmp_path: Path, caplog: pytest
 
 
 def test_missing_photographs_and_cameras_are_warned_of(tmp_path, caplog):
-    write_dataset(tmp_path)
+    write_dataset(tmp_path, subfolder=".")
     photos = tmp_path / "images"
     (photos / "view_1.png").unlink()
     capture = load_capture(tmp_path, WHOLE, tmp_path / "work")
@@ -148,7 +145,7 @@ def test_missing_photographs_and_cameras_are_warned_of(tmp_path, caplog):
 
 
 def test_photographs_of_another_shape_are_refused(tmp_path: Path) -> None:
-    write_dataset(tmp_path)
+    write_dataset(tmp_path, subfolder="colmap/sparse/0")
     photo = tmp_path / "images/view_1.png"
     Image.open(photo).crop((0, 0, 150, 150)).save(photo)
     with pytest.raises(InputError, match=r"view_1\.png is 150x150 pixels but its camera is 200x150"):
@@ -310,6 +307,8 @@ def test_synthetic_scenes_of_nerf_hold_their_test_views_out(tmp_path: Path) -> N
     assert [camera.name for camera in capture.cameras] == ["view_0", "view_1", "view_2"]
     assert split_views(capture, WHOLE) == ([0, 1], [2])
     assert split_views(capture, replace(WHOLE, test_every=0)) == ([0, 1, 2], [])
+    rewrite(tmp_path, {**data, "train_filenames": ["images/view_0.png", "images/view_3"]})
+    assert split_views(load_photographs(tmp_path, WHOLE, tmp_path / "work"), WHOLE) == ([0, 3], [1, 2])
 
 
 @pytest.mark.parametrize(
@@ -322,6 +321,7 @@ def test_synthetic_scenes_of_nerf_hold_their_test_views_out(tmp_path: Path) -> N
         ({"w": 1e9, "h": 1e9}, "pixels a side"),
         ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
         ({"k4": 0.1}, "k4"),
+        ({"ftheta_p0": 0.0}, "ftheta_p0"),
     ],
 )
 def test_a_broken_frame_is_named(tmp_path: Path, change: dict[str, Any], words: str) -> None:

@@ -85,7 +85,7 @@ def test_a_broken_photograph_is_left_out_and_named(tmp_path: Path, caplog: pytes
 
 
 def test_names_stay_unique() -> None:
-    assert unique_names(["a.png", "b.jpg"]) == ["a", "b"]
+    assert unique_names(["l/a.png", "r\\b.jpg"]) == ["a", "b"]
     assert unique_names(["l/a.png", "r/a.png"]) == ["l_a", "r_a"]
     assert unique_names(["a.png", "a.jpg"]) == ["a_png", "a_jpg"]
 
@@ -114,14 +114,15 @@ def test_photographs_are_counted_where_they_lie(tmp_path: Path) -> None:
 
 
 def test_unread_files_beside_photographs_are_named(tmp_path: Path, caplog) -> None:
-    for name in ("IMG_1.HEIC", "IMG_1.MOV", "IMG_2.heic", "IMG_2.mov", "walk.mp4", "edited/IMG_1.jpg"):
+    for name in ("1.HEIC", "1.MOV", "2.heic", "2.mov", "walk.mp4", "edited/1.jpg", "poses.csv"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "IMG_3.jpg").symlink_to("not fetched.jpg")
     caplog.set_level(logging.INFO, "langsplat")
-    say_unread(*photo_folder(tmp_path))
+    say_unread(tmp_path, *photo_folder(tmp_path))
     assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
         "1 links beside the photographs lead nowhere",
+        "1 files may hold cameras and are not read; cameras are found anew, in a world of their own",
         "2 videos of Live Photos are not read, their stills are",
         "1 videos are not read, train each by itself",
         "1 photographs in other folders are not read",
@@ -296,7 +297,7 @@ def test_cut_out_background_stays_empty() -> None:
 LENS = PhotoIntrinsics(120, 90, 110.0, 110.0, 60.0, 45.0)
 
 
-@pytest.mark.parametrize("place", ["images/masks", "masks"])
+@pytest.mark.parametrize("place", ["images/masks", "masks", "mask", "masks/images"])
 @pytest.mark.parametrize("name", ["a.jpg.png", "a.png"])
 def test_a_mask_lies_beside_its_photograph(place: str, name: str, tmp_path: Path) -> None:
     (tmp_path / place).mkdir(parents=True)
@@ -304,6 +305,7 @@ def test_a_mask_lies_beside_its_photograph(place: str, name: str, tmp_path: Path
     assert mask_beside(photo) is None
     mask.write_bytes(b"")
     assert mask_beside(photo) == mask
+    assert (mask_beside(tmp_path / f"photos/images/{photo.name}") is None) != (place == "masks/images")
     assert mask_beside(tmp_path / f"{'a' * 300}.jpg") is None  # no file can have the name of its mask
     assert mask_beside(mask) is None
 
@@ -322,6 +324,8 @@ def test_a_mask_has_the_shape_of_the_photograph_as_it_is_shown(tmp_path: Path) -
     photo = Photo(tmp_path / "a.jpg", "a.jpg", LENS, np.eye(4), upright=True, mask=mask)
     (found,) = developed([photo]).masks
     np.testing.assert_array_equal(found, shown.repeat(2, 0).repeat(2, 1))
+    Image.fromarray(shown.astype(np.uint8)).save(mask)  # of 0 and 1
+    np.testing.assert_array_equal(developed([photo]).masks, [found])
     mask_file(mask, shown.T)
     with pytest.raises(InputError, match=r"a\.png: is 45x60 pixels, its photograph 120x90"):
         developed([photo])

@@ -21,7 +21,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
 from langsplat_core.io.quantised import mirrored, read_splat_scene, write_splat
-from langsplat_core.io.scenes import CORE_FORMATS, load_scene, save_scene
+from langsplat_core.io.scenes import CORE_FORMATS, load_scene, save_scene, write_origin
 from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.sog import write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
@@ -328,6 +328,18 @@ def test_a_sog_says_antialiased(tmp_path):
     for entry in (*plain, {"model": "antialiased"}, {"antialias": True}):
         scene = load_scene(write_folder(tmp_path / "a", meta_with(**entry)))
         assert scene.antialiased is (entry not in plain)
+
+
+def test_a_far_sog_is_exact_to_its_quantisation(tmp_path):
+    low, high = np.log1p([5e6, 5e6 + 16])  # float32 has steps of half a unit there
+    far = write_folder(tmp_path / "far", meta_with(means__mins=[low] * 3, means__maxs=[high] * 3))
+    near, scene = load_gaussians(write_folder(tmp_path / "near", SOG)).means, load_scene(far)
+    least, most = (np.array(json.loads(SOG["meta.json"])["means"][name]) for name in ("mins", "maxs"))
+    shares = (np.sign(near) * np.log1p(np.abs(near)) - least) / (most - least)
+    want = np.expm1(low + (high - low) * shares)
+    np.testing.assert_allclose(scene.in_world(scene.gaussians.means), want, rtol=0, atol=1e-4)
+    write_origin(tmp_path / "far.origin.json", np.array([0, 100, 0]))
+    np.testing.assert_array_equal(load_scene(far).origin, scene.origin + (0, 100, 0))
 
 
 def written(tmp_path, gaussians: Gaussians) -> Gaussians:

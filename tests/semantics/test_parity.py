@@ -173,10 +173,7 @@ POINTS = np.array([[100, 200], [700, 500], [1300, 1000]], np.float32) / (1440, 1
 def compare(
     name: str, encoded: EncodedImage, embedding: Any, points: Array, want: tuple[Any, Any], measured: Measure
 ) -> None:
-    """Compare an `EncodedImage` with the package's `embedding` (1, C, h, w), and its answers with `want`.
-
-    `want`: scores (P, 3) and full-size logits (P, 3, H, W); what rounding grows to by both is measured.
-    """
+    """Compare an image's embedding (1, C, h, w), scores (P, 3) and full-size logits (P, 3, H, W)."""
     field = upstream()
     scores, full = want
     seen = encoded.seen["image_embeddings"]

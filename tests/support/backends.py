@@ -217,10 +217,7 @@ BAND = 1e-4  # relative distance to a cut-off; float32 kernels are within about 
 
 
 def assert_close_off_cuts(got: Array, want: Array, band: Array, atol: float = 2e-5) -> None:
-    """`got` equals `want` within `atol` outside the band; in the band at most half the pixels are off.
-
-    The band must be small (under 2 % of the pixels), or the comparison would say little.
-    """
+    """`got` equals `want` within `atol` outside the band, under 2 % of the pixels; half of it may be off."""
     assert got.shape == want.shape
     assert np.isfinite(got).all()
     error = np.abs(got - want).reshape(*band.shape, -1).max(-1)

@@ -534,10 +534,7 @@ def _arrays(owner: object, names: Sequence[str], prefix: str = "") -> dict[str, 
 def same_or_a_line(
     read: Callable[[], T], check: Callable[[T], object], caplog: pytest.LogCaptureFixture
 ) -> int:
-    """Read what was changed: it is the same, or an error, or said, which `--strict` makes an error.
-
-    check: that it is the same. Returns how many lines were said.
-    """
+    """Read what was changed: the same by `check`, or an error, or said; return how many lines were said."""
     try:
         got = read()
     except InputError:

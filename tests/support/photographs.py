@@ -90,10 +90,7 @@ def pinhole_picture(camera: Camera, samples: int = 1) -> Array:
 
 @lru_cache(maxsize=64)  # the same few photographs serve many tests
 def sensor_picture(intrinsics: PhotoIntrinsics, pose: bytes) -> Image.Image:
-    """`photograph` with 3x3 samples averaged per pixel, as a sensor does; small pictures alias without.
-
-    `pose` holds the bytes of a float64 world-to-camera matrix.
-    """
+    """`photograph` by a pose of these float64 bytes, 3x3 samples averaged per pixel against aliasing."""
     fine = intrinsics.resized(3 * intrinsics.width, 3 * intrinsics.height)
     return Image.fromarray(photograph(fine, np.frombuffer(pose).reshape(4, 4))).reduce(3)
 

@@ -69,10 +69,7 @@ def unturned_gaussians(
 def random_camera(
     seed: int = 0, width: int = 70, height: int = 45, *, distance: float = 3.0, off_centre: bool = True
 ) -> Camera:
-    """A camera `distance` world units from the origin that looks roughly at it.
-
-    With `off_centre` the principal point is not the middle and fx differs from fy.
-    """
+    """A camera that looks roughly at the origin; off_centre: the principal point, and fx differs from fy."""
     rng = np.random.default_rng(seed)
     eye = rng.normal(size=3)
     eye *= distance / np.linalg.norm(eye)

@@ -1,11 +1,9 @@
 """Sixteen float32, or eight float64, lanes as one value inside compiled code.
 
-A tile is 16 pixels wide, so one row of it is one `<16 x float>` of LLVM: a single AVX-512 register, two
-AVX or four SSE/NEON ones. Writing rows as values of that type, instead of as loops that an optimiser may
-or may not vectorise, makes the kernels' speed a property of their source. Eight Gaussians are projected as
-one value of doubles, which round at every step as numbers do. Lanes are added, subtracted, multiplied and
-divided with `+ - * /`, scalars broadcast, and `min`, `max`, `abs` and `np.sqrt` take them; the rest are the
-functions below, used in kernels.
+A row of a tile, 16 pixels, is one `<16 x float>` of LLVM: a single AVX-512 register, two AVX or four SSE or
+NEON ones, whatever an optimiser would make of a loop. Eight Gaussians are projected as one value of doubles,
+which round at every step as numbers do. Lanes take `+ - * /`, `min`, `max`, `abs`, `np.sqrt` and the
+functions below; scalars broadcast.
 """
 
 import math

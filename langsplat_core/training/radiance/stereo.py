@@ -1,8 +1,7 @@
 """Depths by plane sweeping (Collins 1996) between photographs with known cameras.
 
-Structure from motion finds some hundred points in nine photographs. Training then overfits what lies between
-them: each photograph gets Gaussians of its own, anywhere along its rays. Depths are the remedy: Gaussians
-begin at the surfaces, and those in free space before a surface are removed.
+Between the few points of nine photographs each would get Gaussians of its own, anywhere along its rays. With
+depths, Gaussians begin at the surfaces, and those in free space before a surface are removed.
 
 A view is compared with each neighbour as that would look if the scene were a plane parallel to the view. Of
 all planes, uniform in inverse depth, a pixel takes the one at which windows correlate best. A depth is kept

@@ -62,10 +62,7 @@ Tensors = dict[str, Tensor]
 def clip_model(
     vision: int = 128, layers: int = 2, inner: int = 48, heads: tuple[int, int] = (2, 2), quick: bool = False
 ) -> CLIPModel:
-    """A CLIP of transformers, whose weights depend on its sizes alone.
-
-    vision: width of the half that sees; heads: of images and of text; quick: OpenAI's GELU.
-    """
+    """A CLIP of transformers; vision: width of the half that sees; heads: of images and of text."""
     act = "quick_gelu" if quick else "gelu"
     half = {"intermediate_size": inner, "num_hidden_layers": layers, "hidden_act": act}
     text = {"hidden_size": 128, "num_attention_heads": heads[1], "vocab_size": len(TOKENS)}

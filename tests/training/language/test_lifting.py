@@ -1,7 +1,4 @@
-"""Mask weights and groups of masks, instances and votes from them, and the lifting of vectors and latents.
-
-Against dense weights, sets, a plain median, automatic differentiation and the one-pass mean.
-"""
+"""Mask weights, groups, instances and votes, and the lifting of vectors and latents, against plain twins."""
 
 from collections.abc import Sequence
 from dataclasses import replace
