@@ -220,10 +220,8 @@ def test_plain_install_holds_no_optional_package(light: Path) -> None:
     found = run(light, "python", "-c", look, "numpy", "langsplat_assets", *EXTRAS)
     assert found.stdout.split() == ["numpy", "langsplat_assets"]
     (packages,) = light.parent.glob("lib/python*/site-packages")
-    assert sorted(path.parent.name for path in packages.glob("lang*/py.typed")) == [
-        "langsplat_core",
-        "langsplat_viewer",
-    ]
+    typed = sorted(path.parent.name for path in packages.glob("lang*/py.typed"))
+    assert typed == ["langsplat_core", "langsplat_viewer"]
 
 
 def test_types_are_found_from_outside_in_an_editable_install(tmp_path: Path) -> None:

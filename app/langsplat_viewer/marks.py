@@ -130,8 +130,6 @@ def caught(drawn: Drawn, means: Array, depths: Array | None = None) -> Array:
     depths: (H, W) of the surface, as `Surface.depths` has them, to leave out what a rectangle, lasso or brush
     meets behind it; None: all the way through.
     """
-    if drawn.tool not in ON_SCREEN and drawn.stroke.centre is None:
-        return np.zeros(len(means), bool)
     if drawn.tool == "sphere":
         return selection.in_sphere(means, drawn.centre, drawn.radius)
     if drawn.tool not in ON_SCREEN:
@@ -154,8 +152,7 @@ def outlines(drawn: Drawn) -> list[Array]:
     first, last = drawn.stroke.path[0], drawn.stroke.path[-1]
     match drawn.tool:
         case "rectangle":
-            corners = [first, (last[0], first[1]), last, (first[0], last[1]), first]
-            return [np.array(corners)]
+            return [np.array([first, (last[0], first[1]), last, (first[0], last[1]), first])]
         case "lasso":
             return [np.array([*drawn.stroke.path, first])]
         case "brush":

@@ -34,12 +34,9 @@ MOST_FRAMES = 100_000
 
 def free_name(folder: Path, stem: str, suffix: str, companions: tuple[str, ...] = ()) -> Path:
     """Return the first of stem-001, stem-002, ... that is free in `folder`, with each of `companions`."""
-
-    def is_free(name: str) -> bool:
-        return not any((folder / f"{name}{end}").exists() for end in (suffix, *companions))
-
-    name = next(filter(is_free, (f"{stem}-{number:03d}" for number in count(1))))
-    return folder.absolute() / f"{name}{suffix}"
+    names, ends = (f"{stem}-{number:03d}" for number in count(1)), (suffix, *companions)
+    free = next(name for name in names if not any((folder / f"{name}{end}").exists() for end in ends))
+    return folder.absolute() / f"{free}{suffix}"
 
 
 def save_png(path: Path, image: Array) -> None:

@@ -140,10 +140,8 @@ def _check_pose(pose: Pose) -> None:
         raise ValueError(f"'position' is not 3 numbers of at most {FARTHEST:g}")
     if pose.rotation.shape != (3, 3) or not is_rotation(pose.rotation):
         raise ValueError("'rotation' is not a rotation matrix")
-    for name, value, (low, high) in (
-        ("fov_degrees", pose.fov_degrees, FOV_LIMITS),
-        ("span", pose.span, SPAN_LIMITS),
-    ):
+    for name, (low, high) in (("fov_degrees", FOV_LIMITS), ("span", SPAN_LIMITS)):
+        value = getattr(pose, name)
         if value is not None and not low <= value <= high:
             raise ValueError(f"'{name}' is {value:g}; expected {low:g} to {high:g}")
 

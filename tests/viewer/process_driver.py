@@ -281,6 +281,7 @@ def typing(window: Window) -> Iterator[None]:
     yield from press(window, *["tab"] * 7, "2", "tab", "1", "tab", "escape")
     assert (state.edit_form.move, state.session.picture.display) == ((2.0, 1.0, 0.0), "relevancy")
     print("PASSED", flush=True)
+    close()
 
 
 def drive(path: Path) -> None:
@@ -292,9 +293,7 @@ def drive(path: Path) -> None:
     def stepped() -> None:
         gui()
         try:
-            next(steps)
-        except StopIteration:
-            close()
+            next(steps, None)
         except AssertionError:
             traceback.print_exc()
             close()

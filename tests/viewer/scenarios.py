@@ -411,10 +411,17 @@ def use_the_mouse_alone(s: Any) -> None:
 
 
 def read_a_narrow_panel(s: Any) -> None:
+    """A panel's rows lie below its header, and the help has no column of single letters."""
     settings.prefer(s.viewer, ui_scale=1.5)
     s.open_panel("Selection", frames=4)
     header, below = (s.ctx.item_info(f"//**/{name}").rect_full for name in ("Selection", "No tool"))
     assert header.max.y <= below.min.y
+    settings.prefer(s.viewer, ui_scale=2.0)
+    s.key("f1", frames=6)
+    text = imgui.internal.find_window_by_name("Help").content_size
+    assert text.x < 400
+    assert text.y < 100 * imgui.get_text_line_height()
+    s.key("escape", frames=2)
     settings.prefer(s.viewer, ui_scale=1.0)
 
 
@@ -876,6 +883,15 @@ def travel_by_keys(s: Any) -> None:
         s.key("down_arrow", frames=2)
     s.key("enter", frames=3)
     assert s.state.session.picture.display == "depth"
+    for begin in (lambda: s.click_at((650, 500)), lambda: s.open_panel("Display", frames=3)):
+        begin()  # in the view, or in a panel
+        editing.use_tool(s.viewer, "lasso")
+        focused = imgui.internal.get_focus_id()
+        for key in ("Ctrl+Shift+P", "f1"):
+            s.key(key, frames=3)
+            s.key("escape", frames=4)
+            assert imgui.internal.get_focus_id() == focused
+    assert s.state.tools.tool == "lasso"
 
 
 def do_without_a_mouse(s: Any) -> None:

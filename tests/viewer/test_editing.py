@@ -69,12 +69,7 @@ def test_hidden_and_deleted_are_never_selected(opened):
     ):
         act(action, opened)
         assert marked(opened) == expected, action
-
-
-def test_selecting_what_is_hidden_says_so(opened):
-    take(opened, blob("mug"))
-    editing.hide_selected(opened)
-    take(opened, blob("mug"))
+    take(opened, blob("book"))
     assert "hidden" in opened.state.messages[-1].text
 
 
@@ -459,6 +454,19 @@ def test_failed_saving_stays_in_the_scene(pruned, tmp_path):
     assert "not saved" in errors(pruned)[-1]
     assert not pruned.state.may_close
     assert pruned.state.is_unsaved
+
+
+def test_nothing_is_written_once_all_is_deleted(opened, tmp_path):
+    editing.select_all(opened)
+    editing.delete_selected(opened)
+    for title in saving.exports():
+        saving.ask_export(opened, title)
+    assert opened.state.export_form is None
+    saving.quit_viewer(opened)
+    act(saving.save_and_leave, opened, tmp_path)
+    assert not opened.state.may_close
+    assert [text.partition(": all ")[0] for text in errors(opened)] == ["nothing to export", "not saved"]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_ending_process_saves_unsaved_edits_and_says_where(pruned, tmp_path, capsys):

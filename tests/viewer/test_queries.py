@@ -271,7 +271,7 @@ def outlined(viewer, monkeypatch):
     monkeypatch.setitem(SCENES, "tree.ply", with_tree(blob_scene(phrasebook=True)))
     open_scene(viewer, "tree.ply")
     ask(viewer, "mug")  # so that the encoder is known to be there
-    assert outline.wanted(viewer).problem
+    assert outline.wanted(viewer).problem == "looking for what is here ..."
     settle(viewer)
     assert outline.wanted(viewer).problem == ""
     return viewer
@@ -393,7 +393,7 @@ def test_outline_needs_a_field_and_downloads_no_encoder(viewer, monkeypatch):
     assert "hub/of-someone" in outline.wanted(viewer).problem
     assert viewer.worker.current is None
     open_scene(viewer, "plain.ply")
-    assert outline.wanted(viewer) is None
+    assert outline.wanted(viewer).problem == viewer.state.why_no_field
     outline.select(viewer, np.zeros(3))
     assert "language field" in errors(viewer)[-1]
 

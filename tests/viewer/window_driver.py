@@ -29,7 +29,7 @@ from langsplat_core.pipeline.report import PREVIEW
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import queries, saving, settings
+from langsplat_viewer.actions import outline, queries, saving, settings
 from langsplat_viewer.options import ViewerOptions
 from langsplat_viewer.panels import layout
 from langsplat_viewer.panels.ui import scene_area
@@ -447,6 +447,7 @@ def close_while_opening(s: Session) -> None:
     """The window may be closed at any time; the process ends when the reading does."""
     assert s.state.open is None
     assert s.viewer.worker.current is not None
+    assert outline.wanted(s.viewer).problem == "opening blobs.ply ..."
     s.ctx.item_click("//**/Cancel")
     assert s.viewer.worker.current is None
     Timer(1.0, READ_ON.set).start()  # when the window is closed

@@ -31,7 +31,7 @@ from langsplat_viewer.projects import PATHS, PROJECTS, Project, digest_of, read_
 from langsplat_viewer.rendering.request import Split, why_undrawable
 from langsplat_viewer.session import OF_PROJECT, MarkBits, Query, Session, Things
 from langsplat_viewer.state import FileChoice, OpenScene, Recording, Saved, SceneState, ViewerState, Visit
-from langsplat_viewer.viewer import History, Training, Viewer
+from langsplat_viewer.viewer import History, Training, Viewer, needs_scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,12 +191,9 @@ def _fitting(viewer: Viewer, session: Session) -> Session:
     return replace(session, things=session.things.known(viewer.engine.tree.count))
 
 
-def reload(viewer: Viewer) -> None:
+@needs_scene("read it again when its file has changed")
+def reload(viewer: Viewer, seen: OpenScene) -> None:
     """Read the scene's files again and keep the view; where that fails the scene is kept."""
-    seen = viewer.state.open
-    if seen is None:
-        viewer.say_error("open a scene first; it can be read again when its file has changed")
-        return
     if viewer.state.opening is not None:
         return
     path, known = seen.path, seen.scene.unread
@@ -355,14 +352,13 @@ def choose_photographs(viewer: Viewer, folder: Path) -> None:
     viewer.state.training_form = replace(form, dataset=str(folder), out=out)
 
 
-def train_language(viewer: Viewer) -> None:
+@needs_scene("train its language field")
+def train_language(viewer: Viewer, seen: OpenScene) -> None:
     """Open the panel "Train" for a language field of the scene that is shown, a new file beside it.
 
     The photographs are named where they lie as COLMAP has them, in "images" beside the scene or one above.
     """
-    if viewer.state.path is None:
-        return
-    path = viewer.state.path.absolute()
+    path = seen.path.absolute()
     near = (place for place in (path.parent, path.parent.parent) if (place / "images").is_dir())
     viewer.state.training_form = replace(
         viewer.state.training_form,

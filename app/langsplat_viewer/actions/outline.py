@@ -24,15 +24,16 @@ SURE = 0.7  # probability below which a name is shown as a question
 BACKGROUND = {"wall", "floor", "ground", "ceiling", "skirting", "rug", "carpet"}  # listed last in the outline
 
 
-def wanted(viewer: Viewer) -> OutlineView | None:
-    """Return the outline of the scene, as far as it is known.
+def wanted(viewer: Viewer) -> OutlineView:
+    """Return the outline of the scene, as far as it is known, or why there is none.
 
     The worker finds it once it has nothing else to do.
     """
-    state = viewer.state
-    if viewer.engine is None or not state.has_field:
-        return None
-    if state.outline is None and viewer.worker.current is None:
+    state, work = viewer.state, viewer.worker.current
+    if state.outline is None:
+        if work is not None or not state.has_field:
+            missing = state.why_no_field or "open a scene with a language field"
+            return OutlineView(problem=missing if work is None else f"{work[0]} ...")
         if not viewer.has_encoder_here and not state.session.queries:
             reason = f"names come from the encoder '{viewer.encoder_id}': search for something first"
             return OutlineView(problem=reason)

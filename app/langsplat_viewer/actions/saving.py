@@ -27,6 +27,7 @@ from langsplat_core.pipeline.webpage import make_page
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
+from langsplat_viewer.actions.editing import has_selection
 from langsplat_viewer.actions.settings import ask_for, folder_of
 from langsplat_viewer.actions.viewpoint import bookmarked_view, count_path_as_saved, path_seconds
 from langsplat_viewer.camera.flight import pose_of
@@ -158,6 +159,7 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
 # The scene as it was edited.
 
 COMPANIONS = (sidecar.SUFFIX, cameras.SUFFIX)
+ALL_DELETED = "all Gaussians are deleted; undo (Ctrl+Z) brings them back"
 LONGEST_WAIT = 60.0  # seconds that a window which is closed waits for what is being written
 
 
@@ -168,6 +170,9 @@ def save_edited(
     """Have the worker write the scene without what was deleted to a new file; `then` runs after that."""
     state = viewer.state
     marked, rows = state.session, np.flatnonzero(state.marks.kept)
+    if len(rows) == 0:
+        viewer.say_error(f"not saved: {ALL_DELETED}")
+        return
     scene = replace(seen.scene, language=viewer.language)
 
     def work(progress: Progress) -> Path:
@@ -273,7 +278,12 @@ def exports() -> tuple[str, ...]:
 
 @needs_scene("export it")
 def ask_export(viewer: Viewer, seen: OpenScene, title: str, only_selected: bool = False) -> None:
-    """Open the dialog of the export `title`."""
+    """Open the dialog of the export `title`, unless there is nothing to write."""
+    if not viewer.state.marks.kept.any():
+        viewer.say_error(f"nothing to export: {ALL_DELETED}")
+        return
+    if only_selected and not has_selection(viewer):
+        return
     row = EXPORTS[title]
     shown = (flag for flag in row.options if flag != UNIT or seen.scene.metres_per_unit is None)
     values = {flag: OPTIONS[flag][1] for flag in shown}

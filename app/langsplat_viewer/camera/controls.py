@@ -335,11 +335,11 @@ def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
     forward, inner = camera.rotation[2], camera.intrinsics
     if camera.orthographic:
         distance = symmetric_intrinsics().fitted(camera.width, camera.height).fx / camera.fx
-        target, inner = camera.position + distance * forward, narrowed(inner, distance)
-        return OrbitCamera(camera.rotation, target, distance, extent.up, inner, orthographic=True)
-    distance = max(float((extent.centre - camera.position) @ forward), 0.3 * extent.radius)
+        inner = narrowed(inner, distance)
+    else:
+        distance = max(float((extent.centre - camera.position) @ forward), 0.3 * extent.radius)
     target = camera.position + distance * forward
-    return OrbitCamera(camera.rotation, target, distance, extent.up, inner)
+    return OrbitCamera(camera.rotation, target, distance, extent.up, inner, camera.orthographic)
 
 
 def spanning(view: OrbitCamera, span: float) -> OrbitCamera:

@@ -179,7 +179,7 @@ def _begin_modal(title: str, is_wanted: bool, width: float) -> bool:
 
 def _end_modal(viewer: Viewer, name: str, cancel: str = "Cancel") -> None:
     """End it with a button that empties its field of the state, as Esc does; without that it closes."""
-    if imgui.button(cancel) or imgui.is_key_pressed(imgui.Key.escape):
+    if ui.next_button(cancel):
         settings.put(viewer.state, **{name: None})
     if getattr(viewer.state, name) is None:
         imgui.close_current_popup()
@@ -328,7 +328,6 @@ def _export(viewer: Viewer, form: ExportForm) -> None:
     imgui.text_unformatted(f"{saving.export_size(viewer, form)} on disk")
     if ui.button("Export ...", enabled=bool(saving.exported(viewer, form).any())):
         saving.choose_export(viewer)
-    imgui.same_line()
 
 
 # A file that has changed.
@@ -377,16 +376,13 @@ def _ask(viewer: Viewer, to: str) -> None:
     for other in viewer.unsaved():
         imgui.text_wrapped(f"Notes, names, bookmarks or keyframes of {other.path.name} are in no project.")
     imgui.text_unformatted(f"Save before {to}?")
-    if state.is_unsaved:
-        if ui.button("Save", "The scene as a new file, without what was deleted"):
-            saving.save_and_leave(viewer)
-        imgui.same_line()
-    if ui.button("Save the project", "Everything in one small file; the scene stays as it is"):
+    if state.is_unsaved and ui.button("Save", "The scene as a new file, without what was deleted"):
+        saving.save_and_leave(viewer)
+    verb = ui.next_button if state.is_unsaved else ui.button
+    if verb("Save the project", "Everything in one small file; the scene stays as it is"):
         saving.save_project_and_leave(viewer)
-    imgui.same_line()
-    if imgui.button("Discard"):
+    if ui.next_button("Discard"):
         saving.go_on(viewer)
-    imgui.same_line()
 
 
 def _wait_for_film(viewer: Viewer) -> None:
@@ -398,4 +394,3 @@ def _wait_for_film(viewer: Viewer) -> None:
     imgui.progress_bar(work[1], ImVec2(-1, 0), work[0])
     if imgui.button("Stop it, and close"):
         saving.end_at_once(viewer)
-    imgui.same_line()

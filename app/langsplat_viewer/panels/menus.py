@@ -163,7 +163,7 @@ WIDTH_EM, HEIGHT_EM = 26.0, 20.0
 
 
 def draw_palette(viewer: Viewer, panels: Sequence[Command]) -> None:
-    """Draw the palette: a box and the commands that match; Enter does the first, Esc closes.
+    """Draw the palette: a box and the commands that match; Enter does the first.
 
     `panels`: the commands that open them.
     """
@@ -184,9 +184,8 @@ def draw_palette(viewer: Viewer, panels: Sequence[Command]) -> None:
     found = matching(typed, panels, viewer.state.preferences.recent)
     chosen = found[0] if entered and found else _clicked(found, typing)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
-    escaped = imgui.is_key_pressed(imgui.Key.escape)
     imgui.end()
-    if chosen is not None or escaped or (left and not imgui.is_window_appearing()):
+    if chosen is not None or left:
         settings.put(viewer.state, show_palette=False)
     if chosen is not None:
         chosen.act(viewer)
@@ -240,7 +239,6 @@ def draw_help(viewer: Viewer) -> None:
     settings.put(viewer.state, show_help=bool(still_open))
     pages = imgui.is_key_pressed(imgui.Key.page_down) - imgui.is_key_pressed(imgui.Key.page_up)
     imgui.set_scroll_y(imgui.get_scroll_y() + pages * imgui.get_window_height() / 2)
-    imgui.text_disabled(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
     if imgui.begin_tab_bar("pages"):
         keys = [(", ".join(command.keys), command.does) for command in COMMANDS if command.keys]
         examples = ", ".join(f"'{phrase}'" for phrase in viewer.state.suggestions.examples)
@@ -249,17 +247,21 @@ def draw_help(viewer: Viewer) -> None:
                 _table(rows, f": {examples}" if examples else "")
                 imgui.end_tab_item()
         imgui.end_tab_bar()
+    ui.small_wrapped(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
     imgui.end()
 
 
 def _table(rows: Sequence[tuple[str, str]], examples: str) -> None:
-    if imgui.begin_table("rows", 2):
-        imgui.table_setup_column("what", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(KEYS_EM))
-        imgui.table_setup_column("does", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(DOES_EM))
+    """Draw two columns or, in a window too narrow for them, one below the other."""
+    style, left, right = imgui.get_style(), hello_imgui.em_size(KEYS_EM), hello_imgui.em_size(DOES_EM)
+    room = imgui.get_main_viewport().work_size.x - 4 * style.window_padding.x - style.scrollbar_size
+    widths = (left, min(right, room - left)) if room > 2 * left else (min(right, room),)
+    if imgui.begin_table("rows", len(widths)):
+        for width in widths:
+            imgui.table_setup_column("", imgui.TableColumnFlags_.width_fixed, width)
         for what, does in rows:
-            imgui.table_next_row()
             imgui.table_next_column()
-            imgui.text_unformatted(what)
+            imgui.text_wrapped(what)
             imgui.table_next_column()
             ui.small_wrapped(does.replace("{examples}", examples))
         imgui.end_table()

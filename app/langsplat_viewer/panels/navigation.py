@@ -29,6 +29,8 @@ class Keyboard:
         self._kept = imgui.ImVector_InputEvent()
         self._waited = 0  # frames
         self._tabbed = self._is_lost = False  # in the last frame: Tab was pressed, nothing had the focus
+        self._before: str | None = None  # the window that had it before one that passes, None for the view
+        self._was_framed = False  # its widget with the keyboard
 
     @property
     def is_waiting(self) -> bool:
@@ -55,10 +57,22 @@ class Keyboard:
         for event in self._kept:
             imgui.get_current_context().input_events_queue.push_back(event)
         self._kept.clear()
+        self._return()
         self._tabbed, window = imgui.is_key_pressed(imgui.Key.tab), imgui.get_current_context().nav_window
         if self._tabbed and self._is_lost and window is not None:
             imgui.internal.nav_init_window(window, True)  # else Tab would lead nowhere
             imgui.set_nav_cursor_visible(True)
+
+    def _return(self) -> None:
+        """Give the keyboard back once palette or help is closed; imgui would give it to any window."""
+        context, state = imgui.get_current_context(), self._state
+        window = context.nav_window
+        if window is None or window.root_window.name not in ("Commands", "Help"):
+            self._before = None if window is None else window.name
+            self._was_framed = context.nav_cursor_visible
+        elif not (state.show_palette or state.show_help):
+            imgui.set_window_focus(self._before)
+            imgui.set_nav_cursor_visible(self._was_framed)
 
 
 # Pressed keys run commands.

@@ -20,8 +20,8 @@ MENU = "menu of a thing"
 def draw(viewer: Viewer) -> None:
     """Draw the panel "Outline": a box that filters, and the tree."""
     view = outline.wanted(viewer)
-    if view is None or view.problem:
-        ui.small_wrapped(view.problem if view else "open a scene with a language field")
+    if view.problem:
+        ui.small_wrapped(view.problem)
         return
     imgui.set_next_item_width(-1)
     drafts = viewer.state.drafts

@@ -295,8 +295,7 @@ def draw(viewer: Viewer) -> None:
 
 def _level(viewer: Viewer) -> None:
     levels = {name: name.capitalize() for name in LEVEL_TIPS}
-    chosen = ui.choice(levels, viewer.state.session.level, LEVEL_TIPS)
-    queries.set_level(viewer, chosen)
+    queries.set_level(viewer, ui.choice(levels, viewer.state.session.level, LEVEL_TIPS))
     if viewer.state.session.queries:
         ui.row("New answers")
         viewer.change("adds", adds=ui.choice(NEW, viewer.state.session.adds, NEW_TIPS))

@@ -80,17 +80,16 @@ class Inputs:
         """Return the further channel of each pane, then that of what is selected."""
         if self._of != (request.scene, request.answers):
             self._of, self._channels = (request.scene, request.answers), {}
-        wanted = [
-            (pane, (pane.row.channel, pane.level, pane.picture.heat, request.merged))
-            for pane in request.panes
-        ]
-        for pane, key in wanted:
+        found = []
+        for pane in request.panes:
+            key = pane.row.channel, pane.level, pane.picture.heat, request.merged
             if key not in self._channels:
                 self._channels[key] = _channel(request, pane)
+            found.append(self._channels[key])
         selected = "selected", request.merged
         if selected not in self._channels:
             self._channels[selected] = _merged(request, request.scene.selected)
-        return [self._channels[key] for key in (*(key for _, key in wanted), selected)]
+        return [*found, self._channels[selected]]
 
 
 def _projected_scene(scene: Scene, splats: Splats, merged: Merged | None) -> Scene:
