@@ -3,8 +3,7 @@
 Arithmetic and its order are those of gsplat's CUDA code, in float32, without tiles: every pixel is asked of
 every Gaussian. One camera, no packing, no depth modes: what `raster.gsplat` asks for.
 
-What this cannot show: gsplat's own Python code, whether its kernels compile, the digits that
-`-use_fast_math` costs, the order of their atomic sums, and everything about time and memory.
+It cannot show gsplat's Python code, compiling, `-use_fast_math`, the order of atomic sums, time and memory.
 """
 
 import inspect

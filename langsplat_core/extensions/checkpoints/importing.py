@@ -1,10 +1,9 @@
 """Import of scenes of other methods from their files.
 
-Nothing in a file is executed, and files are recognised by their content. docs/files.md lists the files of
-each method and what is imported. Latents of LangSplat's autoencoder are kept with it. CLIP vectors are
-encoded by a codec fitted to a sample of them, by default a codebook; vectors of clusters are a codebook
-already. Methods keep 512 numbers per Gaussian or a smaller code; vectors are read a block of Gaussians at a
-time, and no (N, 512) array is made here, as it may exceed the memory.
+Nothing in a file is executed, and files are recognised by their content; docs/files.md lists those of each
+method. Latents of LangSplat's autoencoder are kept with it. CLIP vectors are encoded by a codec fitted to a
+sample of them, by default a codebook; vectors of clusters are one already. Vectors are read a block of
+Gaussians at a time, as an (N, 512) array may exceed the memory.
 """
 
 import re

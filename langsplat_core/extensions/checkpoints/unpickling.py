@@ -1,9 +1,8 @@
 """Reading of torch files as plain data: tensors, numbers and containers of them, without running code.
 
-A pickle is checked before torch runs it: it may name little more than the parts of dense tensors, since torch
-trusts the sizes in a file for sparse, quantised and nested ones, and reads beyond its memory. NumPy objects
-of training code are not needed here, and stand-ins replace them. Archives are mapped into memory, so that
-torch knows where they end.
+A pickle is checked before torch runs it: it may name little more than the parts of dense tensors, since of
+sparse, quantised and nested ones torch trusts the file's sizes, and reads beyond its memory. NumPy objects of
+training code have stand-ins. Archives are mapped into memory, so that torch knows where they end.
 """
 
 import io

@@ -3,10 +3,10 @@
 Tensors in the layouts of open_clip, OpenAI, segment_anything and sam2 are renamed to those of transformers.
 
 The configuration of a model follows from the shapes of its tensors, except for the heads and the kind of
-GELU, which an open_clip_config.json beside them states. Without one, CLIP's heads are 64 wide, at most 16 of
-them for images, as in the models that OpenAI and open_clip published; and the GELU is OpenAI's quick one if
-the file has OpenAI's `input_resolution`, `context_length` and `vocab_size`, or "quickgelu" or "openai" in its
-name, else the exact one. Windows and heads of SAM 2 are those of the published sizes.
+GELU, which an open_clip_config.json beside them states. Without one, CLIP's heads are 64 wide, at most 16 for
+images, as published, and the GELU is OpenAI's quick one if the file has OpenAI's `input_resolution`,
+`context_length` and `vocab_size`, or "quickgelu" or "openai" in its name, else the exact one. Windows and
+heads of SAM 2 are those of the published sizes.
 """
 
 import json

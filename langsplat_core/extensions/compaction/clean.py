@@ -3,10 +3,9 @@
 They are found by two measures and removed within an error budget, by a third.
 
 **Regions.** Two neighbours touch if the gap between their centres is at most `TOUCH` times the sum of their
-extents (one standard deviation) along it. Gaussians that touch are one region; a region of few Gaussians
-apart from the scene's surfaces is a floater, down to a single Gaussian. Relative to extents, large sparse
-Gaussians of a wall touch as small dense ones do. Over six scenes, trained by five programs, 0.8 to 1.4 % of
-the Gaussians are in small regions at 1.25 extents.
+extents (one standard deviation) along it: large sparse Gaussians of a wall touch as small dense ones do.
+Gaussians that touch are one region; one of few Gaussians apart from the scene's surfaces is a floater. Over
+six scenes, trained by five programs, 0.8 to 1.4 % of the Gaussians are in small regions at 1.25 extents.
 
 **Free space.** A faint veil touches the surface behind it. A Gaussian is in free space in a view if its
 centre is in front of the surface that is seen through it (the median depth). Veils are found first and are in
@@ -209,9 +208,8 @@ def _by_photographs(
     Groups of `order` are removed one after the other. The cost of a group, its addition to the mean loss plus
     the standard error of that, is taken from the budget. A group that costs more than is left is halved, and
     its halves are tried. Gains are not added to the budget, else true floaters would pay for other Gaussians.
-    Last, Gaussians whose cost was hidden by others at the time are found: spatial groups of removed ones are
-    measured again, each alone against all others removed, and the most costly are put back until the rest is
-    within the budget.
+    Last, as others may hide a cost, spatial groups of removed ones are measured again, others removed, and
+    the most costly are put back until the rest is within the budget.
     """
     losses, spent, done = np.zeros(1), 0.0, 0  # nothing is lost in any view
     resolution = 96  # groups are halved down to this fraction of the floaters

@@ -14,22 +14,16 @@ sums this over pixels without ever listing them: with one gather of [1, C, |C|^2
     W_i = sum_p w_pi,    E_i = sum_p w_pi |c_i - C_p|^2 = |c_i|^2 W_i - 2 c_i . (W^T C)_i + (W^T |C|^2)_i,
 
 and by Cauchy-Schwarz sum_p w_pi |c_i - C_p| <= sqrt(W_i E_i), an upper bound of the total change in display
-values times pixels, if one Gaussian is removed alone. Many Gaussians of one colour form a white wall, though
-each has only similar ones behind it. So the distance of every Gaussian to the image is increased by `ALONE`:
-its contribution is sqrt(W_i (E_i + ALONE^2 W_i)). The largest over views counts, so that Gaussians in only
-one view are not averaged away. On the bundled scene, at 77 % of the Gaussians, the mean loss (the worst
-view's) is 0.21 (1.3) dB; ranked by W_i it is 0.42 (1.3), by sqrt(W_i E_i) 0.30 (3.4).
+values times pixels, if one Gaussian is removed alone. As those of a white wall have only similar ones behind
+them, distances to the image are increased by `ALONE`: the contribution is sqrt(W_i (E_i + ALONE^2 W_i)), the
+largest over views. On the bundled scene, at 77 % of the Gaussians, the mean loss (the worst view's) is 0.21
+(1.3) dB; ranked by W_i it is 0.42 (1.3), by sqrt(W_i E_i) 0.30 (3.4).
 
-**Loss.** With photographs, the loss in PSNR is measured on them. Without, it is derived from the difference
-of the new image and the original one: the change by a removal is, to first order, uncorrelated with the
-errors of a trained scene (at a minimum of the training loss no direction helps), so squared errors add. A
-view that the original shows with mean squared error e and that changes by d loses
-
-    10 log10(1 + d / e) dB.
-
-Without photographs e is that of a scene of an assumed PSNR. A scene that is worse than assumed loses less
-than stated, so the assumption should be high. On the bundled scene, with its photographs and true e, this
-agreed with the measured loss within 0.03 dB at losses up to 1 dB.
+**Loss.** With photographs, the loss in PSNR is measured on them. Without, it is derived from the change of
+images, which is, to first order, uncorrelated with the errors of a trained scene, so that squared errors add:
+a view of mean squared error e that changes by d loses 10 log10(1 + d / e) dB. e is that of an assumed PSNR,
+which should be high: a worse scene loses less than stated. On the bundled scene, with its photographs and
+true e, this agreed with the measured loss within 0.03 dB at losses up to 1 dB.
 """
 
 import tempfile

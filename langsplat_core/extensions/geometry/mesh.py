@@ -214,7 +214,6 @@ def watertight(points: Array, triangles: Array, near: float) -> tuple[Array, Arr
     """Return a surface of which every edge has two triangles, with opposite directions along it.
 
     points: (V, D) positions, with or without colours after them; near: distance at which points are merged.
-
     Triangles without an area, with their own reverse, or repeated are left out, and a fan closes every rim.
     Then every edge has as many triangles in one direction as in the other, which form pairs. If an edge has
     several pairs, each pair gets a vertex of its own near the edge's middle, and its triangles become fans.

@@ -4,7 +4,7 @@ Features of surface points are matched by RANSAC and refined by ICP (Open3D); re
 transform.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, rotation_matrices, unit
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, report_losses, shortened
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene, Tree
@@ -90,8 +90,8 @@ class Registration:
 def register(moving: Scene, fixed: Scene, scaled: bool = False, progress: Progress = silent) -> Registration:
     """Return the rigid motion, and with `scaled` the scale, from one scene to another.
 
-    Without `scaled` both have the same unit, unless their metres per unit differ. Raises InputError for a
-    scene without a surface. The result is only a guess unless it is `trusted`.
+    Without `scaled` both have the same unit, unless their metres per unit differ. The result is only a guess
+    unless it is `trusted`. InputError for a scene without a surface.
     """
     ratio = 1.0  # of a unit of the moving scene to one of the fixed scene
     if moving.metres_per_unit is not None and fixed.metres_per_unit is not None:
@@ -192,10 +192,9 @@ def some_cameras(cameras: Sequence[Camera], most: int, side: int) -> list[Camera
 def merge(first: Scene, second: Scene) -> Scene:
     """Return the Gaussians of both scenes, those of `first` first, with all their data, at its origin.
 
-    Gaussians of a scene without a language field get no feature. Settings of the whole scene and equal words
-    are those of `first`; properties that only one has are left out. Raises InputError if only one is
-    antialiased, if the language fields cannot be merged, and for scenes so far apart that float32 would round
-    the positions of `second` by more than the size of most of its Gaussians.
+    Settings of the whole scene and equal words are those of `first`. Reports what only one has. InputError if
+    only one is antialiased, if the language fields cannot be merged, and for scenes so far apart that float32
+    would round the positions of `second` by more than the size of most of its Gaussians.
     """
     if first.antialiased != second.antialiased:
         raise InputError(
@@ -211,6 +210,7 @@ def merge(first: Scene, second: Scene) -> Scene:
         name for name, values in first.extras.items()
         if name in second.extras and second.extras[name].dtype == values.dtype
     ]  # fmt: skip
+    report_losses("merged", _losses(first, second, shared))
     return Scene(
         join_gaussians([first.gaussians, second.gaussians]),
         _language(first, second),
@@ -221,6 +221,20 @@ def merge(first: Scene, second: Scene) -> Scene:
         unread=first.unread + second.unread,
         origin=first.origin,
     )
+
+
+def _losses(first: Scene, second: Scene, shared: Sequence[str]) -> Iterator[str]:
+    """Yield what only one of two scenes has, and units that are not equal."""
+    if others := {*first.extras, *second.extras}.difference(shared):
+        yield f"properties that only one has are left out: {shortened(others)}"
+    fields = [scene.language for scene in (first, second) if len(scene.gaussians)]
+    if len({field is None for field in fields}) > 1:
+        yield "only one of the scenes has a language field, and the other cannot be searched"
+    elif len({field is None or field.tree is None for field in fields}) > 1:
+        yield "the tree of instances that only one has is left out"
+    metres = first.metres_per_unit or second.metres_per_unit or 1.0
+    if abs((second.metres_per_unit or metres) / metres - 1) > 0.01:
+        yield f"units of {metres:g} and {second.metres_per_unit:g} m count as equal, of {metres:g} m"
 
 
 def once(both: Scene, first: Scene) -> tuple[Scene, int]:

@@ -2,9 +2,8 @@
 
 Both scenes are rendered from the training cameras of both. A pixel of one scene is *gone* if the other's
 surface is clearly farther away, *hidden* if it is nearer, and else *kept*; a kept pixel may have *another
-colour*. The adjoint of the rasterizer sums these over the Gaussians that paint a pixel, and these are summed
-over the nodes of the scene's tree. A node has changed if most of its own pixels have, independent of the
-other scene's tree; pixels that one capture did not see, and hidden ones, do not count.
+colour*. The rasterizer's adjoint sums these over Gaussians, and these are summed over the nodes of a tree. A
+node has changed if most of its pixels have; hidden ones, and those that one capture missed, do not count.
 """
 
 from dataclasses import dataclass, replace
@@ -100,9 +99,8 @@ def changes(
     """Return the changes from the first scene to the second, by `KINDS`, the largest first.
 
     placed: (4, 4) similarity from the second scene's frame to the first one's; None: one world and its units.
-    describers: of both, for names. Reports scenes in which most of the other's pixels are gone. Raises
-    InputError if neither scene has cameras, if one has no language field, and for a matrix that is no
-    similarity.
+    describers: of both, for names. Reports scenes in which most of the other's pixels are gone. InputError if
+    neither scene has cameras, if one has no language field, and for a matrix that is no similarity.
     """
     into = _in_one_world(first.scene, second.scene) if placed is None else similarity(placed).matrix
     before, after = _evidence(first.scene, second.scene, into, progress)

@@ -1,10 +1,9 @@
 """Search over all scenes of a folder: ranked by an index of their codebooks, the best ones searched exactly.
 
-The answer to a phrase in a scene depends on the mean relevancies of its regions, which are mixtures of the
-relevancies of few codewords. So the index has, for every scene, its codewords in 8 bits, the zero and rate of
-each (see `Scale`), the codewords of every region with their shares, and the fits of everyday phrases by
-chance. From these the fits and the verdict of `query.rule` are computed without opening the scene, up to the
-rounding of codewords. The scenes with the best verdicts are then opened and searched by `QueryEngine`.
+The mean relevancies of a scene's regions are mixtures of those of few codewords. So the index has, for every
+scene, its codewords in 8 bits, the zero and rate of each (see `Scale`), the codewords of every region with
+their shares, and the fits of everyday phrases by chance: with these `query.rule` is followed without opening
+the scene, up to rounding. The scenes with the best verdicts are then searched by `QueryEngine`.
 
 The index is a safetensors file: the scenes as JSON in its metadata, and for each group of scenes of one
 encoder, `N.`, its canonical vectors, the `Columns` of all its scenes and their thumbnails.

@@ -317,6 +317,15 @@ def test_merge_keeps_what_both_scenes_show_once(tmp_path, capsys):
     assert once(merge(first, Scene(random_gaussians(0))), first)[1] == 0
 
 
+def test_merge_says_what_only_one_scene_has(caplog):
+    a = replace(scene(0, "mug"), metres_per_unit=0.001)
+    fields = ({"language": field} for field in (None, replace(a.language, tree=None), a.language))
+    for change in ({"extras": {"age": np.zeros(N)}}, {"metres_per_unit": 1.0}, *fields):
+        merge(a, replace(a, **change))
+    told = "left out: age", "units of 0.001 and 1 m count", "only one of the scenes has", "tree of instances"
+    assert [word in said for word, said in zip(told, caplog.messages, strict=True)] == [True] * 4
+
+
 def test_merge_refuses_scenes_of_two_encoders_or_far_apart():
     a, b = scene(0, "mug"), scene(5, "vase")
     far = np.full(3, 5e8)
