@@ -40,7 +40,7 @@ class Describe:
     outline: bool = False
     """The scene as a tree: wholes, with their parts under them."""
     labels: Annotated[Path | None, tyro.conf.arg(metavar="OUT.ply")] = None
-    """Write instance, part and class of each Gaussian into this .ply, and OUT.labels.json about the nodes."""
+    """Write instance, part and class per Gaussian here; words, boxes and counts into OUT.labels.json."""
     vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Your own list, one phrase per line, in place of the bundled everyday things and parts."""
     encoder: EncoderOption = ""

@@ -74,7 +74,7 @@ class Convert:
     source: tyro.conf.Positional[Path]
     """Scene to read, of any format; or the first of the files that another method has of one scene."""
     rest: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[MORE...] OUT")]]
-    """Further files of that method, and last (or as --out OUT, -o OUT) the scene or folder to write."""
+    """More of its files; last (or --out, -o) a folder, or .ply .spz .sog .glb .gltf .usdc .usda .splat."""
     rematch: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A language sidecar of before the Gaussians were edited, carried over to those of SOURCE by position."""
     to: Annotated[str, tyro.conf.arg(metavar="scene|langsplat")] = "scene"

@@ -175,7 +175,7 @@ class QueryScene:
     why: arguments.OutFile | None = None
     """Draw here, *.png, the best and worst photograph and mask behind each answer; --json has them, too."""
     segmenter: arguments.EncoderName = ""
-    """Ask the photographs, too, by a model that outlines what phrases name, such as facebook/sam3."""
+    """Ask the photographs too, by a model such as facebook/sam3; answers say which of both found them."""
     work: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), _PHOTOGRAPHS] = None
     """Folder of the training, with its masks (default: <scene>.work)."""
     photographs: Annotated[arguments.Photographs | None, _PHOTOGRAPHS] = None

@@ -53,7 +53,7 @@ class Train:
     preset: TrainPreset = "full"
     """quick: minutes on a CPU; good: half an hour; full: as published, for a GPU; options beside it count."""
     progress: Literal["bars", "lines"] = "bars"
-    """How progress is shown on standard error: as bars, or for other programs as lines of JSON."""
+    """On standard error: bars, or for other programs lines of JSON (stage, fraction, note, metrics)."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
     """A file of options, `preset = "good"` or `radiance.steps = 7000`; options beside it count more."""
     gaussians: Annotated[Path | None, tyro.conf.arg(metavar="SCENE")] = None

@@ -425,8 +425,7 @@ TELLING_POINTS = 50  # known points from which on random depths follow theirs
 def look_distance(cameras: Sequence[Camera]) -> float:
     """Return the typical distance from the cameras to the place they look at, world units, > 0.
 
-    That place is nearest to all optical axes in the least-squares sense; a small pull to the cameras' own
-    mean keeps parallel axes from running to infinity.
+    It is nearest to all optical axes by least squares, with a small pull to the cameras, for parallel axes.
     """
     positions = np.array([camera.position for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])

@@ -301,8 +301,7 @@ def over_black(image: Image.Image) -> Image.Image:
 def _read_for(photo: Photo, tell: Tell) -> tuple[Image.Image, PhotoIntrinsics]:
     """Read a photograph, and return its intrinsics on the pixel grid of the file.
 
-    COLMAP reads pixels as stored, other tools turn them first; when the stored shape does not fit the
-    lens but the turned one does, the latter is meant.
+    COLMAP reads pixels as stored, other tools turn them first: the one whose shape fits the lens is meant.
     """
     intrinsics = photo.intrinsics
     image = read_photo(photo.path, photo.upright, tell)

@@ -267,8 +267,7 @@ class Archive:
     def read(self, name: str, limit: int) -> bytes:
         """Return the content of a member.
 
-        FormatError if there is none, if it has more than `limit` bytes, or if all that were read exceed the
-        allowance of the archive; no more than that is unpacked.
+        FormatError if there is none, or beyond `limit` bytes or the archive's allowance, unpacked no further.
         """
         try:
             info = self._archive.getinfo(name)

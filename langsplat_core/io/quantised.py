@@ -55,8 +55,7 @@ def check_steps(path: Path, gaussians: Gaussians, steps: Array) -> None:
 def smallest_three(three: Array, largest: Array, tell: Tell) -> Array:
     """Return (N, 4) unit quaternions from their (N, 3) components other than the largest.
 
-    largest: (N,) index of the largest component, which is positive; tell: gets a line about components that
-    are too long for a unit quaternion, beyond rounding to 8 bits.
+    largest: (N,) index of the largest component, which is positive; tell: about others that are too long.
     """
     out = np.empty((len(three), 4))
     left = 1 - (three**2).sum(1)

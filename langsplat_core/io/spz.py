@@ -189,8 +189,7 @@ FRACTIONAL_BITS = 12  # as in other writers: steps of 1/4096, up to 2048
 def read_spz_scene(path: Path | str, axes: str = "", note: Tell = lambda line: None) -> Scene:
     """Return the scene of a .spz file; InputError if it cannot be opened, else FormatError.
 
-    axes: in `AXES`, of a file that does not name them; "" stands for RUB, with a warning if the scene is then
-    upside down. note: gets a line about axes that were assumed.
+    axes: in `AXES`, of a file that names none; "": RUB, with a warning if that is upside down. note: of that.
     """
     path = Path(path)
     file, size = open_for_reading(path)

@@ -91,8 +91,7 @@ def find_evidence(
 ) -> Evidence | None:
     """Return the evidence of the best region of `answer`; None where no region answers.
 
-    phrases: masks are compared with the one that fits the region best; features: of the scene's cameras.
-    Raises FormatError for features of another scene.
+    phrases: the one that fits best is compared with masks; FormatError for features of another scene.
     """
     scene, found = engine.scene, _best_region(engine, answer)
     if found is None:

@@ -47,7 +47,7 @@ from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary
 # In an order in which each imports only those before it, so that their code can stand in one script.
 MODULES = ("words", "rule", "encoder", "camera", "space", "language", "data", "draw", "headset", "page")
 BEGIN = "// [page]\n"  # between imports and code of a module
-LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "COLOURS", "PARTS", "ALSO_NOUNS", "ALWAYS_PLURAL",
+LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "COLOURS", "PARTS", "ALSO_NOUNS", "OWN_SINGULARS",
          "MEASURES", "OWNERS")  # fmt: skip
 TABLES = ("PREPOSITIONS", "SUPERLATIVES", "NUMBERS", "PLURALS", "ENDINGS")  # also in query/grammar.py
 STILL = 1280  # pixels of the longer side of the picture in the page

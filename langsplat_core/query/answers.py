@@ -347,8 +347,7 @@ def by_peak(
 def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, Array] | tuple[None, None]:
     """Return position (3,) and box (2, 3) of the connected part above `threshold` that holds the peak.
 
-    smoothed: (M,) relevancy of the surface; None if all is 0. The position is in the middle of all that is as
-    high as the peak: a whole instance may have one feature.
+    smoothed: (M,) relevancy of the surface; None if all is 0. The position is the middle of all at the peak.
     """
     if smoothed.max(initial=0) <= 0:
         return None, None

@@ -91,13 +91,16 @@ class QueryEngine:
             taught += words.words
         self.taught: dict[str, TaughtWord] = {word.key: word for word in taught}
 
+    def __deepcopy__(self, memo: object) -> "QueryEngine":
+        """Return the engine itself: copies of its answers (`dataclasses.asdict`) share it with its locks."""
+        return self
+
     # Answers.
 
     def run(self, phrase: str, level: LevelChoice = "auto", progress: Progress = silent) -> QueryResult:
         """Answer `phrase` as one name; a taught word by its examples. Raises as `TextVectors.of` does.
 
-        The level is chosen per scene and not per view, so that images do not flicker between levels. "Lid of
-        the teapot" is one name here; `run_phrase` parses it.
+        The level is that of the scene in all views. "Lid of the teapot" is one name; `run_phrase` parses it.
         """
         return self.run_many([phrase], level, progress)[0]
 

@@ -74,21 +74,29 @@ def forms(word: str) -> tuple[str, ...]:
 
 
 PLURALS = {
-    "men": "man", "women": "woman", "people": "person", "children": "child", "feet": "foot", "teeth": "tooth",
-    "mice": "mouse", "geese": "goose", "leaves": "leaf", "loaves": "loaf", "knives": "knife",
-    "wolves": "wolf", "shelves": "shelf", "halves": "half", "scarves": "scarf", "hooves": "hoof",
-    "cookies": "cookie", "movies": "movie", "hoodies": "hoodie", "calves": "calf", "lenses": "lens",
+    "women": "woman", "men": "man", "people": "person", "feet": "foot", "teeth": "tooth", "mice": "mouse",
+    "geese": "goose", "lenses": "lens", "wives": "wife", "knives": "knife", "cacti": "cactus",
 }  # fmt: skip
-ALWAYS_PLURAL = _words("scissors glasses jeans trousers headphones shorts pants pliers tongs binoculars")
-# Endings of regular plurals, and their replacement in the singular.
-ENDINGS = {"(?<=..)ies$": "y", "(?<=..)(?<!sh|an)oes$": "o"}
-ENDINGS |= {"(?<=..ss|..ch|..sh)es$|(?<=[^o]us|..x)es$|(?<![sui])s$": ""}
+OWN_SINGULARS = _words(
+    "scissors glasses sunglasses eyeglasses goggles jeans trousers headphones shorts pants tights leggings "
+    "clothes pyjamas overalls dungarees pliers tongs tweezers shears secateurs binoculars lens canvas atlas "
+    "gas thermos rhinoceros series species christmas"
+)
+# Endings of other plurals, and what they are in the singular.
+ENDINGS = {
+    "(?<=child)ren$": "", "(?<=..[dekmnrstw])men$": "man",
+    "(?<=lea|loa|hoo|wol|[hc]al|[hs]el|car|hie)ves$": "f",
+    "(?<=ook|ood|oth|elf|omb|own|mov|pix|ean|egg|udg|ckt|owt|agp|otp|ird)ies$": "ie", "(?<=..)ies$": "y",
+    "(?<=..)(?<!sh|pt|ob|fl)(?<!let)(?<!^al)(?<!^can)oes$": "o",
+    "(?<=..ss|..sh|..tz)es$|(?<=..ch)(?<![tdhc]ach|[un]ich|ioch)es$|(?<=iz)zes$": "",
+    "(?<=..[^oa]us)es$|(?<=^bus|^gas)es$|(?<=nvas|tlas|llis|iris)es$|(?<=..x)es$|(?<![sui])s$": "",
+}  # fmt: skip
 
 
 def singular(word: str) -> str:
     """Return the singular of an English noun; a word that is not plural is unchanged."""
     low = word.lower()
-    if low in PLURALS or low in ALWAYS_PLURAL:
+    if low in PLURALS or low in OWN_SINGULARS:
         return PLURALS.get(low, word)
     for ending, one in ENDINGS.items():
         word = re.sub(ending, one, word, flags=re.IGNORECASE)

@@ -201,8 +201,7 @@ EPSILON = 1e-5  # added to the variance by batch normalisation, in torch and in 
 def folded(network: Iterable[Mapping[str, Array]]) -> Layers:
     """Return a network's linear layers, float32, each batch normalisation folded into the layer before it.
 
-    network: the weights of each layer by their names in torch; layers without weights are skipped.
-    ValueError or KeyError for other kinds of layers.
+    network: weights of each layer by their names in torch. ValueError or KeyError for other kinds of layers.
     """
     layers: list[tuple[Array, Array]] = []
     for named in network:

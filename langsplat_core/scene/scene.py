@@ -185,8 +185,7 @@ WIDEST = 0.2  # least focal length over an image's width, 136 degrees: shorter o
 def near_plane(gaussians: Gaussians, cameras: Sequence[Camera], most: float | None = None) -> float:
     """Return the near plane, camera z in world units, > 0: a fraction of the depths that cameras see.
 
-    most: its upper bound; None: `NEAR` of the median depth. Published code has 0.2 whatever the unit
-    (`config.INRIA`). Orthographic cameras are ignored.
+    most: its upper bound; None: `NEAR` of the median depth (published: 0.2). Orthographic ones do not count.
     """
     points = gaussians.sample.means.astype(np.float64)
     telling = [camera for camera in cameras if not camera.orthographic]

@@ -58,10 +58,10 @@ export function phraseKey(text) {
 }
 
 // The singular of a noun; a word that is not plural is unchanged.
-function singular(noun, { plurals, endings, always_plural: always }) {
+function singular(noun, { plurals, endings, own_singulars: own }) {
   const low = noun.toLowerCase();
   const one = [...endings].reduce((word, [end, by]) => word.replace(RegExp(end, "i"), by), noun);
-  return plurals.get(low) ?? (always.has(low) ? noun : one);
+  return plurals.get(low) ?? (own.has(low) ? noun : one);
 }
 
 // A word in lower case and its possible singulars.

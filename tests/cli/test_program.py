@@ -28,7 +28,7 @@ from langsplat_core.cli.run import ROLES, main
 from langsplat_core.cli.scenes import Doctor
 from langsplat_core.config import check_settings, range_of
 from langsplat_core.errors import InputError
-from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.io.scenes import load_scene, save_scene, writable_suffixes
 from langsplat_core.pipeline import encoder_check
 from langsplat_viewer.program import ViewerCommand
 from langsplat_viewer.program import entry as viewer_entry
@@ -58,7 +58,9 @@ def test_every_option_is_described(name, capsys):
     with pytest.raises(SystemExit):
         parsed_as(name, ["--help"])
     empty = r"\(default: (?:None|True|False|'')?\)|\{None|\bSTR\b|\bPATH\b(?!\.)|can be overridden"
-    assert re.findall(empty, " ".join(capsys.readouterr().out.split())) == []
+    printed = " ".join(capsys.readouterr().out.split())
+    assert re.findall(empty, printed) == []
+    assert name not in ("convert", "select") or {*writable_suffixes()} <= {*re.findall(r"\.[a-z]+", printed)}
 
 
 @pytest.mark.parametrize(

@@ -85,8 +85,14 @@ def test_long_text_is_refused():
 
 
 SINGULARS = (
-    "boxes box, glass glass, shelves shelf, cherries cherry, Chairs Chair, scissors scissors, cactus cactus, "
-    "cookies cookie, potatoes potato, toes toe, buses bus, houses house, vases vase, ties tie, canoes canoe"
+    "boxes box, glass glass, shelves shelf, cherries cherry, Chairs Chair, scissors scissors, cactus "
+    "cactus, cookies cookie, potatoes potato, toes toe, buses bus, houses house, vases vase, ties tie, "
+    "canoes canoe, brownies brownie, canvases canvas, atlases atlas, hoodies hoodie, puppies puppy, "
+    "volcanoes volcano, fuses fuse, irises iris, octopuses octopus, moustaches moustache, watches watch, "
+    "quizzes quiz, mazes maze, axes axe, bookshelves bookshelf, gloves glove, olives olive, thieves thief, "
+    "knives knife, firemen fireman, lens lens, specimen specimen, grandchildren grandchild, women woman, "
+    "feet foot, canvas canvas, tights tights, cups cup, horseshoes horseshoe, neckties necktie, butterflies "
+    "butterfly, dresses dress, oranges orange, toys toy"
 )
 
 

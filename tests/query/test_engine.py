@@ -8,7 +8,7 @@ import threading
 import time
 import tracemalloc
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache
 from itertools import pairwise
 
@@ -128,6 +128,7 @@ def test_answers_reach_other_processes_and_say_where_in_the_world():
     scene = replace(blob_scene(), origin=np.array([5e5, 5.4e6, 0]))
     answer = QueryEngine(scene, FakeEncoder()).run("mug")  # what loads an encoder, or one
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(answer)).members, answer.members)
+    np.testing.assert_array_equal(asdict(answer)["members"], answer.members)
     assert repr(answer).endswith(f"near {scene.in_world(answer.place)}>")
 
 

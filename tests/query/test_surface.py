@@ -479,8 +479,7 @@ def test_every_ball_is_an_instance_with_its_figures():
 
 
 def test_voted_wholes_divide_touching_instances():
-    """A row of 80 that touch: two wholes, then ten of none. An answer of wholes joins what is of one of them,
-    a finer one takes apart what lies apart."""
+    """A row of 80 that touch: two wholes, ten of none. Wholes join what is theirs, finer answers do not."""
     gaussians = balls([80])[0]
     gaussians.means[:] = np.stack([np.arange(80), np.zeros(80), np.zeros(80)], 1)
     surface, wholes = build_surface(gaussians), np.repeat([7, 3, -1], [40, 30, 10])

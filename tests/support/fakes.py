@@ -151,8 +151,7 @@ def named_scene(codebook: bool = True) -> Scene:
 
 
 def as_trained(path: Path, scene: Scene, features: Sequence[ImageFeatures]) -> None:
-    """Save a scene with the masks and the report that its training would have left beside it, and grey
-    photographs in the folder "photographs"."""
+    """Save a scene with masks and report as a training leaves them, and grey photographs in "photographs"."""
     save_scene(path, scene)
     work, photographs = work_folder(path), path.parent / "photographs"
     photographs.mkdir()

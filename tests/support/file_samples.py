@@ -1,8 +1,6 @@
-"""Encoders of the formats that the project only reads, small files of every kind, and comparisons of what was
-read with what was written.
+"""Encoders of formats that are only read, small files of every kind, and comparisons after a round trip.
 
-They are written from the published layouts, apart from the readers, so that both would have to be wrong
-in the same way for a test to miss it.
+They are written from the published layouts, apart from the readers: a test misses what is wrong in both.
 """
 
 import gzip

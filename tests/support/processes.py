@@ -41,8 +41,7 @@ PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 24, 1, 2  # linux/prctl
 
 
 def bound_by_permissions() -> Callable[[], None] | None:
-    """`preexec_fn` for `subprocess`: for the administrator, the right to pass over permissions is given up
-    before the program starts; other users need nothing."""
+    """`preexec_fn` for `subprocess`, by which an administrator gives up rights to pass over permissions."""
     if os.geteuid() != 0:
         return None
     prctl = ctypes.CDLL(None, use_errno=True).prctl

@@ -205,8 +205,7 @@ def test_merged_gaussians_are_drawn_while_a_large_scene_moves(merging, shown):
 
 
 class Gated:
-    """The CPU's rasterizer. Other threads than the window's wait before they project, as long as the gate is
-    closed, and fail where they are told to."""
+    """The CPU's rasterizer, whose other threads wait at a closed gate, and fail where they are told to."""
 
     name = "cpu"
 

@@ -149,8 +149,7 @@ def test_the_shader_composes_as_the_kernel_does(gl, display, queries, more):
 @pytest.mark.parametrize("split", [Split(), Split("levels")])
 @pytest.mark.parametrize("selects", [False, True])
 def test_the_image_is_that_of_the_reference(renderer, display, split, selects):
-    """Either backend against float64 channels composed on the CPU. Pixels at a threshold or at a cut-off
-    of image formation may flip; all others agree to 2/255."""
+    """Either backend against float64 channels composed on the CPU: 2/255; pixels at a cut-off may flip."""
     request = request_for(display, split=split).seen_by(CAMERA)
     if selects:
         nothing = np.zeros(COUNT, bool)

@@ -1,7 +1,6 @@
 """Drives the real window through imgui's test engine; run by test_window.py in a process of its own.
 
-Its arguments: SCENARIO FOLDER. A scenario asserts as it goes and ends with "PASSED". FOLDER holds the scenes
-and is the working folder.
+Arguments: SCENARIO FOLDER, the working folder with the scenes. A scenario asserts and ends with "PASSED".
 """
 
 import gc

@@ -154,8 +154,7 @@ SAME = 0.6  # IoU of the claims of two masks above which they are linked
 def find_instances(mask_weights: MaskWeights, level: int = len(LEVELS) - 1, sample: int = 50_000) -> Array:
     """Return the (N,) int32 number of each Gaussian's instance at a level; NO_NODE if it is in no mask.
 
-    Instances are numbered from the largest, by number of Gaussians. sample: number of Gaussians by which
-    masks are compared, whose cost grows with the views squared.
+    Instances are numbered from the largest. sample: Gaussians by which masks are compared, view by view.
     """
     view_of = np.repeat(np.arange(len(mask_weights.pairs)), mask_weights.mask_counts)
     claims = _claims(mask_weights, level, sample)
