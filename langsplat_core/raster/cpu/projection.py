@@ -20,16 +20,8 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import Workers, helper, kernel, plain, shared_workers
 from langsplat_core.config import RasterSettings
-from langsplat_core.raster.cpu.lanes import (
-    Lanes,
-    borrowed,
-    exp2,
-    gathered,
-    log2,
-    prefetch,
-    scatter,
-    where_at_least,
-)
+from langsplat_core.raster.cpu import lanes as ln
+from langsplat_core.raster.cpu.lanes import Lanes
 from langsplat_core.raster.protocol import dilation, far_plane, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.scene.transform import C0, C1, C2, C3
@@ -184,19 +176,19 @@ def rows_of(gaussians: Gaussians) -> Rows:
 @helper
 def exp(x: Lanes) -> Lanes:
     """Return e^x of doubles up to 708, relative error 1e-15 for |x| < 10; below -708 as at -708."""
-    return exp2(max(x * (2 * HALF_LOG2_E), -1022.0))
+    return ln.exp2(max(x * (2 * HALF_LOG2_E), -1022.0))
 
 
 @helper
 def _three(array: Array, which: Array) -> Point:
-    return gathered(array, which, 0, 0), gathered(array, which, 0, 1), gathered(array, which, 0, 2)
+    return ln.gathered(array, which, 0, 0), ln.gathered(array, which, 0, 1), ln.gathered(array, which, 0, 2)
 
 
 @helper
 def parameters(rows: Rows, which: Array, camera: KernelCamera) -> Any:
     """Return camera points, scales and raw quaternions of eight Gaussians; which: (8,) their rows."""
     (s0, s1, s2), (q0, q1, q2) = _three(rows.log_scales, which), _three(rows.quats_wxyz, which)
-    quat = q0, q1, q2, gathered(rows.quats_wxyz, which, 0, 3)
+    quat = q0, q1, q2, ln.gathered(rows.quats_wxyz, which, 0, 3)
     return camera_point(_three(rows.means, which), camera), (exp(s0), exp(s1), exp(s2)), quat
 
 
@@ -208,30 +200,30 @@ def _footprints(rows: Rows, which: Array, camera: KernelCamera, each: Array, out
     """
     point, scales, quat = parameters(rows, which, camera)
     (x, y, z), (_, _, _, a) = point, axes(point, scales, quat, camera)
-    logit = gathered(rows.opacity_logits, which, 0, 0)
+    logit = ln.gathered(rows.opacity_logits, which, 0, 0)
     faint = exp(min(logit, -logit))
-    opacity = where_at_least(logit, 0.0, 1.0, faint) / (1 + faint)
+    opacity = ln.where_at_least(logit, 0.0, 1.0, faint) / (1 + faint)
     xx, xy, yy, det, det_fitted = covariance(a, camera.dilation, camera.fitted)
     if camera.fitted < camera.dilation:
         opacity = opacity * np.sqrt(max(det_fitted / det, COMPENSATION_MIN))
-    log2_opacity = log2(opacity)
+    log2_opacity = ln.log2(opacity)
     reach = 2 * LN2 * max(log2_opacity - np.log2(camera.alpha_min), 0.0)  # squared
     over = _over(z, camera)
     u, v = camera.fx * x * over + camera.cx, camera.fy * y * over + camera.cy
     wide, high, inverse = np.sqrt(reach * xx), np.sqrt(reach * yy), 1.0 / yy
-    scatter(out, each, 0, MEAN_X, u)
-    scatter(out, each, 0, MEAN_Y, v)
-    scatter(out, each, 0, FACTOR_A, np.sqrt(HALF_LOG2_E * yy / det))
-    scatter(out, each, 0, FACTOR_K, xy * inverse)
-    scatter(out, each, 0, FACTOR_C, np.sqrt(HALF_LOG2_E * inverse))
-    scatter(out, each, 0, LOG2_OPACITY, log2_opacity)
-    scatter(out, each, 0, HALF_WIDTH, wide)
-    scatter(out, each, 0, HALF_HEIGHT, high)
-    scatter(out, each, 0, COLUMNS, z)
+    ln.scatter(out, each, 0, MEAN_X, u)
+    ln.scatter(out, each, 0, MEAN_Y, v)
+    ln.scatter(out, each, 0, FACTOR_A, np.sqrt(HALF_LOG2_E * yy / det))
+    ln.scatter(out, each, 0, FACTOR_K, xy * inverse)
+    ln.scatter(out, each, 0, FACTOR_C, np.sqrt(HALF_LOG2_E * inverse))
+    ln.scatter(out, each, 0, LOG2_OPACITY, log2_opacity)
+    ln.scatter(out, each, 0, HALF_WIDTH, wide)
+    ln.scatter(out, each, 0, HALF_HEIGHT, high)
+    ln.scatter(out, each, 0, COLUMNS, z)
     across = min(u + wide, camera.width - (u - wide))
     inside = min(across, min(v + high, camera.height - (v - high))) - 0.5
     least = min(min(inside, opacity - camera.alpha_min), camera.far - z)
-    scatter(out, each, 0, COLUMNS + 1, where_at_least(camera.near, z, -1.0, least))
+    ln.scatter(out, each, 0, COLUMNS + 1, ln.where_at_least(camera.near, z, -1.0, least))
 
 
 @kernel
@@ -240,7 +232,7 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, geometry: A
 
     A Gaussian whose alpha = alpha_min contour meets no pixel centre is not drawn.
     """
-    rows, camera, geometry, depths = borrowed((rows, camera, geometry, depths))
+    rows, camera, geometry, depths = ln.borrowed((rows, camera, geometry, depths))
     which, each, found = np.empty(8, np.int64), np.arange(8), np.empty((8, COLUMNS + 2))
     drawn, number = np.empty(last - first, np.int32), 0
     for start in range(first, last, 8):
@@ -334,14 +326,14 @@ def _forward(
     first: int, last: int, rows: Array, sh: Array, means: Array, position: Array, out: Array
 ) -> None:
     """out[place] <- colour of the Gaussian rows[place]; columns of `out` beyond the third are left."""
-    rows, sh, means, position, out = borrowed((rows, sh, means, position, out))
+    rows, sh, means, position, out = ln.borrowed((rows, sh, means, position, out))
     b, numbers = np.empty(sh.shape[1]), 3 * sh.shape[1]
     for place in range(first, last):
         later = np.int64(rows[min(place + _AHEAD, last - 1)])
-        prefetch(means, 3 * later)
+        ln.prefetch(means, 3 * later)
         for start in range(0, numbers, 16):  # cache lines
-            prefetch(sh, numbers * later + start)
-        prefetch(sh, numbers * later + numbers - 1)  # the last may lie in one more
+            ln.prefetch(sh, numbers * later + start)
+        ln.prefetch(sh, numbers * later + numbers - 1)  # the last may lie in one more
         n = rows[place]
         x, y, z, _ = _direction(means[n], position)
         _basis(x, y, z, b)
@@ -360,8 +352,8 @@ def _backward(
     sh_grad: Array,
     means_grad: Array,
 ) -> None:
-    sh, means, position, colour_grad = borrowed((sh, means, position, colour_grad))
-    sh_grad, means_grad = borrowed((sh_grad, means_grad))
+    sh, means, position, colour_grad = ln.borrowed((sh, means, position, colour_grad))
+    sh_grad, means_grad = ln.borrowed((sh_grad, means_grad))
     b, h = np.empty(sh.shape[1]), np.empty(sh.shape[1])
     for n in range(first, last):
         if colour_grad[n, 0] == 0 and colour_grad[n, 1] == 0 and colour_grad[n, 2] == 0:

@@ -15,23 +15,9 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import Workers, helper, kernel
 from langsplat_core.config import RasterSettings
 from langsplat_core.errors import BackendError
+from langsplat_core.raster.cpu import lanes as ln
 from langsplat_core.raster.cpu import projection as cp
-from langsplat_core.raster.cpu.lanes import (
-    Lanes,
-    borrowed,
-    exp2,
-    gathered,
-    lanes,
-    largest,
-    load,
-    prefetch,
-    ramp,
-    scatter,
-    store,
-    store_totals,
-    total,
-    where_at_least,
-)
+from langsplat_core.raster.cpu.lanes import Lanes
 
 TILE = 16
 PIXELS = TILE * TILE
@@ -85,7 +71,7 @@ def _sort_depths(rows: Array, depths: Array, middle: float, near: bool) -> tuple
     float32 depth, whose bits order as the numbers do (least significant digit first, each pass stable), is
     followed by an insertion sort of equal keys by float64 depth.
     """
-    rows, depths = borrowed((rows, depths))
+    rows, depths = ln.borrowed((rows, depths))
     number, moves = 0, 0
     ends = np.zeros((_PASSES, 1 << _DIGIT), np.int64)
     pairs = np.empty((2, rows.shape[0] + 1), np.int64)  # keys, above 32 bits of row
@@ -147,19 +133,19 @@ def _rows_in_columns(geometry: Array, pairs: Array, k: int, height: int, out: Ar
     whole ellipse or lies on the strip's border nearest to that point.
     """
     ranks = pairs[0]
-    x, y = gathered(geometry, ranks, k, cp.MEAN_X), gathered(geometry, ranks, k, cp.MEAN_Y)
-    a, c = gathered(geometry, ranks, k, cp.FACTOR_A), gathered(geometry, ranks, k, cp.FACTOR_C)
-    skew, wide = gathered(geometry, ranks, k, cp.FACTOR_K), gathered(geometry, ranks, k, cp.HALF_WIDTH)
-    peak = skew * gathered(geometry, ranks, k, cp.HALF_HEIGHT)
+    x, y = ln.gathered(geometry, ranks, k, cp.MEAN_X), ln.gathered(geometry, ranks, k, cp.MEAN_Y)
+    a, c = ln.gathered(geometry, ranks, k, cp.FACTOR_A), ln.gathered(geometry, ranks, k, cp.FACTOR_C)
+    skew, wide = ln.gathered(geometry, ranks, k, cp.FACTOR_K), ln.gathered(geometry, ranks, k, cp.HALF_WIDTH)
+    peak = skew * ln.gathered(geometry, ranks, k, cp.HALF_HEIGHT)
     across = a / (a * a * skew * skew + c * c)
     slope, bulge = across * a * skew, across * c
-    start = gathered(out[0], pairs[2], k, 0) * TILE - x
+    start = ln.gathered(out[0], pairs[2], k, 0) * TILE - x
     left, right = max(start + (0.5 - _SLACK), -wide), min(start + (TILE - 0.5 + _SLACK), wide)
     bottom, top = min(max(peak, left), right), min(max(-peak, left), right)
     high = y + slope * bottom + bulge * np.sqrt(max(wide * wide - bottom * bottom, 0.0))
     low = y + slope * top - bulge * np.sqrt(max(wide * wide - top * top, 0.0))
-    scatter(out[0], pairs[2], k, 0, min(max(low + (0.5 - _SLACK), 0.0), float(height)))
-    scatter(out[1], pairs[2], k, 0, min(max(high + (0.5 + _SLACK), 0.0), float(height)))
+    ln.scatter(out[0], pairs[2], k, 0, min(max(low + (0.5 - _SLACK), 0.0), float(height)))
+    ln.scatter(out[1], pairs[2], k, 0, min(max(high + (0.5 + _SLACK), 0.0), float(height)))
 
 
 @helper
@@ -181,7 +167,7 @@ def _touch(
     packed, and its end, in rows from that tile's top; how many numbers these are; and how many Gaussians
     touch each tile.
     """
-    order, footprints, geometry, firsts = borrowed((order, footprints, geometry, firsts))
+    order, footprints, geometry, firsts = ln.borrowed((order, footprints, geometry, firsts))
     width, height = size
     columns, lines_of_tiles = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     found = np.empty(2 * (3 * (last - first) + _BLOCK + columns), np.int64)
@@ -192,7 +178,7 @@ def _touch(
     while first < last:
         number = 0
         while first < last and number < _BLOCK:
-            prefetch(footprints, np.int64(order[min(first + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
+            ln.prefetch(footprints, np.int64(order[min(first + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
             for n in range(cp.COLUMNS):
                 geometry[first, n] = footprints[order[first], n]
             begin, end = _columns_of(geometry[first], width)
@@ -231,7 +217,7 @@ def _place(first: int, last: int, found: tuple[Array, int], places: Array, start
     A tile's intersections go to places[tile] and on: ranks ascend within a tile, in any order of pieces.
     start: index into `tiles.slots` of the piece's first intersection.
     """
-    (touched, used), places, tiles = borrowed((found, places, tiles))
+    (touched, used), places, tiles = ln.borrowed((found, places, tiles))
     for rank in range(first, last):
         tiles.firsts[rank + 1] += start
     for n in range(0, used, 2):
@@ -313,16 +299,16 @@ def add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -
     """sums[at + 16 channel : + 16] += weight x[channel]."""
     if channels == 3:  # a constant, for images: rows need no branches
         for channel in range(3):
-            store(sums, at + channel * TILE, load(sums, at + channel * TILE) + weight * x[channel])
+            ln.store(sums, at + channel * TILE, ln.load(sums, at + channel * TILE) + weight * x[channel])
         return
     for channel in range(0, channels & ~3, 4):
-        store(sums, at, load(sums, at) + weight * x[channel])
-        store(sums, at + TILE, load(sums, at + TILE) + weight * x[channel + 1])
-        store(sums, at + 2 * TILE, load(sums, at + 2 * TILE) + weight * x[channel + 2])
-        store(sums, at + 3 * TILE, load(sums, at + 3 * TILE) + weight * x[channel + 3])
+        ln.store(sums, at, ln.load(sums, at) + weight * x[channel])
+        ln.store(sums, at + TILE, ln.load(sums, at + TILE) + weight * x[channel + 1])
+        ln.store(sums, at + 2 * TILE, ln.load(sums, at + 2 * TILE) + weight * x[channel + 2])
+        ln.store(sums, at + 3 * TILE, ln.load(sums, at + 3 * TILE) + weight * x[channel + 3])
         at += 4 * TILE
     for channel in range(channels & ~3, channels):
-        store(sums, at, load(sums, at) + weight * x[channel])
+        ln.store(sums, at, ln.load(sums, at) + weight * x[channel])
         at += TILE
 
 
@@ -372,21 +358,21 @@ def correlate(
     """out[s, column + line] <- sum over rows [low, high) of weights (stored from row `low`) times planes."""
     fours = lines & ~3
     for line in range(0, fours, 4):
-        a = b = c = d = lanes(np.float32(0))
+        a = b = c = d = ln.lanes(np.float32(0))
         f = (low * lines + line) * TILE
         for row in range(high - low):
-            weight = load(weights, row * TILE)
-            a = a + weight * load(planes, f)
-            b = b + weight * load(planes, f + TILE)
-            c = c + weight * load(planes, f + 2 * TILE)
-            d = d + weight * load(planes, f + 3 * TILE)
+            weight = ln.load(weights, row * TILE)
+            a = a + weight * ln.load(planes, f)
+            b = b + weight * ln.load(planes, f + TILE)
+            c = c + weight * ln.load(planes, f + 2 * TILE)
+            d = d + weight * ln.load(planes, f + 3 * TILE)
             f += lines * TILE
-        store_totals(out, s * out.shape[1] + column + line, a, b, c, d)
+        ln.store_totals(out, s * out.shape[1] + column + line, a, b, c, d)
     for line in range(fours, lines):
-        a = lanes(np.float32(0))
+        a = ln.lanes(np.float32(0))
         for row in range(low, high):
-            a = a + load(weights, (row - low) * TILE) * load(planes, (row * lines + line) * TILE)
-        out[s, column + line] = total(a)
+            a = a + ln.load(weights, (row - low) * TILE) * ln.load(planes, (row * lines + line) * TILE)
+        out[s, column + line] = ln.total(a)
 
 
 # The walk over a tile that every operation shares: its Gaussians front to back, of each the rows it touches.
@@ -426,9 +412,9 @@ def start_tile(tile: int, tiles: Tiles) -> Array:
 @helper
 def running_rows(transmittance: Array, low: int, high: int) -> tuple[int, int]:
     """Shrink rows [low, high) to those that begin and end with a row that has a running pixel."""
-    while low < high and largest(load(transmittance, low * TILE)) <= 0:
+    while low < high and ln.largest(ln.load(transmittance, low * TILE)) <= 0:
         low += 1
-    while low < high and largest(load(transmittance, (high - 1) * TILE)) <= 0:
+    while low < high and ln.largest(ln.load(transmittance, (high - 1) * TILE)) <= 0:
         high -= 1
     return low, high
 
@@ -443,7 +429,7 @@ def rows_to_blend(tiles: Tiles, s: int, top: int, bottom: int) -> tuple[int, int
 def enter(tiles: Tiles, s: int, later: int) -> tuple[int, int]:
     """Return the Gaussians of intersections `s` and `later`, and prefetch the later one's footprint."""
     coming = tiles.met[later] >> _SPAN + _PLACE
-    prefetch(tiles.geometry, coming * cp.COLUMNS)
+    ln.prefetch(tiles.geometry, coming * cp.COLUMNS)
     return tiles.met[s] >> _SPAN + _PLACE, coming
 
 
@@ -456,11 +442,11 @@ def begin_rows(g: Array, x: float, y: float, rows: Array) -> Lanes:
     """
     dy = y - g[cp.MEAN_Y]
     skew = g[cp.FACTOR_A] * g[cp.FACTOR_K]
-    v = ramp(g[cp.FACTOR_C] * dy, g[cp.FACTOR_C])
-    store(rows, 0, ramp(g[cp.FACTOR_A] * (x - g[cp.MEAN_X]) - skew * dy, -skew))
-    store(rows, TILE, g[cp.LOG2_OPACITY] - v * v)
-    store(rows, 2 * TILE, v)
-    return ramp(0.0, g[cp.FACTOR_A])
+    v = ln.ramp(g[cp.FACTOR_C] * dy, g[cp.FACTOR_C])
+    ln.store(rows, 0, ln.ramp(g[cp.FACTOR_A] * (x - g[cp.MEAN_X]) - skew * dy, -skew))
+    ln.store(rows, TILE, g[cp.LOG2_OPACITY] - v * v)
+    ln.store(rows, 2 * TILE, v)
+    return ln.ramp(0.0, g[cp.FACTOR_A])
 
 
 @helper
@@ -471,11 +457,11 @@ def blend_row(
 
     All sixteen lanes are stored: a masked store would stall the next Gaussian's load of the same row.
     """
-    before, power = load(transmittance, at), log2_height - w * w
-    alpha = where_at_least(power, cutoffs.log2_alpha_min, min(exp2(power), cutoffs.alpha_max), 0.0)
+    before, power = ln.load(transmittance, at), log2_height - w * w
+    alpha = ln.where_at_least(power, cutoffs.log2_alpha_min, min(ln.exp2(power), cutoffs.alpha_max), 0.0)
     after = before - alpha * before
-    store(transmittance, at, where_at_least(cutoffs.transmittance_min, after, -abs(before), after))
-    return where_at_least(cutoffs.transmittance_min, after, 0.0, alpha), before
+    ln.store(transmittance, at, ln.where_at_least(cutoffs.transmittance_min, after, -abs(before), after))
+    return ln.where_at_least(cutoffs.transmittance_min, after, 0.0, alpha), before
 
 
 @helper
