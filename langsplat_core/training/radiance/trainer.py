@@ -29,6 +29,13 @@ from langsplat_core.training.radiance.stereo import DepthMap, find_depths, in_fr
 
 STAGE = "training Gaussians"
 JUDGED = 3  # held-out views that are drawn while a training runs
+COOLING, COOLEST = 0.3, 0.05  # last share of a short run in which rates fall, and the factor they fall to
+FADING = 0.01  # least weight of the mean opacity in the loss with few views
+GAIN = 0.35  # dB that exposures gain on the training views, at least, to be used
+EXPOSED = 7  # one pixel in so many is enough for an exposure
+LOOKS = 64  # passes over the photographs, at most, in which a run looks for transients
+EXPLAINED = 0.24  # least share of the squared error that lies in transients, to leave them out
+STEREO_POINTS = 20_000  # of depth maps, at most, where Gaussians begin
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,10 @@ class Schedule:
         """Return True where opacities are capped at 0.01 after the step."""
         return self.reset_every > 0 and step < self.densify_until and step % self.reset_every == 0
 
+    def finds_exposures(self, step: int) -> bool:
+        """Return True where exposures are found before the step: after a third of the run and after two."""
+        return step in (1 + round(self.steps / 3), 1 + round(2 * self.steps / 3))
+
     def active_sh_degree(self, step: int) -> int:
         """Return the degree of the spherical harmonics used and trained in the step."""
         return min(self.sh_degree, step // self.sh_degree_every)
@@ -76,7 +87,7 @@ class Schedule:
         """Return Adam's rate for every parameter; that of positions decays log-linearly over the run."""
         t = min(step / self.steps, 1.0)
         first, last = (math.log(rate) for rate in self.position_lr)
-        cool = min(max((1 - t) / 0.3, 0.05), 1.0) if self.cools else 1.0
+        cool = min(max((1 - t) / COOLING, COOLEST), 1.0) if self.cools else 1.0
         rates = {"means": math.exp((1 - t) * first + t * last), **self.rates}
         return {name: cool * rate for name, rate in rates.items()}
 
@@ -141,10 +152,10 @@ def train_radiance(
     if len(train_indices) <= config.few_views:
         # After a reset, Gaussians close before each of few cameras come back first. A decay of opacities
         # removes what no photograph needs instead.
-        config = replace(config, opacity_reset_every=0, opacity_decay=max(config.opacity_decay, 0.01))
+        config = replace(config, opacity_reset_every=0, opacity_decay=max(config.opacity_decay, FADING))
         depths = find_depths(capture, train_indices, progress)
-    members = config.ensemble if config.ensemble > 1 else 0
-    config = replace(config, ensemble=members, max_gaussians=max(config.max_gaussians // (members or 1), 1))
+    members = max(config.ensemble, 1)
+    config = replace(config, max_gaussians=max(config.max_gaussians // members, 1))
     first = _first_gaussians(capture, train_indices, depths, config)
     centre = np.mean([camera.position for camera in capture.cameras], axis=0)
     distance = float(np.median(np.linalg.norm(first.means - centre, axis=1)))
@@ -153,7 +164,7 @@ def train_radiance(
     renderer = differentiable.renderer_for(config.backend, config.formation(near))
     views = _Views(capture, train_indices, renderer.device)
     judged = held_out[:: -(-len(held_out) // JUDGED) or 1]
-    run = _Run(config, schedule_for(config, extent), views, judged, renderer, extent, depths)
+    run = _Run(config, schedule_for(config, extent), views, judged, renderer, extent, depths, members)
     if checkpoint and checkpoint.exists():
         state = training.load_checkpoint(checkpoint, made_from, renderer.device)
     else:
@@ -165,7 +176,7 @@ def train_radiance(
     signals: list[int] = []  # held back while a step runs: half a step is no state to resume from
     with one_torch_thread(), handled(lambda number, _: signals.append(number)):
         try:
-            while state.step < config.steps or state.member < config.ensemble:
+            while not run.is_finished(state):
                 state = run.current(state, capture, train_indices)
                 recent.append(run.step(state))
                 # Photographs differ in their loss: progress gets the mean over each 200th of the run.
@@ -231,20 +242,30 @@ class _Run:
     renderer: differentiable.DifferentiableRenderer
     extent: float  # world units
     depths: Sequence[DepthMap]  # before whose surfaces Gaussians are removed; none for many views
+    members: int  # trainings that are merged, and then trained together; 1: a single one
+
+    def is_finished(self, state: TrainingState) -> bool:
+        """Return True after the last step of the last training."""
+        return state.step >= self.config.steps and state.member == (self.members if self.members > 1 else 0)
 
     def work(self, state: TrainingState) -> float:
         """Return the share of the work that is done; a joint step on all members counts as a step on one."""
-        members, before = self.config.ensemble, self.schedule.work(self.schedule.joint_from)
         done = state.member + self.schedule.work(state.step)
-        return (done - before * (state.member == members)) / (members + 1 - before) if members else done
+        if self.members == 1:
+            return done
+        skipped = self.schedule.work(self.schedule.joint_from)  # by the joint training
+        return (done - skipped * (state.member == self.members)) / (self.members + 1 - skipped)
 
     def current(self, state: TrainingState, capture: Capture, indices: Sequence[int]) -> TrainingState:
-        """Return `state` or, if its training is finished, the initial state of the next training."""
+        """Return `state` or, once its training is finished, the initial state of the next one.
+
+        That is the next member's and, after the last member, that of the joint training.
+        """
         if state.step < self.config.steps:
             return state
         member = state.member + 1
         seeded = replace(self.config, seed=self.config.seed + (member << 32))  # a seed of no other run
-        if member < self.config.ensemble:
+        if member < self.members:
             first = _first_gaussians(capture, indices, self.depths, seeded)
             after = training.start(first, seeded.seed, self.renderer.device)
             after.finished = training.members(state)
@@ -256,16 +277,23 @@ class _Run:
 
     def step(self, state: TrainingState) -> float:
         """Update the Gaussians by one photograph; return the loss before the update."""
-        config, schedule, step = self.config, self.schedule, state.step + 1
+        step = state.step + 1
         if not state.queue:
             state.queue = [int(index) for index in state.rng.permutation(len(self.views))]
-        exposing = [] if config.exposure == "off" else [1 + round(n * config.steps / 3) for n in (1, 2)]
-        if step in exposing:
+        if self.config.exposure != "off" and self.schedule.finds_exposures(step):
             state.exposures = self.find_exposures(state)
-        index = state.queue.pop()
-        camera, target, mask = self.views.at(index, coarse=step <= schedule.coarse_until)
-        degree, focal = schedule.active_sh_degree(step), self.views.focals[index]
-        rendered = self.renderer.render(state.values, camera, degree, focal)
+        loss = self.gradients(state, step, state.queue.pop())
+        training.add_opacity_decay(state, self.config.opacity_decay)
+        training.adam_step(state, self.schedule.learning_rates(step))
+        self.control_density(state, step)
+        state.step = step
+        return float(loss)
+
+    def gradients(self, state: TrainingState, step: int, index: int) -> Tensor:
+        """Find the gradients of a step by view `index`, and what densification needs; return the loss."""
+        camera, target, mask = self.views.at(index, coarse=step <= self.schedule.coarse_until)
+        degree = self.schedule.active_sh_degree(step)
+        rendered = self.renderer.render(state.values, camera, degree, self.views.focals[index])
         image = rendered.image
         if len(state.exposures):
             image = losses.with_exposure(image, state.exposures[index])
@@ -276,15 +304,18 @@ class _Run:
         if mask is not None:  # masked pixels are their own target, without a gradient
             image = torch.where(mask[..., None], image, image.detach())
             target = torch.where(mask[..., None], target, image.detach())
-        loss = loss + losses.radiance_loss(image, target, config.lambda_dssim)
+        loss = loss + losses.radiance_loss(image, target, self.config.lambda_dssim)
         loss.backward()
-        training.add_opacity_decay(state, config.opacity_decay)
-        if step < schedule.densify_until:
+        if step < self.schedule.densify_until:
             size = camera.width, camera.height
             training.accumulate(state, rendered.means_px_grad(), rendered.visible, size)
-        training.adam_step(state, schedule.learning_rates(step))
+        return loss.detach()
+
+    def control_density(self, state: TrainingState, step: int) -> None:
+        """Add and remove Gaussians after a step, clear free space, and reset opacities, where it is time."""
+        schedule = self.schedule
         if schedule.densifies(step):
-            training.densify(state, config, self.extent, prune_large=0 < schedule.reset_every < step)
+            training.densify(state, self.config, self.extent, prune_large=0 < schedule.reset_every < step)
         clears = schedule.densify_from < step <= schedule.joint_from  # the last steps fill the gaps
         if self.depths and clears and step % schedule.densify_every == 0:
             means = state.values["means"].detach().cpu().numpy()
@@ -293,8 +324,6 @@ class _Run:
                 training.rearrange(state, torch.from_numpy(keep).to(state.device))
         if schedule.resets_opacity(step):
             training.reset_opacities(state)
-        state.step = step
-        return float(loss.detach())
 
     def held_out(self, state: TrainingState, capture: Capture) -> dict[str, float]:
         """Return the mean PSNR of the views that are judged, dB, a dozen times in a run; else nothing."""
@@ -312,22 +341,22 @@ class _Run:
             with torch.no_grad():
                 image = self.renderer.render(state.values, camera, degree, self.views.focals[index]).image
             counted = (slice(None), slice(None)) if mask is None else mask
-            # One pixel in seven is enough for the exposure.
-            pairs.append((image[counted].reshape(-1, 3)[::7], target[counted].reshape(-1, 3)[::7]))
+            chosen = image[counted].reshape(-1, 3)[::EXPOSED], target[counted].reshape(-1, 3)[::EXPOSED]
+            pairs.append(chosen)
         exposures, gain = losses.fit_exposures(pairs)
-        return exposures if gain >= 0.35 or self.config.exposure == "on" else exposures[:0]
+        return exposures if gain >= GAIN or self.config.exposure == "on" else exposures[:0]
 
     def observe_transients(
         self, state: TrainingState, index: int, image: Tensor, target: Tensor, mask: Tensor | None
     ) -> None:
         """Judge the patches of view `index`, of which this step renders `image`.
 
-        Transients that explain less than 24 % of the squared error are given up for the rest of the run.
+        Transients that explain less than `EXPLAINED` are given up for the rest of the run.
         """
         judged = state.step == self.schedule.transients_from and self.config.transients == "auto"
-        if judged and state.transients.explained() < 0.24:
+        if judged and state.transients.explained() < EXPLAINED:
             state.transients = losses.no_transients(0)
-        every = max(self.config.steps // (64 * len(self.views)), 1)  # in passes: long runs look less often
+        every = max(self.config.steps // (LOOKS * len(self.views)), 1)  # in passes
         # Each observation counts as much as all before: a sixteenth of older ones would be left.
         since = self.schedule.transients_from - 4 * every * len(self.views)
         looks = state.step >= since and state.step // len(self.views) % every == 0
@@ -356,7 +385,7 @@ def _first_gaussians(
     found = [(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)), *(one.points() for one in depths)]
     points, colours = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     chosen = np.random.default_rng(config.seed).permutation(len(points))
-    chosen = chosen[: min(20_000, config.max_gaussians // 3)]
+    chosen = chosen[: min(STEREO_POINTS, config.max_gaussians // 3)]
     capture = replace(
         capture,
         points=np.concatenate([capture.points, points[chosen]]),
