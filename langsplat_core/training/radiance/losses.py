@@ -24,15 +24,9 @@ RADIUS, SIGMA = 5, 1.5  # of the window, pixels
 C1, C2 = 0.01**2, 0.03**2  # of SSIM, for a data range of 1
 _TWO = np.float32(2)  # a plain 2 would turn every product into float64 and halve the speed
 _ONE, _ZERO = np.float32(1), np.float32(0)
-
-
-def _window() -> list[float]:
-    """Return the 11 normalised taps of the one-dimensional window."""
-    taps = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
-    return [tap / sum(taps) for tap in taps]
-
-
-_TAPS = np.array(_window(), np.float32)
+_WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)  # its 11 taps along one axis
+_WINDOW /= _WINDOW.sum()
+_TAPS = _WINDOW.astype(np.float32)
 
 
 # The loss and its gradient in three passes over the rows: pass 1 blurs the raw moments along rows; pass 2
@@ -170,11 +164,10 @@ class _Blur(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, images: Tensor) -> Tensor:
-        taps = _window()
         for axis, size in ((-2, images.shape[-2]), (-3, images.shape[-3])):
             padded = torch.nn.functional.pad(images, [0, 0] * (-axis - 1) + [RADIUS, RADIUS])
-            images = padded.narrow(axis, 0, size) * taps[0]
-            for offset, tap in enumerate(taps[1:], start=1):
+            images = padded.narrow(axis, 0, size) * float(_WINDOW[0])
+            for offset, tap in enumerate(_WINDOW[1:].tolist(), start=1):
                 images.add_(padded.narrow(axis, offset, size), alpha=tap)
         return images
 
