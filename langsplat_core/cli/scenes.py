@@ -26,7 +26,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import encoders
 
 log = logging.getLogger("langsplat")
-OPTIONAL = ("torch", "transformers", "pycolmap", "matplotlib", "gsplat")
+OPTIONAL = ("torch", "transformers", "pycolmap", "matplotlib", "gsplat", "open3d", "mcp", "av")
 # Debian's packages
 LIBRARIES = {"EGL": "libegl1", "GL": "libgl1", "X11": "libx11-6", "usb-1.0": "libusb-1.0-0"}
 

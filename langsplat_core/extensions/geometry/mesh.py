@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -112,6 +113,8 @@ def fuse(
     views: least number of views of a surface, >= 1: more leave more holes and fewer errors; cameras: to
     render, by default the scene's own, or generated ones. Raises InputError if nothing is visible.
     """
+    import open3d  # before images are rendered, as it is optional
+
     every = cameras or scene.cameras or scene.spiral_cameras(VIEWS, (SIDE, SIDE * 3 // 4), ELEVATIONS)
     chosen, images, pixels = some_cameras(every, MOST, SIDE), [], []
     for number, each in enumerate(chosen):
@@ -125,11 +128,9 @@ def fuse(
     if resolution is None:
         resolution = max(scene.bounds()[1] / FINEST, 1.5 * pixel)
     if resolution < pixel / OVERSAMPLED:
-        raise InputError(
-            f"voxels of {resolution:g} units are finer than the images, whose pixels are {pixel:.2g} wide; "
-            f"take {pixel / OVERSAMPLED:.2g} or more"
-        )
-    return _cleaned(_fused(images, scene.bounds()[0], resolution, views, progress)), resolution
+        least = f"take {pixel / OVERSAMPLED:.2g} or more"
+        raise InputError(f"voxels of {resolution:g} units are finer than the images can tell; {least}")
+    return _cleaned(_fused(open3d, images, scene.bounds()[0], resolution, views, progress)), resolution
 
 
 def _rendered(scene: Scene, camera: Camera) -> Depth:
@@ -140,12 +141,11 @@ def _rendered(scene: Scene, camera: Camera) -> Depth:
     return camera, depth, np.rint(255 * colours).astype(np.uint8)
 
 
-def _fused(images: list[Depth], centre: Array, resolution: float, views: int, progress: Progress) -> Mesh:
+def _fused(
+    o3d: Any, images: list[Depth], centre: Array, resolution: float, views: int, progress: Progress
+) -> Mesh:
     """Return the mesh from a grid of voxels with its origin at `centre` (3,), which moves with the scene."""
-    import open3d
-
-    o3d, core = open3d, open3d.core
-    kinds = core.float32, core.uint16, core.uint16
+    core, kinds = o3d.core, (o3d.core.float32, o3d.core.uint16, o3d.core.uint16)
     grid = o3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight", "color"), kinds, ((1), (1), (3)), resolution, BLOCK, 10_000
     )
@@ -166,7 +166,7 @@ def _fused(images: list[Depth], centre: Array, resolution: float, views: int, pr
     return replace(mesh, vertices=mesh.vertices + centre)
 
 
-def _taken(mesh: "object") -> Mesh:
+def _taken(mesh: Any) -> Mesh:
     """Return a legacy mesh of Open3D as arrays."""
     vertices, triangles, colours = (
         np.asarray(getattr(mesh, name)) for name in ("vertices", "triangles", "vertex_colors")

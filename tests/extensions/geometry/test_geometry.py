@@ -717,13 +717,13 @@ def test_a_stage_of_another_program_is_placed_by_its_transforms(tmp_path, caplog
             load_scene(tmp_path / "b.usd")
 
 
-def test_without_usd_core_the_remedy_is_said(tmp_path, monkeypatch):
+def test_optional_packages_are_asked_for_before_any_work(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
+    monkeypatch.setitem(sys.modules, "open3d", None)
     monkeypatch.setattr(apart, "run", lambda read, *given, progress, **_: read(*given, progress))
-    (tmp_path / "a.usda").write_text(OTHERS)
-    for ask in (
-        lambda: load_scene(tmp_path / "a.usda"),
-        lambda: save_scene(tmp_path / "b.usdc", blob_scene()),
-    ):
+    (stage := tmp_path / "a.usda").write_text(OTHERS)
+    for ask in (lambda: load_scene(stage), lambda: save_scene(tmp_path / "b.usdc", blob_scene())):
         with pytest.raises(BackendError, match=r"langsplat-viewer\[usd\]"):
             ask()
+    with pytest.raises(ModuleNotFoundError):
+        fuse(box_room(1), progress=lambda *_, **__: pytest.fail("rendered first"))
