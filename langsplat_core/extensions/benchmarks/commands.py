@@ -9,15 +9,8 @@ import tyro
 
 from langsplat_core.cli.arguments import EncoderOption, Needs, OutFile
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks import profiles
 from langsplat_core.extensions.benchmarks.labels import Benchmark, read_3d_ovs, read_gr_lerf, read_lerf_ovs
-from langsplat_core.extensions.benchmarks.profiles import (
-    GR_PROFILES,
-    LERF_PROFILES,
-    OVS_PROFILES,
-    LerfProtocol,
-    OvsProtocol,
-    Profile,
-)
 from langsplat_core.extensions.benchmarks.report import Evaluated, run_benchmark, save_json, table
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -39,7 +32,7 @@ class _Eval:
         """True if a scene is scored, False for maps of another system."""
         return self.maps is None
 
-    def evaluate(self, read: Callable[[Path], Benchmark], profile: Profile) -> None:
+    def evaluate(self, read: Callable[[Path], Benchmark], profile: profiles.Profile) -> None:
         """Score the scene or maps, print the tables and write the JSON file."""
         if self.maps is not None and len(self.paths) != 1:
             raise InputError("give the benchmark's folder alone with --maps")
@@ -62,11 +55,11 @@ class EvalLerfOvs(_Eval):
     that the scene was not trained on are read from the dataset beside the labels.
     """
 
-    protocol: LerfProtocol = "langsplat-code"
+    protocol: profiles.LerfProtocol = "langsplat-code"
     """Constants of the evaluation: filters, cut and choice of level; docs/evaluating.md lists them."""
 
     def run(self) -> None:
-        self.evaluate(read_lerf_ovs, LERF_PROFILES[self.protocol])
+        self.evaluate(read_lerf_ovs, profiles.LERF_PROFILES[self.protocol])
 
 
 @dataclass(frozen=True)
@@ -76,11 +69,11 @@ class EvalGrLerf(_Eval):
     DATA is a folder with SCENE/json/test_json/FRAME.json, or one SCENE; docs/evaluating.md has the layout.
     """
 
-    protocol: LerfProtocol = "ours"
+    protocol: profiles.LerfProtocol = "ours"
     """Constants of the evaluation, as for lerf-ovs; those of LangSplat never give an empty answer."""
 
     def run(self) -> None:
-        self.evaluate(read_gr_lerf, GR_PROFILES[self.protocol])
+        self.evaluate(read_gr_lerf, profiles.GR_PROFILES[self.protocol])
 
 
 @dataclass(frozen=True)
@@ -90,8 +83,8 @@ class EvalOvs3d(_Eval):
     DATA is a folder with segmentations/classes.txt and segmentations/VIEW/CLASS.png, or one of several.
     """
 
-    protocol: OvsProtocol = "langsplat-paper"
+    protocol: profiles.OvsProtocol = "langsplat-paper"
     """Constants of the evaluation: cut and choice of level; docs/evaluating.md lists them."""
 
     def run(self) -> None:
-        self.evaluate(read_3d_ovs, OVS_PROFILES[self.protocol])
+        self.evaluate(read_3d_ovs, profiles.OVS_PROFILES[self.protocol])

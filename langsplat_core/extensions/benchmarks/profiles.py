@@ -34,7 +34,7 @@ LerfProtocol = Literal["langsplat-code", "langsplat-paper", "langsplat-v2", "dir
 OvsProtocol = Literal["langsplat-paper", "direct-3d", "ours"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MapRule:
     """A rule that turns relevancy maps, one per level, into a mask and a peak."""
 
@@ -78,6 +78,14 @@ class Profile:
     max_rows: int = 1080  # higher images are scored at this height, as LangSplat's loader shrinks them
 
 
+_CODE = MapRule(window=30, raw_share=0.5, border="mirror", level="peak", min_max=True, threshold=0.7,
+                vote="clipped", vote_window=7, peak_window=30, ties=True)  # fmt: skip
+_TEXT = MapRule(window=20, raw_share=0.0, border="mirror", level="peak", min_max=True, threshold=0.7,
+                vote="none", vote_window=1, peak_window=20, ties=False)  # fmt: skip
+_CODE_V2 = MapRule(window=29, raw_share=0.5, border="inside", level="peak", min_max=True, threshold=0.7,
+                   vote="inside", vote_window=7, peak_window=29, ties=True)  # fmt: skip
+_TEXT_OVS = MapRule(window=1, raw_share=1.0, border="mirror", level="inside", min_max=False, threshold=0.4,
+                    vote="none", vote_window=1, peak_window=20, ties=False)  # fmt: skip
 _DIRECT = Profile(
     "direct-3d",
     "OpenGaussian's protocol: Gaussians are selected by the phrase, drawn alone, and the image is cut; of "
@@ -95,19 +103,19 @@ LERF_PROFILES: Mapping[str, Profile] = {
             "langsplat-code",
             "LangSplat's public evaluator: (filter 30 + raw) / 2, level by the peak before min-max, min-max "
             "above 0.7, 7x7 majority; place: all highest pixels of the filtered map",
-            MapRule(30, 0.5, "mirror", "peak", True, 0.7, "clipped", 7, 30, True),
+            _CODE,
         ),
         Profile(
             "langsplat-paper",
             "LangSplat's text: filter 20, level and place by the filtered peak; the text gives no cut for "
             "LERF-OVS: min-max above 0.7 as its code, without the vote",
-            MapRule(20, 0.0, "mirror", "peak", True, 0.7, "none", 1, 20, False),
+            _TEXT,
         ),
         Profile(
             "langsplat-v2",
             "LangSplatV2's public evaluator: 29x29 mean of what lies inside the image, the same blend and "
             "cut, 7x7 mean above one half; place as in LangSplat's code",
-            MapRule(29, 0.5, "inside", "peak", True, 0.7, "inside", 7, 29, True),
+            _CODE_V2,
         ),
         _DIRECT,
         _OURS,
@@ -118,7 +126,7 @@ _OVS_PAPER = Profile(
     "langsplat-paper",
     "LangSplat's appendix: absolute 0.4, the level whose mask has the highest mean relevancy, no filter; its "
     "code for 3D-OVS was never released",
-    MapRule(1, 1.0, "mirror", "inside", False, 0.4, "none", 1, 20, False),
+    _TEXT_OVS,
 )
 OVS_PROFILES: Mapping[str, Profile] = {profile.name: profile for profile in (_OVS_PAPER, _DIRECT, _OURS)}
 
@@ -299,8 +307,8 @@ class MapSource:
         return {phrase: self._answer(self.folder / frame, phrase) for phrase in phrases}
 
     def _answer(self, folder: Path, phrase: str) -> Prediction | str:
-        drawn = isinstance(self.rule, SilhouetteRule)
-        files = (folder / f"{phrase.replace('/', '_')}{suffix}" for suffix in (".npy", ".png")[drawn:])
+        suffixes = (".png",) if isinstance(self.rule, SilhouetteRule) else (".npy", ".png")
+        files = (folder / f"{phrase.replace('/', '_')}{suffix}" for suffix in suffixes)
         path = next((path for path in files if path.is_file()), None)
         if path is None:
             return "no map"

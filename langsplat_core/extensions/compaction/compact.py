@@ -41,16 +41,8 @@ from langsplat_core.cli.run import print_json
 from langsplat_core.config import DatasetConfig, Decibels, Range, SeveralCount, Side, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
+from langsplat_core.io import scenes
 from langsplat_core.io.files import shown
-from langsplat_core.io.scenes import (
-    ORIGIN_SUFFIX,
-    check_writable,
-    disk_bytes,
-    load_scene,
-    memory_bytes,
-    report_left_out,
-    save_scene,
-)
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.raster.render import colours_seen, render, view_of
 from langsplat_core.scene import SH_COUNTS, Camera, Scene
@@ -283,19 +275,21 @@ def compact_scene(
         raise InputError(f"{out}: as stored it would lose {losses.mean():.3f} dB; not written, allow more")
 
     def weigh(one: Scene, stored_bytes: int) -> Weight:
-        degree, memory = one.gaussians.sh_degree, memory_bytes(one)
+        degree, memory = one.gaussians.sh_degree, scenes.memory_bytes(one)
         return Weight(len(one.gaussians), degree, stored_bytes, memory, mean_psnr(one, measured))
 
     sizes = {"before": weigh(scene, before_bytes), "after": weigh(after, after_bytes)}
     report = CompactReport.of(losses, config, views, **sizes, ranking_views=len(views.ranking))
-    save_scene(out, replace(candidate, path=out), tell=False)
+    scenes.save_scene(out, replace(candidate, path=out), tell=False)
     return report
 
 
 def scene_for(out: Path, source: Path) -> Scene:
     """Return the scene `source` after checks of `out`, and report what `out` cannot hold; InputError."""
-    row, scene = check_writable(out, source), load_scene(source)
-    report_left_out(out, scene, f"{row.suffix} files", row.loses, f"its companion *{ORIGIN_SUFFIX}")
+    row = scenes.check_writable(out, source)
+    scene = scenes.load_scene(source)
+    companion = f"its companion *{scenes.ORIGIN_SUFFIX}"
+    scenes.report_left_out(out, scene, f"{row.suffix} files", row.loses, companion)
     return scene
 
 
@@ -303,8 +297,8 @@ def _stored(scene: Scene, out: Path) -> tuple[Scene, int]:
     """Return the scene as written to and read from a file in the format of `out`, and its bytes on disk."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / out.name
-        save_scene(path, replace(scene, path=path), tell=False)
-        return place_scene(load_scene(path), origin=scene.origin), disk_bytes(path)
+        scenes.save_scene(path, replace(scene, path=path), tell=False)
+        return place_scene(scenes.load_scene(path), origin=scene.origin), scenes.disk_bytes(path)
 
 
 def _reduced(scene: Scene, rows: Array, sh_degree: int) -> Scene:

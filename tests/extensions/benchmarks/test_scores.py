@@ -151,7 +151,8 @@ def test_eval_scores_the_bundled_scene_on_a_written_set(rooms, tmp_path, capsys,
 # The protocols' rules against plain loops.
 
 CODE_RULE = profiles.LERF_PROFILES["langsplat-code"].rule
-PLAIN_RULE = profiles.MapRule(1, 1.0, "mirror", "peak", True, 0.7, "none", 1, 1, False)
+PLAIN_RULE = profiles.MapRule(window=1, raw_share=1, border="mirror", level="peak", min_max=True, vote="none",
+                              threshold=0.7, vote_window=1, peak_window=1, ties=False)  # fmt: skip
 
 
 def plain_mean(values: np.ndarray, window: int, inside: bool) -> np.ndarray:
