@@ -14,15 +14,7 @@ from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import InputError, shortened
-from langsplat_core.extensions.benchmarks import profiles
-from langsplat_core.extensions.benchmarks.labels import (
-    Benchmark,
-    LabelledScene,
-    Size,
-    check_same_image,
-    without_suffix,
-)
-from langsplat_core.extensions.benchmarks.profiles import Profile
+from langsplat_core.extensions.benchmarks import labels, profiles
 from langsplat_core.io.files import write_json, write_whole
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import AnswerRule
@@ -63,13 +55,16 @@ class QueryScore:
     level: str  # of the map that was cut; "": none was
     unanswered: str  # why there is no answer; "" with one
     trained_on: bool | None  # True for a training view; None: unknown
-    grid: Size  # width and height that were scored
+    grid: labels.Size  # width and height that were scored
     targets: int | None  # number of the phrase's instances in the frame, if that may be 0
     is_empty: bool  # True for an empty mask
 
 
 def score_scene(
-    labelled: LabelledScene, source: profiles.Source, profile: Profile, progress: Progress = silent
+    labelled: labels.LabelledScene,
+    source: profiles.Source,
+    profile: profiles.Profile,
+    progress: Progress = silent,
 ) -> tuple[list[QueryScore], list[str]]:
     """Return the scores of all queries of a scene, and the labels that cannot be scored, with the reason.
 
@@ -86,7 +81,7 @@ def score_scene(
             if isinstance(answer, str):  # counts as an empty answer that is wrong
                 unanswered, answer = answer, profiles.Prediction(np.zeros(frame.size[::-1], bool))
             size = answer.mask.shape[1], answer.mask.shape[0]
-            check_same_image(frame.name, size, frame.size)
+            labels.check_same_image(frame.name, size, frame.size)
             truth = label.truth(size)
             if label.targets != 0 and not truth.any():
                 left_out.append(f"{frame.name}: {label.phrase} (empty mask)")
@@ -110,13 +105,13 @@ def score_scene(
     return scores, left_out
 
 
-def scored_size(size: Size, max_rows: int) -> Size:
+def scored_size(size: labels.Size, max_rows: int) -> labels.Size:
     """Return `size`, shrunk to `max_rows` rows if it has more."""
     width, height = size
     return size if height <= max_rows else (max(1, int(width * max_rows / height)), max_rows)
 
 
-def inside_any_box(peaks: Array, boxes: Array | None, size: Size, grid: Size) -> bool:
+def inside_any_box(peaks: Array, boxes: Array | None, size: labels.Size, grid: labels.Size) -> bool:
     """Return True if a peak (P, 2) on `grid` is in a box (B, 4) of the label's `size`, borders included."""
     if boxes is None:
         return False
@@ -145,7 +140,7 @@ class BenchmarkReport:
     """One system on one benchmark under one protocol."""
 
     benchmark: str
-    profile: Profile
+    profile: profiles.Profile
     subject: str  # the scene or maps that were scored
     queries: tuple[QueryScore, ...]
     left_out: tuple[str, ...]  # labels that cannot be scored, each "frame: phrase (why)"
@@ -264,8 +259,8 @@ class Evaluated:
 
 
 def run_benchmark(
-    benchmark: Benchmark,
-    profile: Profile,
+    benchmark: labels.Benchmark,
+    profile: profiles.Profile,
     subject: Evaluated,
     load_encoder: LoadEncoder,
     progress: Progress = silent,
@@ -303,8 +298,8 @@ def _chosen_scenes(labelled: Sequence[str], subject: Evaluated) -> list[str]:
 
 
 def _scene_source(
-    labelled: LabelledScene,
-    profile: Profile,
+    labelled: labels.LabelledScene,
+    profile: profiles.Profile,
     subject: Evaluated,
     load_encoder: LoadEncoder,
     progress: Progress,
@@ -316,7 +311,7 @@ def _scene_source(
     # Rules for maps need relevancies as published.
     rule: AnswerRule = "peak" if isinstance(profile.rule, profiles.MapRule) else "regions"
     engine = QueryEngine(searchable(path), load_encoder, encoder_id=subject.encoder, rule=rule)
-    own = {without_suffix(camera.name): camera for camera in engine.scene.cameras}
+    own = {labels.without_suffix(camera.name): camera for camera in engine.scene.cameras}
     others = _other_cameras(own, labelled, progress)
     # Without a common name the scene has other names for views, and training views are unknown.
     related = not own.keys().isdisjoint([*others, *(frame.name for frame in labelled.frames)])
@@ -324,7 +319,9 @@ def _scene_source(
     return profiles.SceneSource(engine, {**others, **own}, trained, profile)
 
 
-def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Path) -> profiles.MapSource:
+def _map_source(
+    labelled: labels.LabelledScene, count: int, profile: profiles.Profile, maps: Path
+) -> profiles.MapSource:
     if isinstance(profile.rule, profiles.OwnRule):
         raise InputError("--protocol ours reads a scene's own answer; score maps by another protocol")
     candidates = (maps / labelled.name, maps) if count == 1 else (maps / labelled.name,)
@@ -339,7 +336,7 @@ def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Pat
 
 
 def _other_cameras(
-    own: Mapping[str, Camera], labelled: LabelledScene, progress: Progress
+    own: Mapping[str, Camera], labelled: labels.LabelledScene, progress: Progress
 ) -> Mapping[str, Camera]:
     """Return the dataset's cameras by name, if the scene lacks some; InputError if neither has any."""
     wanted = [frame.name for frame in labelled.frames]

@@ -43,14 +43,7 @@ from langsplat_core.scene import LEVELS, NO_ORIGIN, AutoencoderCodec, Codec, Gau
 from langsplat_core.scene.codec import MOST_CODEWORDS, SHORTEST
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.semantics.encoders import OPEN_MODEL, load_text_encoder
-from langsplat_core.training.language.codec_fit import (
-    CodecReport,
-    Vocabulary,
-    codebook_of,
-    codec_report,
-    everyday_vocabulary,
-    fit_codec,
-)
+from langsplat_core.training.language import codec_fit
 
 TOPK = 4  # codewords of a Gaussian in LangSplatV2
 
@@ -569,7 +562,7 @@ def import_scene(
     phrases: tuple[str, ...] = (),
     config: CodecConfig | None = None,
     progress: Progress = silent,
-) -> tuple[Scene, CodecReport | None]:
+) -> tuple[Scene, codec_fit.CodecReport | None]:
     """Return the scene with its language field, and the errors of its codec on vectors not fitted to.
 
     Without features there is no field, and no errors are measured for the method's own codec. encoder_id: the
@@ -588,7 +581,7 @@ def import_scene(
             f"{foreign.first_path}: vectors of {foreign.dim} numbers, those of the encoder {encoder.id} "
             f"have {encoder.dim}; name the encoder they were made with by --encoder"
         )
-    vocabulary = everyday_vocabulary(encoder, phrases)
+    vocabulary = codec_fit.everyday_vocabulary(encoder, phrases)
     codec, loss = _codec(foreign, config, vocabulary, progress)
     latents, confidence = _latents(foreign, codec, progress)
     field = field_of((latents, confidence), codec, encoder, phrases)
@@ -596,8 +589,8 @@ def import_scene(
 
 
 def _codec(
-    foreign: ForeignScene, config: CodecConfig, vocabulary: Vocabulary, progress: Progress
-) -> tuple[Codec, CodecReport | None]:
+    foreign: ForeignScene, config: CodecConfig, vocabulary: codec_fit.Vocabulary, progress: Progress
+) -> tuple[Codec, codec_fit.CodecReport | None]:
     if foreign.codec is not None:
         return foreign.codec, None
     clusters = foreign.clusters
@@ -606,10 +599,10 @@ def _codec(
         used = np.flatnonzero((counts > 0) & _has_feature(clusters.vectors))
         if len(used) == 0:
             raise InputError("no cluster that Gaussians belong to has a meaning; there is nothing to search")
-        return codebook_of(unit(clusters.vectors[used]), counts[used].astype(np.float64)), None
+        return codec_fit.codebook_of(unit(clusters.vectors[used]), counts[used].astype(np.float64)), None
     fitted, judged = _samples(foreign, config.seed)
-    codec = fit_codec(fitted, config, vocabulary, progress)
-    return codec, codec_report(codec, judged if len(judged) else fitted, vocabulary)
+    codec = codec_fit.fit_codec(fitted, config, vocabulary, progress)
+    return codec, codec_fit.codec_report(codec, judged if len(judged) else fitted, vocabulary)
 
 
 def _samples(foreign: ForeignScene, seed: int) -> tuple[Array, Array]:

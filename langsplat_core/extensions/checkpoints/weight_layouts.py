@@ -26,16 +26,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError
-from langsplat_core.semantics.encoders import (
-    ClipText,
-    Encoder,
-    Family,
-    Images,
-    ImageTower,
-    TorchText,
-    clean_text,
-    torch_clip_images,
-)
+from langsplat_core.semantics import encoders
 from langsplat_core.semantics.sam import SAM3_PIXELS, Sam
 from langsplat_core.semantics.weights import (
     OPEN_CLIP_CONFIG,
@@ -432,7 +423,7 @@ def _count(tensors: Tensors, pattern: str) -> int:
 SHARE_OF_SCALE = 0.1
 
 
-class SiglipText(TorchText):
+class SiglipText(encoders.TorchText):
     """The text tower of a SigLIP in torch."""
 
     padded = True
@@ -452,16 +443,16 @@ class SiglipText(TorchText):
 
     def encode(self, texts: list[str]) -> Array:
         """Return the vectors of texts, cleaned and in lower case as in its training."""
-        lower = (clean_text(text).lower().translate(self._without) for text in texts)
+        lower = (encoders.clean_text(text).lower().translate(self._without) for text in texts)
         return super().encode([" ".join(text.split()) for text in lower])
 
 
-def siglip_images(weights: Weights) -> ImageTower:
+def siglip_images(weights: Weights) -> encoders.ImageTower:
     """Return the image tower of a SigLIP in torch."""
     from transformers import SiglipVisionModel as Model
 
     usual = np.full((2, 3), 0.5)
-    return Images(Model, weights, _siglip_config(weights).vision_config, "pooler_output", usual)
+    return encoders.Images(Model, weights, _siglip_config(weights).vision_config, "pooler_output", usual)
 
 
 def _siglip_config(weights: Weights) -> Any:
@@ -480,10 +471,10 @@ def _logit_scale(weights: Weights) -> float:
     return math.nan
 
 
-SIGLIP = Family(SiglipText, siglip_images)
+SIGLIP = encoders.Family(SiglipText, siglip_images)
 
 
-class MetaClip2Text(ClipText):
+class MetaClip2Text(encoders.ClipText):
     """The text tower of a MetaCLIP 2 (Chuang et al. 2025), a CLIP for 300 languages."""
 
     def __init__(self, weights: Weights) -> None:
@@ -493,10 +484,10 @@ class MetaClip2Text(ClipText):
         self._model.text_model.eos_token_id = self._end[0]  # config.json may have that of a CLIP
 
 
-METACLIP2 = Family(MetaClip2Text, partial(torch_clip_images, name="MetaClip2"))
+METACLIP2 = encoders.Family(MetaClip2Text, partial(encoders.torch_clip_images, name="MetaClip2"))
 
 
-class Tipsv2Text(TorchText):
+class Tipsv2Text(encoders.TorchText):
     """The text tower of a TIPS v2 (Cao et al. 2026) in torch."""
 
     ends = False
@@ -514,7 +505,7 @@ class Tipsv2Text(TorchText):
         return super().encode([text.lower() for text in texts])
 
 
-class Tipsv2Images(Images):
+class Tipsv2Images(encoders.Images):
     """The image tower of a TIPS v2 in torch; its pixels are not normalised."""
 
     def __init__(self, weights: Weights) -> None:
@@ -530,7 +521,7 @@ class Tipsv2Images(Images):
         return self.infer(pixels, "last_hidden_state")[0, self._before :]
 
 
-class Tipsv2Encoder(Encoder):
+class Tipsv2Encoder(encoders.Encoder):
     """Both halves of a TIPS v2: a region's vector is the mean over its pixels of their patches' vectors.
 
     An image is encoded once, its shorter side as long as in training, that of a panorama shorter.
@@ -554,7 +545,7 @@ class Tipsv2Encoder(Encoder):
         return unit(np.asarray(pixels, np.float32).reshape(shape) @ patches)
 
 
-TIPSV2 = Family(Tipsv2Text, Tipsv2Images, Tipsv2Encoder)
+TIPSV2 = encoders.Family(Tipsv2Text, Tipsv2Images, Tipsv2Encoder)
 
 
 def load_sam3(weights: Weights) -> Sam:

@@ -214,40 +214,57 @@ def watertight(points: Array, triangles: Array, near: float) -> tuple[Array, Arr
     """Return a surface of which every edge has two triangles, with opposite directions along it.
 
     points: (V, D) positions, with or without colours after them; near: distance at which points are merged.
-    Triangles without an area, with their own reverse, or repeated are left out, and a fan closes every rim.
-    Then every edge has as many triangles in one direction as in the other, which form pairs. If an edge has
-    several pairs, each pair gets a vertex of its own near the edge's middle, and its triangles become fans.
     """
     cells = np.rint((points[:, :3] - points[:, :3].min(axis=0, initial=0)) / near).astype(np.int64)
     place = _distinct(cells)[1]
-    points, triangles = points[np.unique(place, return_index=True)[1]], place[triangles]
+    points = points[np.unique(place, return_index=True)[1]]
+    used, triangles = np.unique(_once(place[triangles]), return_inverse=True)
+    points, triangles = _closed(points[used], triangles.reshape(-1, 3))
+    # Triangles without an area get one: their last point is moved.
+    a, b, c = points[triangles.T, :3]
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    sides = np.linalg.norm([b - a, c - a], axis=2)
+    flat = triangles[areas < 1e-2 * near * sides.sum(0), 2]
+    points[flat, :3] += near * np.random.default_rng(0).normal(size=(len(flat), 3))
+    return _unpinched(points, triangles)
+
+
+def _once(triangles: Array) -> Array:
+    """Return triangles without those that have no area or their own reverse, and without repetitions."""
     turns = np.sign(triangles - np.roll(triangles, 1, axis=1)).prod(axis=1)  # 0: without an area
     faces, which = _distinct(np.sort(triangles, axis=1))
     net = np.bincount(which, -turns)
-    kept = np.where(net[:, None] > 0, faces, faces[:, ::-1])[net != 0]
-    used, triangles = np.unique(kept, return_inverse=True)
-    points, triangles = points[used], triangles.reshape(-1, 3)
-    rims, loops = _rims(triangles)
-    triangles = np.concatenate([triangles, np.column_stack([rims[:, ::-1], len(points) + loops])])
-    middle = [points[rims[loops == loop, 0]].mean(0) for loop in range(loops.max(initial=-1) + 1)]
-    points = np.concatenate([points, np.reshape(middle, (-1, points.shape[1]))])
-    a, b, c = points[triangles.T, :3]
-    areas, sides = np.linalg.norm(np.cross(b - a, c - a), axis=1), np.linalg.norm([b - a, c - a], axis=2)
-    flat = triangles[areas < 1e-2 * near * sides.sum(0), 2]
-    points[flat, :3] += near * np.random.default_rng(0).normal(size=(len(flat), 3))
+    return np.where(net[:, None] > 0, faces, faces[:, ::-1])[net != 0]
 
+
+def _closed(points: Array, triangles: Array) -> tuple[Array, Array]:
+    """Close every rim by a fan: every edge then has as many triangles in one direction as in the other."""
+    rims, loops = _rims(triangles)
+    middles = [points[rims[loops == loop, 0]].mean(0) for loop in range(loops.max(initial=-1) + 1)]
+    fans = np.column_stack([rims[:, ::-1], len(points) + loops])
+    points = np.concatenate([points, np.reshape(middles, (-1, points.shape[1]))])
+    return points, np.concatenate([triangles, fans])
+
+
+def _unpinched(points: Array, triangles: Array) -> tuple[Array, Array]:
+    """Part the pairs of triangles, of opposite directions, at edges that have several.
+
+    Each pair gets a vertex of its own near the edge's middle, and its triangles become fans.
+    """
     start, end, third = (np.roll(triangles, -step, axis=1).reshape(-1) for step in range(3))
     edge = _distinct(np.sort(np.column_stack([start, end]), axis=1))[1]
     many = np.flatnonzero(np.bincount(edge)[edge] > 2)
     many = many[np.argsort(edge[many], kind="stable")]
     pairs = np.column_stack([many[start[many] > end[many]], many[start[many] < end[many]]])
-    added = 0.475 * points[start[pairs]].sum(1) + 0.05 * points[third[pairs]].mean(1)
-    on, cut = np.full(triangles.size, -1), np.zeros(len(triangles), bool)
-    on[pairs], cut[pairs // 3] = (len(points) + np.arange(len(pairs)))[:, None], True
-    centres = len(points) + len(pairs) + np.cumsum(cut) - 1
-    points = np.concatenate([points, added, points[triangles[cut]].mean(1)])
-    fans = np.column_stack([start, np.where(on < 0, end, on), np.repeat(centres, 3)])[np.repeat(cut, 3)]
-    halves = np.column_stack([on, end, np.repeat(centres, 3)])[on >= 0]
+    middles = 0.475 * points[start[pairs]].sum(1) + 0.05 * points[third[pairs]].mean(1)
+    on = np.full(triangles.size, -1)  # the vertex on each side of a triangle
+    on[pairs] = (len(points) + np.arange(len(pairs)))[:, None]
+    cut = np.zeros(len(triangles), bool)
+    cut[pairs // 3] = True
+    centres = np.repeat(len(points) + len(pairs) + np.cumsum(cut) - 1, 3)
+    fans = np.column_stack([start, np.where(on < 0, end, on), centres])[np.repeat(cut, 3)]
+    halves = np.column_stack([on, end, centres])[on >= 0]
+    points = np.concatenate([points, middles, points[triangles[cut]].mean(1)])
     return points, np.concatenate([triangles[~cut], fans, halves])
 
 

@@ -19,16 +19,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from langsplat_core import errors
 from langsplat_core.arrays import Array, logit
-from langsplat_core.errors import (
-    LangSplatError,
-    malformed,
-    optional_imports,
-    printable_line,
-    quoted,
-    report_losses,
-    unread,
-)
 from langsplat_core.io import apart, hostile
 from langsplat_core.io.files import TEMPORARY, atomic_path
 from langsplat_core.io.gltf import COEFFICIENTS, OWN, Kept, attributes_of, node_of, placed_scene
@@ -55,7 +47,7 @@ MEMORY, SECONDS = 3 << 30, 60  # for reading, plus 100 bytes and a microsecond p
 ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
-@optional_imports()
+@errors.optional_imports()
 def write_usd(path: Path, scene: Scene) -> None:
     """Write a stage, atomically; rows keep their order, and numbers are as in a .glb.
 
@@ -103,7 +95,7 @@ def write_usd(path: Path, scene: Scene) -> None:
         try:
             for thing in scene_outline(Describer(QueryEngine(scene, load_text_encoder))):
                 _add(stage, "/Scene/Things", np.zeros(3), thing, points)
-        except LangSplatError as error:
+        except errors.LangSplatError as error:
             log.warning("%s: things are numbers without labels: %s", path.name, error)
     with atomic_path(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
@@ -141,18 +133,18 @@ def read_usd(path: Path) -> Scene:
     file.close()
     try:
         found = apart.run(_read, path, size, progress=silent, environment=ALONE)
-    except LangSplatError:
+    except errors.LangSplatError:
         raise
     except Exception as error:  # noqa: BLE001  usd-core may raise anything, or its process end
-        said = printable_line(str(error).rpartition(" : ")[2], 120)
-        raise malformed(path, f"usd-core cannot read it ({said})") from None
+        said = errors.printable_line(str(error).rpartition(" : ")[2], 120)
+        raise errors.malformed(path, f"usd-core cannot read it ({said})") from None
     parts, kept, metres, told = found
-    report_losses(path, told)
+    errors.report_losses(path, told)
     scene = placed_scene(path, parts)
     return replace(scene, metres_per_unit=metres) if kept is None else kept.given(scene)
 
 
-@optional_imports()
+@errors.optional_imports()
 def _read(
     path: Path, size: int, progress: Progress
 ) -> tuple[list[Any], Kept | None, float | None, list[str]]:
@@ -177,7 +169,7 @@ def _read(
         names.update([prim.typeName, *prim.attributes.keys(), *prim.variantSets.keys()])
         prims += [prim] if prim.typeName == TYPE else []
     if not prims:
-        raise malformed(path, f"holds no {TYPE}", "meshes are not read, nor files that it refers to")
+        raise errors.malformed(path, f"holds no {TYPE}", "meshes are not read, nor files that it refers to")
     room = hostile.Allowance(path, size, hostile.SMALL_RATIO)
     parts = [(_place(layer, prim), _gaussians(layer, prim, path, room, told)) for prim in prims]
     kept = None
@@ -192,9 +184,9 @@ def _read(
         names -= OURS
     top = layer.pseudoRoot
     metres = float(top.GetInfo("metersPerUnit")) if top.HasInfo("metersPerUnit") else 0
-    others = sorted(quoted(name) for name in names - KNOWN if not name.startswith("xformOp"))
-    outside = map(quoted, layer.GetCompositionAssetDependencies())
-    told += [unread("", others), unread("what it refers to,", outside)]
+    others = sorted(errors.quoted(name) for name in names - KNOWN if not name.startswith("xformOp"))
+    outside = map(errors.quoted, layer.GetCompositionAssetDependencies())
+    told += [errors.unread("", others), errors.unread("what it refers to,", outside)]
     return parts, kept, metres if 0 < metres < 1e12 else None, told
 
 
@@ -208,14 +200,14 @@ def _gaussians(layer: Any, prim: Any, path: Path, room: hostile.Allowance, told:
             values = layer.QueryTimeSample(held.path, times[0])
             told.append(f"the first of {len(times)} moments of {name} is taken")
         if values is None:
-            raise malformed(path, f"{prim.path} has no {name}")
+            raise errors.malformed(path, f"{prim.path} has no {name}")
         room.take(4 * width * len(values))
         columns.append(np.asarray(values, np.float32).reshape(-1, width))
     positions, scales, orientations, opacities, harmonics = columns
     degree = prim.attributes[DEGREE].default if DEGREE in prim.attributes else 3
     rows, count = [len(column) for column in columns], len(positions)
     if rows != [*[count] * 4, count * SH_COUNTS.get(degree, -1)]:
-        raise malformed(
+        raise errors.malformed(
             path, f"{prim.path}: arrays of {', '.join(map(str, rows))} rows do not fit degree {degree}"
         )
     logits = logit(opacities[:, 0].astype(np.float64))

@@ -20,8 +20,9 @@ from langsplat_core.query.describe import Describer, likely_name
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.inventory import NAMES
+from langsplat_core.raster import LiftingView
 from langsplat_core.raster.render import splat_colours, view_of
-from langsplat_core.scene import LEVELS, Scene
+from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.surface import surface_areas
 from langsplat_core.scene.transform import between_worlds, scaling, similarity
 from langsplat_core.semantics.encoders import same_vectors
@@ -140,46 +141,59 @@ def _in_one_world(first: Scene, second: Scene) -> Array:
 _CHANNELS = 10
 
 
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A scene from one camera."""
+
+    view: LiftingView
+    depth: Array  # (H, W) of the surface, units of the first scene; inf where it is empty, 0: unknown
+    look: Array  # (H, W, 3) L*a*b*
+
+
 def _evidence(first: Scene, second: Scene, into: Array, progress: Progress) -> tuple[Array, Array]:
     """Return (N, `_CHANNELS`) float64 of the Gaussians of both scenes."""
     there = similarity(into)
     back = there.inverse()
     own, others = (some_cameras(scene.cameras, VIEWS, SIDE) for scene in (first, second))
-    others = [there.camera(camera) for camera in others]
-    if not own + others:
+    cameras = own + [there.camera(camera) for camera in others]
+    if not cameras:
         raise InputError("neither scene has cameras to look from; keep .cameras.json beside one of them")
     sums = np.zeros((len(first.gaussians), _CHANNELS)), np.zeros((len(second.gaussians), _CHANNELS))
-    for done, camera in enumerate(own + others):
-        progress("comparing the scenes", done / len(own + others))
-        pair = ((first, camera), (second, back.camera(camera)))
-        views = [view_of(scene, at) for scene, at in pair]
-        drawn = [splat_colours(view, scene.gaussians) for view, (scene, _) in zip(views, pair, strict=True)]
-        looks = [to_lab(np.clip(image.colours, 0, 1)) for image in drawn]
-        near, far = views[0].median_depth(), there.scale * views[1].median_depth()
-        # Empty pixels in a scene's own camera are empty; in the other scene's cameras they are unknown.
-        if done < len(own):
-            near = np.where(drawn[0].alpha < EMPTY, np.inf, near)
-        else:
-            far = np.where(drawn[1].alpha < EMPTY, np.inf, far)
-        both, limit = (near > 0) & (far > 0), FARTHER * np.minimum(near, far)
-        kept = both & (np.abs(near - far) <= limit)
+    for done, camera in enumerate(cameras):
+        progress("comparing the scenes", done / len(cameras))
+        one = _seen(first, camera, 1.0, done < len(own))
+        two = _seen(second, back.camera(camera), there.scale, done >= len(own))
+        near = np.minimum(one.depth, two.depth)
+        kept = (near > 0) & (np.abs(one.depth - two.depth) <= FARTHER * near)
         if kept.any():  # removes a difference in exposure
-            looks[1] = looks[1] - np.median((looks[1] - looks[0])[kept], axis=0)
-        apart = np.linalg.norm(looks[1] - looks[0], axis=-1)
-        for depth, other, view, total, look, away in (
-            (near, far, views[0], sums[0], looks[0], looks[1]),
-            (far, near, views[1], sums[1], looks[1], looks[0]),
-        ):
-            behind = other - depth
-            gone = both & ((behind > limit) & (apart > TINT) | (behind > PLAINLY * limit))
-            stays = both & ~gone & (behind > -limit)
-            marks = np.stack([gone, stays, stays & (apart > OTHER)], -1).astype(np.float32)
-            colours = np.concatenate([look * (gone | stays)[..., None], away * stays[..., None]], -1)
-            lifted = view.gather(np.concatenate([marks, colours], -1).astype(np.float32))
-            total[:, :3] += lifted[:, :3]
-            total[:, 3] += lifted[:, :2].sum(1) > 0
-            total[:, 4:] += lifted[:, 3:]
+            two = replace(two, look=two.look - np.median((two.look - one.look)[kept], axis=0))
+        sums[0][:] += _changed_pixels(one, two)
+        sums[1][:] += _changed_pixels(two, one)
     return sums
+
+
+def _seen(scene: Scene, camera: Camera, scale: float, is_own: bool) -> _Seen:
+    """Return the scene from a camera; empty pixels are empty in its own cameras, in others unknown."""
+    view = view_of(scene, camera)
+    drawn = splat_colours(view, scene.gaussians)
+    depth = scale * view.median_depth()
+    if is_own:
+        depth = np.where(drawn.alpha < EMPTY, np.inf, depth)
+    return _Seen(view, depth, to_lab(np.clip(drawn.colours, 0, 1)))
+
+
+def _changed_pixels(seen: _Seen, other: _Seen) -> Array:
+    """Return (N, `_CHANNELS`) of the Gaussians of a scene in one image, by how the other one looks there."""
+    near = np.minimum(seen.depth, other.depth)
+    limit, behind = FARTHER * near, other.depth - seen.depth
+    apart = np.linalg.norm(other.look - seen.look, axis=-1)
+    gone = (near > 0) & ((behind > limit) & (apart > TINT) | (behind > PLAINLY * limit))
+    stays = (near > 0) & ~gone & (behind > -limit)
+    marks = np.stack([gone, stays, stays & (apart > OTHER)], -1)
+    colours = np.concatenate([seen.look * (gone | stays)[..., None], other.look * stays[..., None]], -1)
+    lifted = seen.view.gather(np.concatenate([marks, colours], -1).astype(np.float32))
+    shown = lifted[:, :2].sum(1, keepdims=True) > 0
+    return np.concatenate([lifted[:, :3], shown, lifted[:, 3:]], 1)
 
 
 def to_lab(colours: Array) -> Array:
