@@ -107,11 +107,11 @@ def settle(viewer: Viewer) -> None:
         viewer.take_results()
         viewpoint.tick(viewer, 0.0)
 
-    _repeat(frame, lambda: viewer.worker.current is not None)
+    repeat(frame, lambda: viewer.worker.current is not None)
     frame()
 
 
-def _repeat(step: Callable[[], object], goes_on: Callable[[], object]) -> None:
+def repeat(step: Callable[[], object], goes_on: Callable[[], object]) -> None:
     """Steps, one after another, as long as something goes on."""
     end = time.monotonic() + 120
     while goes_on():
@@ -147,7 +147,7 @@ def ask(viewer: Viewer, *phrases: str) -> None:
 
 def recorded(viewer: Viewer) -> None:
     """Until the recorder has nothing left to do."""
-    _repeat(viewer.take_results, lambda: viewer.recorder.current is not None)
+    repeat(viewer.take_results, lambda: viewer.recorder.current is not None)
     viewer.take_results()
 
 
@@ -194,7 +194,7 @@ def on_screen(canvas: Canvas) -> list[np.ndarray]:
 
 def rest(canvas: Canvas, state: ViewerState, now: float) -> None:
     """Update until the fine picture is there, whoever rasterizes it."""
-    _repeat(lambda: None, lambda: canvas.update(state, now) and canvas.waits)
+    repeat(lambda: None, lambda: canvas.update(state, now) and canvas.waits)
 
 
 # The scene of three blobs: what is selected, hidden and deleted in it, and a flight around it.

@@ -417,6 +417,8 @@ def read_a_narrow_panel(s: Any) -> None:
     header, below = (s.ctx.item_info(f"//**/{name}").rect_full for name in ("Selection", "No tool"))
     assert header.max.y <= below.min.y
     settings.prefer(s.viewer, ui_scale=2.0)
+    s.ctx.mouse_move("//**/Only what is visible")
+    assert imgui.internal.find_window_by_name("##Tooltip_00").content_size.x < 400
     s.key("f1", frames=6)
     text = imgui.internal.find_window_by_name("Help").content_size
     assert text.x < 400

@@ -30,7 +30,7 @@ from langsplat_viewer.canvas import (
 from langsplat_viewer.rendering.renderer import ArrayRenderer, renderer_for
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
-from tests.support.windowless import CHANGES, FakeRenderer, go, on_screen, put_marks, put_scene, rest
+from tests.support.windowless import CHANGES, FakeRenderer, go, on_screen, put_marks, put_scene, repeat, rest
 
 
 @pytest.fixture
@@ -235,10 +235,7 @@ def slow_clock() -> Callable[[], float]:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.002)
+    repeat(lambda: None, lambda: not condition())
 
 
 @pytest.fixture

@@ -342,8 +342,7 @@ def test_export_size_is_said_before_it_is_written(viewer, tmp_path, suffix):
 
 
 def test_folder_to_export_to_has_a_free_name(opened):
-    opened.state.export_form = form_of(opened, "map for a robot")
-    saving.choose_export(opened)
+    saving.choose_export(opened, form_of(opened, "map for a robot"))
     assert (opened.state.choice.kind, opened.state.choice.start.name) == ("save", "blobs-map-001")
     said = saving.export_size(opened, form_of(opened, "scene", suffix=".splat"))
     assert said == "About 0.012 MB"  # and not 0.0

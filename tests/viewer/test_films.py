@@ -36,6 +36,7 @@ from langsplat_viewer.camera.flight import (
 from langsplat_viewer.output import cameras_of, make_film, write_film
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight, write_flight
 from langsplat_viewer.rendering.request import RenderRequest, plain_request
+from langsplat_viewer.state import FrameStats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
 from tests.support.windowless import errors, flight, open_scene, picture, recorded, render_image
@@ -345,6 +346,13 @@ def test_a_path_is_saved_loaded_and_dropped(opened, tmp_path, frames):
     open_scene(opened, "plain.ply")  # has no path of this one
     assert times(opened) == []
     assert opened.state.record.size == (640, 1)
+
+
+def test_keyframes_have_thumbnails_where_full_images_are_quick(opened):
+    record_three(opened)
+    for scale, milliseconds, count in ((0.25, 100.0, 0), (1.0, 300.0, 0), (1.0, 100.0, 1)):
+        opened.state.stats = FrameStats(milliseconds, scale=scale)
+        assert len(viewpoint.thumbnails(opened)) == count
 
 
 def test_impossible_recordings_are_refused_in_a_line(viewer, opened, tmp_path, frames):

@@ -3,7 +3,6 @@
 import json
 import signal
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.viewer import PREVIEW_EVERY, ProcessProgress, training_words
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
-from tests.support.windowless import SCENES, act, errors, open_scene, settle
+from tests.support.windowless import SCENES, act, errors, open_scene, repeat, settle
 
 SAYS = """
 import json, sys
@@ -62,11 +61,7 @@ def begin(viewer, folder, monkeypatch) -> Callable[..., None]:
 
 
 def finish(viewer) -> None:
-    end = time.monotonic() + 60
-    while viewer.training is not None and time.monotonic() < end:
-        opening.watch_training(viewer)
-        time.sleep(0.02)
-    assert viewer.training is None
+    repeat(lambda: opening.watch_training(viewer), lambda: viewer.training is not None)
     settle(viewer)
 
 

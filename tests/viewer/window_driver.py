@@ -454,12 +454,14 @@ def close_while_opening(s: Session) -> None:
 
 def end_by_signals(s: Session) -> None:
     """What is not saved is asked about, and a film is waited for."""
-    s.viewer.recorder.submit("a film", slow_film, print, print)
+    drawn = Event()
+    s.viewer.recorder.submit("a film", lambda progress: drawn.wait(PATIENCE), print, print)
     saving.quit_viewer(s.viewer)
     s.until(lambda: s.state.leaving is not None)
     s.click("//**/Stay", frames=2)
     assert not s.state.may_close
     s.viewer.recorder.cancel()
+    drawn.set()
     s.search("mug")
     s.menu("Select", "Select what the search found")
     s.key("delete")
@@ -481,12 +483,6 @@ def open_many_scenes(s: Session) -> None:
     kinds = (Scene, QueryEngine, QueryResult)
     alive = [sum(type(thing) is kind for thing in gc.get_objects()) for kind in kinds]
     assert (np.array(alive) <= (8, 1, 20)).all(), alive
-
-
-def slow_film(progress) -> None:
-    for step in range(2000):
-        progress("a film", step / 2000)
-        time.sleep(0.05)
 
 
 def look_at_nothing(s: Session) -> None:

@@ -309,11 +309,9 @@ def export_size(viewer: Viewer, seen: OpenScene, form: ExportForm) -> str:
 
 
 @needs_scene()
-def choose_export(viewer: Viewer, seen: OpenScene) -> None:
-    """Have a dialog ask for the file or folder, and write it."""
-    form, viewer.state.export_form = viewer.state.export_form, None
-    if form is None:
-        return
+def choose_export(viewer: Viewer, seen: OpenScene, form: ExportForm) -> None:
+    """Close the dialog of exports, have one ask for the file or folder, and write it."""
+    viewer.state.export_form = None
     then = partial(run_export, form=form)
     new = _new_file(seen.path, folder_of(viewer), form.suffix, f"-{form.title.split()[0]}")
     ask_for(viewer, FileChoice(f"Export: {form.title}", then, "save", (form.suffix,), new))

@@ -262,7 +262,7 @@ def _show(viewer: Viewer, seconds: float) -> None:
 
 THUMBNAIL, MOST_THUMBNAILS = (144, 90), 64  # pixels
 TURN_SECONDS = 8.0  # duration of a turn, until another is set
-SLOW = 250.0  # milliseconds per image of the window above which there are no thumbnails
+SLOW = 250.0  # milliseconds of a full image of the window above which there are no thumbnails
 
 
 @needs_scene("record a path in it")
@@ -301,7 +301,8 @@ def thumbnails(viewer: Viewer) -> Mapping[Keyframe, Array]:
     state, keys = viewer.state, viewer.state.session.keyframes[:MOST_THUMBNAILS]
     made = {key: image for key, image in state.record.thumbnails.items() if key in keys}
     missing = next((key for key in keys if key not in made), None)
-    if missing and viewer.surface and state.open and state.stats.milliseconds < SLOW:
+    is_quick = state.stats.scale == 1 and state.stats.milliseconds < SLOW
+    if missing and viewer.surface and state.open and is_quick:
         camera = flight.view_of(missing.pose, state.open.extent).camera(*THUMBNAIL)
         request = replace(state.request(THUMBNAIL), camera=camera, split=Split(), answers=())
         picture = replace(request.picture, display="rgb")

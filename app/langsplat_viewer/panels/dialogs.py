@@ -327,7 +327,7 @@ def _export(viewer: Viewer, form: ExportForm) -> None:
     settings.put(viewer.state, export_form=form)
     imgui.text_unformatted(f"{saving.export_size(viewer, form)} on disk")
     if ui.button("Export ...", enabled=bool(saving.exported(viewer, form).any())):
-        saving.choose_export(viewer)
+        saving.choose_export(viewer, form)
 
 
 # A file that has changed.

@@ -172,9 +172,9 @@ def draw_palette(viewer: Viewer, panels: Sequence[Command]) -> None:
     top = imgui.get_main_viewport().get_center()
     imgui.set_next_window_pos(ImVec2(top.x, 0.15 * top.y), imgui.Cond_.always, ImVec2(0.5, 0))
     imgui.set_next_window_size(ui.fitting(WIDTH_EM, HEIGHT_EM))
-    imgui.set_next_window_bg_alpha(1.0)
     flags = imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_collapse
-    imgui.begin("Commands", None, flags)
+    with theme.styled(window_border_size=1.0):
+        imgui.begin("Commands", None, flags)
     if imgui.is_window_appearing():
         viewer.state.drafts.pop("##command", None)
         imgui.set_keyboard_focus_here()
@@ -234,8 +234,8 @@ def draw_help(viewer: Viewer) -> None:
     centre, room = imgui.get_main_viewport().get_work_center(), imgui.get_main_viewport().work_size
     imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, ui.MOST_OVER * room.y))
     imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
-    imgui.set_next_window_bg_alpha(1.0)
-    _, still_open = imgui.begin("Help", True, flags)
+    with theme.styled(window_border_size=1.0):
+        _, still_open = imgui.begin("Help", True, flags)
     settings.put(viewer.state, show_help=bool(still_open))
     pages = imgui.is_key_pressed(imgui.Key.page_down) - imgui.is_key_pressed(imgui.Key.page_up)
     imgui.set_scroll_y(imgui.get_scroll_y() + pages * imgui.get_window_height() / 2)

@@ -121,8 +121,8 @@ def draw_evidence(viewer: Viewer, picture: ui.Picture) -> None:
     texture = picture.texture(image)
     imgui.set_next_window_pos(ImVec2(area.left, area.top), imgui.Cond_.appearing)
     imgui.set_next_window_size(ui.fitting(*EVIDENCE_EM), imgui.Cond_.appearing)
-    imgui.set_next_window_bg_alpha(1.0)
-    _, still_open = imgui.begin(f"Evidence: {phrase}###evidence", True)
+    with theme.styled(window_border_size=1.0):
+        _, still_open = imgui.begin(f"Evidence: {phrase}###evidence", True)
     width = imgui.get_content_region_avail().x
     imgui.image(imgui.ImTextureRef(texture.glo), ImVec2(width, width * texture.height / texture.width))
     imgui.end()

@@ -80,7 +80,7 @@ def draw_display(viewer: Viewer) -> None:
         settings.move_line(viewer, ui.slider("Line", split.at, AT_RANGE))
     needs_query = DISPLAYS[picture.display].needs_query
     if needs_query and not viewer.state.shown():
-        ui.small_wrapped("search for something to see where it is")
+        ui.small_wrapped("no answer is shown: search for something that is here")
     if any(pane.row.drawing is Drawing.HEAT for pane in viewer.state.panes()):
         ui.row("Heat")
         heats = {of: of.capitalize() for of in HEAT_TIPS}

@@ -106,7 +106,8 @@ def small_wrapped(text: str, colour: str = "soft") -> None:
 def tip(text: str) -> None:
     """Show a tooltip while the mouse is over the last item."""
     if text and imgui.is_item_hovered():
-        imgui.set_tooltip(fill(text, 72, break_on_hyphens=False))
+        letters = int(imgui.get_main_viewport().size.x / width_of("n")) - 2  # that the window holds
+        imgui.set_tooltip(fill(text, max(min(letters, 72), 8), break_on_hyphens=False))
 
 
 def stoppable(label: str, fraction: float, ems: float, tag: str = "") -> bool:
