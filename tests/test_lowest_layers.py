@@ -1,5 +1,4 @@
-"""What every layer shares: numbers, lines of messages, progress, compiled kernels, extensions, settings; and
-how the options of `langsplat train` come together."""
+"""What every layer shares: numbers, messages, progress, kernels, extensions, settings, options of `train`."""
 
 import dataclasses
 import math

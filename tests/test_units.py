@@ -2,8 +2,7 @@
 
 A law is a function from a scene to what comes of it: `Same` is equal, `Image`s look alike, `Rows` are
 nearly the same Gaussians, `Length`s are times the scale, `Places` move along, a `Surface` lies on itself.
-What lies along the axes of its world, such as voxels and boxes, is not turned with it: there a law asks for
-less of a turned scene, and says how much.
+What lies along the axes of its world, such as voxels, is not turned: there a law asks for less, and says so.
 """
 
 import json

@@ -43,8 +43,9 @@ def parse(args: list[str]) -> Runnable:
     """Return the command that the words name; SystemExit as of tyro, InputError for none and `--config`."""
     before = list(takewhile(FLAGS.__contains__, args))
     args = args[len(before) :]
-    args = [*args[1:], "--help"] if args[:1] == ["help"] else args
-    if args[:1] in ([], ["-h"], ["--help"]):
+    if args[:1] in ([], ["help"], ["-h"], ["--help"]):  # git's `--help COMMAND`, too
+        args = [*args[1:], "--help"]
+    if args[0] == "--help":
         print(ABOUT, *_overview(), sep="\n")
         raise SystemExit(0)
     check_commands(args)

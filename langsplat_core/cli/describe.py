@@ -52,7 +52,7 @@ class Describe:
                 raise InputError("--labels writes files of the whole scene; leave out what else is asked for")
             if self.labels.suffix.lower() != ".ply":
                 raise InputError(f"{self.labels}: labels are properties of a .ply; choose such a name")
-            check_writable(self.labels)
+            check_writable(self.labels, self.scene)
         phrases = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
         scene = searchable(self.scene)
         with TerminalProgress() as progress:

@@ -18,11 +18,12 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, is_dataclass, make_dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
+from tyro import constructors
 
 from langsplat_core import __version__, registry
 from langsplat_core.cli.arguments import PLACED, Runnable, check_arguments
@@ -36,7 +37,8 @@ HOME = re.compile(r"^(--[\w.-]+=|)~(?=/)")  # in quotes, after = or in a file, w
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 _CONTINUES = "; the same command goes on from what was finished"
 _CONFIG = (tyro.conf.CascadeSubcommandArgs, tyro.conf.DisallowNone)
-ROLES, _ASKED = ConstructorRegistry(), object()  # the rule for help; the mark of what tyro itself is asked
+ROLES = constructors.ConstructorRegistry()  # the rules for help and for names of files
+_ASKED = object()  # the mark of what tyro itself is asked
 _ROOM = "make room, or choose another place; what was finished is kept"
 
 
@@ -73,7 +75,7 @@ def one_line(box: str) -> str:
             said.append(line)
         elif said:
             break
-    words = " ".join(" ".join(said).split()) or title.strip(" ╭╮─").lower()
+    words = " ".join(" ".join(said).split()).replace(" (required)", "") or title.strip(" ╭╮─").lower()
     hint = r"\1 is missing; is there an unknown option, or a file '-NAME' in place of './-NAME'?"
     words = re.sub(r"Missing value for argument 'command\.(\w+)'.*", hint, words)
     optional = r"Error parsing (\S+): no type matching (.*?) could be instantiated from (\[.*?\])\. Got.*"
@@ -88,7 +90,7 @@ def one_line(box: str) -> str:
 
 
 @ROLES.struct_rule
-def _with_roles(info: StructTypeInfo) -> StructConstructorSpec | None:
+def _with_roles(info: constructors.StructTypeInfo) -> constructors.StructConstructorSpec | None:
     """Return the arguments that a dataclass has by tyro's own rule, each field as its role."""
     if _ASKED in info.markers or not is_dataclass(info.type):
         return None  # tyro's rules are next
@@ -96,7 +98,7 @@ def _with_roles(info: StructTypeInfo) -> StructConstructorSpec | None:
     return replace(made, fields=tuple(map(_as_role, made.fields)))
 
 
-def _as_role(field: Any) -> StructFieldSpec:
+def _as_role(field: Any) -> constructors.StructFieldSpec:
     """Return a field whose help names a role, not a type, nor an empty default, and has no line breaks."""
     said = list(annotations(field.type))
     placed, several = PLACED in said, " ..." if Ellipsis in said else ""
@@ -109,6 +111,19 @@ def _as_role(field: Any) -> StructFieldSpec:
         marks.append(tyro.conf.arg(metavar="OUT", aliases=None if placed else ["-o"]))
     typed: Any = Annotated[(field.type, *marks)]
     return replace(field, type=typed, helptext=lambda: " ".join((field.helptext() or "").split()))
+
+
+@ROLES.primitive_rule
+def _as_path(info: constructors.PrimitiveTypeInfo) -> constructors.PrimitiveConstructorSpec[Path] | None:
+    """Return how a path is read: an empty word is refused, which `Path` takes for the folder one is in."""
+    how = 1, "PATH", _path, lambda value: isinstance(value, Path), lambda value: [str(value)]
+    return constructors.PrimitiveConstructorSpec(*how) if info.type is Path else None
+
+
+def _path(words: list[str]) -> Path:
+    if not words[0]:
+        raise ValueError("an empty name; is a variable of the shell not set?")
+    return Path(words[0])
 
 
 def parsed(program: str, kind: Any, args: Sequence[str], description: str | None = None) -> Any:

@@ -175,8 +175,7 @@ def centred(capture: Capture) -> Capture:
 def shrunk_view(camera: Camera, image: Array, mask: Array | None, size: tuple[int, int]) -> View:
     """Return a view at a smaller (width, height), shrunk as photographs are when they are read.
 
-    Area averages differ from that by a PSNR of 31 to 42 dB, which would change the scores of good renders. A
-    pixel counts if all pixels that it is made of count.
+    Area averages differ by 31 to 42 dB PSNR, which would change scores. A pixel counts if its own do.
     """
     shrunk = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS))
     if mask is not None:

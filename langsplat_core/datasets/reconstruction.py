@@ -190,9 +190,8 @@ _FEW_SHARED = _CLOSE_PAIRS | {
 def map_cameras(folder: Path, count: int, progress: Progress, firmly: bool = False) -> bool:
     """Locate the `count` photographs of a workspace that was matched; return whether there is a model.
 
-    `MAPPERS` are tried until one locates `ENOUGH`; the best model (see `best_model`) becomes ``sparse``.
-    Where no two could be located there is none. firmly: the first mapper alone is tried, and there is no
-    model unless `FIRM_POINTS` hold each of the photographs.
+    `MAPPERS` are tried until one locates `ENOUGH`; the best model, if two are located, becomes ``sparse``.
+    firmly: by the first mapper alone, where `FIRM_POINTS` or more hold each of the photographs.
     """
     best: Model | None = None
     astray: Model | None = None
@@ -272,8 +271,7 @@ def _incremental(
     """Place one photograph after the other, onto a first pair.
 
     limits: of COLMAP's mapper; focal: "of EXIF" keeps focal lengths that EXIF data give for all photographs,
-    "guessed" keeps a normal lens's where they do not. What lies far ahead looks much the same from any
-    distance through another lens.
+    "guessed" a normal lens's where they do not: what lies far ahead tells little of the lens.
     """
     with opened(folder) as database:
         known = all(camera.has_prior_focal_length for camera in database.read_all_cameras())

@@ -175,8 +175,7 @@ def read_text(path: Path) -> str:
 def decode_text(data: bytes, path: Path) -> str:
     r"""Return the text of a file of any program, with "\n" at the ends of lines.
 
-    It is UTF-8, UTF-16 or UTF-32, with or without a byte order mark. Other bytes are read as Windows-1252,
-    which is reported as a guess; FormatError if they are no text.
+    UTF-8, UTF-16 or UTF-32, else Windows-1252, which is reported as a guess; FormatError if it is no text.
     """
     try:
         text = data.decode(json.detect_encoding(data))

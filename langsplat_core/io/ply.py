@@ -1,7 +1,6 @@
 """PLY files: tables in any encoding, point clouds, and 3D Gaussian scenes in two layouts.
 
-Rows are streamed into the final arrays; plyfile takes six times as long for a large scene and three times the
-memory (`python -m tests.benchmarks scale --only load`).
+Rows are streamed; plyfile takes six times as long and thrice the memory (tests.benchmarks scale --only load).
 
 INRIA's layout is read in all its variants and written in its plain form: one element `vertex`, one row per
 Gaussian, binary little endian, float32, in order ``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2
@@ -309,8 +308,7 @@ def read_cloud(path: Path) -> tuple[Array, Array]:
     """Return (M, 3) float64 positions and (M, 3) uint8 colours of the element `vertex`.
 
     A position may be infinite or NaN. Colours are whole numbers from 0 to 255, or floats from 0 to 1; others
-    are clipped, points without colours are grey, and both is reported. Raises InputError if the file cannot
-    be opened and FormatError if it breaks a rule of the format.
+    are clipped, points without colours are grey, and both is reported. FormatError if it breaks a rule.
     """
     with open_ply(path) as ply:
         vertex = ply.vertex

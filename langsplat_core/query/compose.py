@@ -283,8 +283,7 @@ def with_masks(engine: QueryEngine, found: QueryResult, shares: Array) -> Masked
     """Return an answer combined with masks; shares: (N,) of `selection.shares_in_masks`.
 
     Gaussians by more than half in masks are members, with sharper borders than regions have; their score is
-    the mean share. Of the field's answer, regions that masks hardly touch stay, and Gaussians that no
-    photograph sees: a segmenter misses some instances.
+    the mean share. Of the field's answer, regions that masks hardly touch stay, and Gaussians out of sight.
     """
     field, masks = found.members & found.found, shares > HALF
     if masks.sum() < RULE.smallest:

@@ -201,8 +201,7 @@ def scene_outline(describer: Describer) -> tuple[Outline, ...]:
     """Return the scene's tree, the whole with the largest surface first.
 
     Small nodes are left out. Parts without a word, or with the word of the node they are in, are replaced by
-    their own parts. A file may hold any tree, so nodes nested deeper than DEEPEST are not listed, and none is
-    named after N * DEEPEST Gaussians were read.
+    their own parts. As files may hold any tree, DEEPEST bounds its depth, and N * DEEPEST the Gaussians read.
     """
     tree, members, areas = describer.engine.tree, describer.engine.tree.gaussians(), describer.areas
     totals = members.sums(areas) / max(float(areas.sum()), 1e-300)

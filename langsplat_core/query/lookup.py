@@ -1,8 +1,7 @@
 """Relevancies of a phrase at every Gaussian and pixel: each distinct feature is compared once.
 
 A scene with a codebook has few distinct features. Latents of three numbers, as LangSplat's autoencoder makes,
-are unit vectors that hardly ever repeat; they are quantised to cells of their sphere, which are decoded once.
-With other codecs every distinct latent is a feature.
+hardly ever repeat: cells of their sphere are decoded once. Else every distinct latent is a feature.
 """
 
 from collections.abc import Iterator

@@ -54,8 +54,7 @@ def load_lifting_rasterizer(backend: str = "auto") -> LiftingRasterizer:
     """Return a rasterizer whose views can gather.
 
     backend: "cpu", "cuda", "reference", or "auto", the CPU: it gathers the labels of masks several times as
-    fast as gsplat on an H200 does, and keeps two digits more (docs/benchmarks/gpu). Raises InputError for one
-    that cannot gather and BackendError as `load_rasterizer` does.
+    fast as gsplat on an H200 does (docs/benchmarks/gpu). InputError for one that cannot gather; BackendError.
     """
     backend = "cpu" if backend == "auto" else backend
     if backend in BACKENDS and not BACKENDS[backend].lifts:

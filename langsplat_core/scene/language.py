@@ -1,7 +1,6 @@
 """The language field of a scene: language features, tree of instances, calibration; and the text of phrases.
 
-Phrases first. Quotes and punctuation around words are removed from them: they would change the text vector,
-and the demo encoder's tokenizer would end the phrase there.
+Phrases first, without quotes and punctuation, which change text vectors and end the demo encoder's phrases.
 """
 
 import re

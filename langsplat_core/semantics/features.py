@@ -140,8 +140,7 @@ def masked_crop(image: Array, mask: Array, size: int) -> Array:
     """Return one region cropped to its bounding box, black outside the mask, centred on a black square.
 
     image: (H, W, 3) uint8; mask: (H, W) bool, ValueError if empty. Returns (size, size, 3) uint8, resized
-    bilinearly, with antialiasing when shrinking. This is the crop of the method's public code (LangSplat
-    `preprocess.py`); an encoder must be trained with it, too.
+    bilinearly, antialiased when shrunk: LangSplat's crop (`preprocess.py`), also for an encoder's training.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if rows.size == 0:

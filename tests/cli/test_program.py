@@ -79,6 +79,12 @@ def test_unknown_commands_and_shells_are_named(words, said):
     assert str(error.value).startswith(said)
 
 
+def test_empty_names_are_refused(capsys):
+    """As of a shell's variables that are not set: `Path` takes them for "."."""
+    for line in ("inspect ", "select  x -o a.ply", "select a.ply x -o ", "export a.ply "):
+        assert "an empty name; is a variable" in refusal(capsys, *line.split(" "))
+
+
 @pytest.mark.parametrize(("program", "begin"), [("langsplat", entry), ("langsplat-viewer", viewer_entry)])
 @pytest.mark.parametrize("words", [[], ["train"]])
 def test_version_is_printed(program, begin, words, monkeypatch, capsys):
@@ -134,9 +140,10 @@ def test_bash_completes_and_doctor_names_what_there_is(capsys):
     terminal = {**os.environ, "LC_ALL": "C.UTF-8", "PYTHONUTF8": "1"}  # of others tyro's scripts know nothing
     said = subprocess.check_output(["bash", "-c", COMPLETE], input=script, encoding="utf-8", env=terminal)
     assert said.splitlines() == ["query", "--max-relevancy-error", "good"]
-    with pytest.raises(SystemExit):
-        parse(["help", "train"])
-    assert "--preset" in capsys.readouterr().out
+    for word in ("help", "--help"):
+        with pytest.raises(SystemExit):
+            parse([word, "train"])
+        assert "--preset" in capsys.readouterr().out
     Doctor().run()
     said = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
     assert said["langsplat"] == __version__

@@ -274,6 +274,7 @@ def pixel_of(blob: int) -> str:
     return f"{column},{row}"
 
 
+REPLACING = "convert,transform,clean,describe --labels"
 NO_PIXELS = ("80", "a,b", "-1,2", "1,2,3", "1.5,2", "9" * 5000 + ",1", "٣,٣")
 MUG, BOOK = pixel_of(0), pixel_of(1)
 
@@ -362,7 +363,7 @@ def test_words_taught_at_once_are_all_kept(described, into):
         ("train loop --out b.ply", "loop does not exist"),
         ("convert b.ply", "name what to read"),
         ("convert a.ply out --to nothing", "choose one of scene"),
-        *((f"{command} a.ply a.ply", "would replace") for command in ("convert", "transform", "clean")),
+        *((f"{one} a.ply a.ply", "would replace") for one in REPLACING.split(",")),
         ("export a.ply b.html --encoder ./absent", "absent: no such"),
         ("export a.ply room.png", "written as .html"),
         ("transform a.ply b.ply", "no step given"),

@@ -243,8 +243,7 @@ def test_colour_maps_for_the_colour_blind_brighten(name):
 
 @pytest.mark.parametrize("display", DISPLAYS)
 def test_transparent_images_over_a_background_are_opaque_ones(display):
-    """Colours that are not premultiplied, as PNG has them: laid over a background they give what is drawn
-    there, where the display draws the scene's own colours or latents."""
+    """PNG's colours, not premultiplied: over a background they are what is drawn, of rgb and latent."""
     picture = replace(PICTURE, display=display, background=(0.2, 0.5, 0.9))
     for alpha in (0.0, 0.2, 0.6, 1.0):
         shown = channels(display, alpha=alpha)

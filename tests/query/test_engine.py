@@ -1,5 +1,4 @@
-"""Asking: encoders and phrasebooks, phrases together and one by one, from many processes and threads at once,
-the basis of answers; and relevancy, by whatever the codec allows, against its definition."""
+"""Asking: encoders, phrasebooks, many phrases, processes and threads; relevancy against its definition."""
 
 import math
 import multiprocessing

@@ -1,9 +1,8 @@
 """Rasterizers over random parameters, hard cases and trained scenes: laws, and errors against the reference.
 
-Hypothesis draws scene, camera and settings: 25 examples per law, 1000 with `--slow`; derandomised, so that
-every run sees the same ones. Away from cut-offs the error is bounded (`tests/support/backends.py`); at
-cut-offs, where rounding decides whether an alpha of 1/255 counts, pixels may flip, and their number has a
-budget. Figures: run with `--measured`.
+Hypothesis draws scene, camera and settings: 25 examples per law, 1000 with `--slow`, the same in every run.
+Away from cut-offs the error is bounded (`tests/support/backends.py`); at cut-offs, where rounding decides
+whether an alpha of 1/255 counts, the pixels that flip have a budget. Figures: run with `--measured`.
 """
 
 from collections.abc import Callable

@@ -65,8 +65,7 @@ class Backend:
     def adjoint_tolerance(self) -> float:
         """Of `gather`, relative to the largest entry.
 
-        gsplat's backward pass begins with a pixel's transmittance as 1 - alpha, of which 6e-8 / 1e-4 may be
-        lost where the pixel is full; its twin in PyTorch keeps it.
+        gsplat's backward pass begins with 1 - alpha, of which 6e-8 / 1e-4 may be lost where a pixel is full.
         """
         return {"reference": 1e-12, "cuda": 6e-4}.get(self.name, 1e-5)
 

@@ -67,8 +67,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
-    """Any file of this process ends at `size` bytes, written by Python or by native code: the system says so
-    where it would say that the disk is full, in the middle of what is written."""
+    """Any file of this process ends at `size` bytes, in the middle of what is written, as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))  # its signal is ignored by Python
     try:

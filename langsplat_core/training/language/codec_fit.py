@@ -288,8 +288,7 @@ def spherical_kmeans(
 def _worth_keeping(vectors: Array, centres: Array, size: int) -> tuple[Array, Array]:
     """Return the (M,) nearest centre of each vector, and (K,) bool: the centres that are kept.
 
-    Unused centres are not kept, nor, above `size`, the least useful ones, one in `STEP` at a time, as either
-    of two similar centres seems useless while the other is there.
+    Unused centres are not kept, nor, above `size`, the least useful ones, one in `STEP` at a time.
     """
     nearest, _, gain = nearest_centres(vectors, centres, gains=True)
     use = np.bincount(nearest, gain, len(centres))  # by how much the sum of cosines would fall without it

@@ -1,5 +1,4 @@
-"""Meshes of rooms whose surfaces are known; two captures laid onto each other, two scenes as one; occupancy
-along rays, the map of the floor, poses in front of things."""
+"""Meshes of rooms whose surfaces are known; captures laid onto each other; maps, and poses before things."""
 
 import json
 import os
