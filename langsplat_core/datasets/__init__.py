@@ -29,10 +29,9 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     """Return undistorted photographs of at most ``config.max_side`` pixels, their cameras and points.
 
     Recognises, in this order, a nerfstudio ``transforms.json``, a COLMAP model, and plain photographs, whose
-    cameras are found by structure from motion. Without points, some are triangulated from training views.
-    What is computed is kept in ``work/sfm-*`` for the same photographs. The world is the dataset's own, about
-    `Capture.origin` where it is far from zero; `config`, the dataset, or the places (GPS) of the photographs
-    tell how long its unit is. What is left out is reported once. InputError where nothing usable remains.
+    cameras are found by structure from motion, kept in ``work/sfm-*``. Without points, some are triangulated.
+    The world is the dataset's own, about `Capture.origin` where that is far off; `config`, the dataset or
+    the places (GPS) of the photographs tell how long its unit is. InputError where nothing usable remains.
     """
     capture = load_photographs(path, config, work, progress)
     metres = config.metres_per_unit or capture.metres_per_unit

@@ -97,8 +97,7 @@ MAX_HALF_ANGLE = np.radians(65)  # from the axis; a pinhole image stretches with
 def _radial_profile(distortion: Distortion) -> tuple[Array, Array]:
     """Return radii 0 to R that can be inverted, and the mean distorted radius of each.
 
-    R is the cap `MAX_HALF_ANGLE` or just inside the first radius at which the map folds over, that is
-    where its Jacobian is singular in some direction: fitted polynomials often do so beyond the corners.
+    R is the cap `MAX_HALF_ANGLE` or just inside the first radius at which the Jacobian is singular.
     """
     radii = np.tan(np.linspace(0, MAX_HALF_ANGLE, 400))
     angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)

@@ -177,10 +177,7 @@ def _read(path: Path, read: Reader | None = None) -> Scene:
 
 
 def _about_origin(path: Path, scene: Scene) -> Scene:
-    """Return the scene with the origin that its companion names, or else that its positions need.
-
-    Reports positions that were rounded to float32 far from zero before they were written.
-    """
+    """Return the scene with its companion's origin, else one near it; reports positions rounded far off."""
     try:
         named = read_origin(path)
     except InputError as error:

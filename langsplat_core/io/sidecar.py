@@ -401,8 +401,7 @@ def rematch_language(sidecar: Path | str, new_means: Array) -> LanguageField:
     """Return the field in `sidecar`, carried over to Gaussians at `new_means` (N, 3) by nearest position.
 
     new_means: in the world, float64 far from zero. A match is at most as far as the median distance of an old
-    Gaussian to its nearest neighbour: rounding is allowed (as in a compressed PLY), but Gaussians that were
-    added or moved far get no feature, which is confidence 0 and zero latents.
+    Gaussian to its nearest neighbour: rounding is allowed, but what was added or moved far gets no feature.
     """
     stored = read_stored(Path(sidecar))
     old_rows = np.flatnonzero(np.isfinite(stored.means).all(1))

@@ -259,8 +259,8 @@ def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub
 
     Positions are rounded to 1/4096 world unit, or finer for smaller Gaussians; scales to 1/16 in the
     logarithm, within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1; colours and opacities to 1/255.
-    A row that cannot be drawn is written with opacity 0; what is beyond a range is cut and reported. Raises
-    InputError for a scene too large for 24 bits per coordinate, or if most sizes are beyond the range.
+    What is beyond is cut and reported, a row that cannot be drawn has opacity 0. InputError for a scene too
+    large for 24 bits per coordinate, or if most sizes are beyond the range.
     """
     gaussians, valid = scene.gaussians, scene.gaussians.valid()
     drawn = mirrored(gaussians.take(valid), _signs_to_rdf(AXES[axes]))  # the map is its own inverse

@@ -118,6 +118,7 @@ class Stages:
     work: Path
     progress: Progress
     processes: ProcessGroup = field(default_factory=ProcessGroup)
+    antialiased: bool = False  # as of the scene
 
     @property
     def by_weights(self) -> bool:
@@ -135,7 +136,8 @@ class Stages:
         """The vectors of each view's masks, and digests of all that the results are made from."""
         read = [(features.vectors, digest_of(features)) for _, features in self.views]
         digests = [digest for _, digest in read]
-        return [own for own, _ in read], (digest_of(self.gaussians), digests, self.config.radiance.near)
+        formed = self.config.radiance.near, *([True] if self.antialiased else [])
+        return [own for own, _ in read], (digest_of(self.gaussians), digests, *formed)
 
     def path(self, name: str, version: int, *settings: Any) -> Path:
         return self.work / f"{stage_key(name, version, *self.inputs[1], *settings)}.npz"
@@ -184,7 +186,8 @@ class Stages:
         """The image formation of the views, from few of them, since reading a view reads its masks."""
         step = max(-(-len(self.views) // NEAR_CAMERAS), 1)
         cameras = [self.views[index][0] for index in range(0, len(self.views), step)]
-        return self.config.radiance.formation(near_plane(self.gaussians, cameras))
+        formed = self.config.radiance.formation(near_plane(self.gaussians, cameras))
+        return replace(formed, antialiased=self.antialiased)
 
     def rasterizer(self) -> LiftingRasterizer:
         return load_lifting_rasterizer(self.config.lift.backend)

@@ -10,7 +10,7 @@ import io
 import json
 from base64 import b64encode
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from langsplat_core.io.files import write_json, write_whole
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.quantised import to_bytes
 from langsplat_core.raster.render import render
-from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene import Camera, Scene
 
 REPORT, PAGE = "report.json", "report.html"
 PREVIEW = "so-far.ply"  # in the work folder: Gaussians that the window shows of a training under way
@@ -162,14 +162,14 @@ def shown_views(train: Sequence[int]) -> list[int]:
 
 
 def write_reports(
-    work: Path, report: TrainReport, capture: Capture, gaussians: Gaussians, trained: Sequence[ViewScore]
+    work: Path, report: TrainReport, capture: Capture, scene: Scene, trained: Sequence[ViewScore]
 ) -> None:
     """Write the report of a finished training, as JSON and as a page; trained: scores of `shown_views`."""
     write_json(work / REPORT, asdict(report))
     held_out = {score.name: score for score in report.held_out_views[:MOST_VIEWS]}
     rows = {camera.name: index for index, camera in enumerate(capture.cameras)}
     scores = [*held_out.values(), *trained][:MOST_VIEWS]
-    scene = Scene(gaussians, cameras=capture.cameras)
+    scene = replace(scene, cameras=capture.cameras)
     views = (_view(capture, scene, rows[score.name], score, score.name in held_out) for score in scores)
     more = len(capture) - len(scores)
     head = files("langsplat_core").joinpath("web", "report.html").read_text(encoding="utf-8")

@@ -160,17 +160,18 @@ def _train(
         if given is None:
             made = capture, train, config.radiance, run.work, run.progress, held_out
             gaussians = processes.once(lambda: trained_gaussians(*made))
+            scene = Scene(gaussians, origin=capture.origin)
         else:
-            gaussians = place_scene(given, origin=capture.origin).gaussians
+            scene = place_scene(given, origin=capture.origin)
 
     language, figures = None, dict[str, Any]()
     if encoder is not None and source is not None:
-        language, figures = _language(run, seen, gaussians, features, source, encoder)
+        language, figures = _language(run, seen, scene, features, source, encoder)
 
     if processes.is_main:
-        said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
-        metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
-        scene = Scene(gaussians, language, seen.cameras, metres_per_unit=metres, origin=capture.origin)
+        # the dataset's may be an estimate
+        metres = config.dataset.metres_per_unit or scene.metres_per_unit or capture.metres_per_unit
+        scene = replace(scene, language=language, cameras=seen.cameras, metres_per_unit=metres, unread=())
         _finish(run, capture, scene, train, held_out, figures)
     processes.barrier()
     return reports.read_report(run.work)
@@ -179,14 +180,14 @@ def _train(
 def _language(
     run: _Run,
     seen: Capture,
-    gaussians: Gaussians,
+    scene: Scene,
     features: Sequence[ImageFeatures],
     source: MaskSource,
     encoder: Encoder,
 ) -> tuple[LanguageField, dict[str, Any]]:
-    """Return the language field of the Gaussians, and the report's figures of it."""
+    """Return the language field of a scene's Gaussians, with its taught words, and the report's figures."""
     views, shared = language_field.views_of(seen.cameras, features), (run.work, run.progress, run.processes)
-    stages = language_field.Stages(gaussians, views, encoder, run.config, *shared)
+    stages = language_field.Stages(scene.gaussians, views, encoder, run.config, *shared, scene.antialiased)
     if not source.agrees:
         with run.timed("masks that agree"):
             photographs = [(image, seen.mask(row)) for row, image in enumerate(seen.images)]
@@ -196,6 +197,8 @@ def _language(
         language, codec = language_field.language_field(stages)
         if not seen.drawn:
             language = replace(language, calibration=None)  # which holds in drawn rooms alone
+        if scene.language is not None and scene.language.encoder_id == encoder.id:
+            language = replace(language, taught=scene.language.taught)
     return language, {
         "masks": source.name,
         "encoder": encoder.id,
@@ -205,7 +208,7 @@ def _language(
         "codec_cosine": codec.cosine,
         "relevancy_error": codec.error_mean,
         "relevancy_error_p99": codec.error_p99,
-        "observed": float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
+        "observed": float((language.confidence[2] > 0).mean()) if len(scene.gaussians) else 0.0,
     }
 
 
@@ -217,7 +220,7 @@ def _finish(
         save_scene(run.out, scene)
         small = capture.read_at(held_out, QUICK_SIDE) if held_out else None
         near = run.config.radiance.near or scene.near  # as whoever opens the scene has it
-        told: dict[str, Any] = {"near": near, "progress": run.progress}
+        told: dict[str, Any] = {"near": near, "antialiased": scene.antialiased, "progress": run.progress}
         scores = evaluate_views(scene.gaussians, capture, held_out, small=small, **told)
         trained = evaluate_views(scene.gaussians, capture, reports.shown_views(train), **told)
     rule = f"one in {run.config.dataset.test_every}, "
@@ -238,7 +241,7 @@ def _finish(
         held_out_rule="as the dataset says" if any(photo.held_out for photo in capture.photos) else rule,
         **figures,
     )
-    reports.write_reports(run.work, report, capture, scene.gaussians, trained)
+    reports.write_reports(run.work, report, capture, scene, trained)
 
 
 def _mean(scores: Iterable[float | None]) -> float | None:

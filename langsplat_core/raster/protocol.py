@@ -156,12 +156,10 @@ class Dilation(NamedTuple):
 def dilation(camera: Camera, settings: RasterSettings) -> Dilation:
     """Return what is added to both variances of a footprint, px^2.
 
-    Gaussians are fitted with the dilation, so it is part of their shape. In images of higher resolution than
-    the photographs it covers more pixels, up to `MOST_GROWTH`: otherwise closed surfaces open, and edges fray
-    into needles (Yu et al. 2024, Mip-Splatting, figure 1). In images of lower resolution it covers less, and
-    a pixel is the mean of several pixels of the photographs: the variance of its box, less that of theirs, is
-    added, and opacities fade in return. Antialiased Gaussians were fitted without dilation, by a filter of
-    their own.
+    Gaussians are fitted with the dilation. In images of higher resolution than the photographs it covers more
+    pixels, up to `MOST_GROWTH`: otherwise closed surfaces open, and edges fray into needles (Yu et al. 2024,
+    Mip-Splatting, figure 1). In images of a lower one it covers less; the variance of a pixel's box, less
+    that of theirs, is added, and opacities fade in return. Antialiased Gaussians were fitted without it.
     """
     growth = 1.0
     if settings.focal is not None and not camera.orthographic:

@@ -24,7 +24,7 @@ from langsplat_core.pipeline.report import (
     work_folder,
     write_reports,
 )
-from langsplat_core.scene import look_at
+from langsplat_core.scene import Scene, look_at
 from tests.support.processes import open_browser
 from tests.support.scenes import random_gaussians, ring
 
@@ -144,7 +144,7 @@ def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path)
     matches = Matches(tuple(names), (900,) * 8, ((0, 1, 80), (1, 2, 20), (5, 6, 3)), frozenset(range(7)))
     made = report(names[2:4], warnings=("it is dim: add <light>",), psnr_small=22.7, held_out_rule="one in 4")
     others = [ViewScore(name, 30.0, 0.9, 0.9) for name in names if name not in names[2:4]]
-    write_reports(tmp_path, made, capture(names, matches=matches), random_gaussians(50), others)
+    write_reports(tmp_path, made, capture(names, matches=matches), Scene(random_gaussians(50)), others)
     assert read_report(tmp_path) == made
     page = Read(tmp_path / PAGE)
     assert not {"link", "iframe", "light"} & {tag for tag, _ in page.tags}

@@ -23,7 +23,6 @@ from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.interrupts import raised
 from langsplat_core.io import apart
 from langsplat_core.io.files import write_json
-from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.evidence import kept_photographs
 from langsplat_core.pipeline.report import read_report
@@ -33,6 +32,7 @@ from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from tests.support.fakes import blob_scene
+from tests.support.file_kinds import taught_word
 from tests.support.file_samples import assert_same_tree
 from tests.support.processes import in_this_process, python, refusal, run, stop_at
 from tests.support.tiny_models import tiny_room, tiny_settings
@@ -292,9 +292,15 @@ def test_given_gaussians_are_described_and_not_trained(room, tmp_path):
     assert not list((tmp_path / "again.work").glob("radiance*"))
     assert load_scene(again).language.codec.size == 9
     assert run("train", room, "--out", again, "--gaussians", tmp_path / "missing.ply", *options) == 2
-    write_metres(first, 0.25)  # as `langsplat scale` measured it; the photographs say 0.5
+    before, age = load_scene(again), {"age": np.zeros(len(load_scene(again).gaussians))}
+    taught = replace(before.language, taught=(taught_word("lamp", before.language.codec.vector_dim),))
+    # the photographs say 0.5
+    save_scene(first, replace(before, language=taught, antialiased=True, extras=age, metres_per_unit=0.25))
     assert run("train", room, "--out", again, "--gaussians", first, *options) == 0
-    assert load_scene(again).metres_per_unit == 0.25
+    after = load_scene(again)
+    assert (after.metres_per_unit, after.antialiased, list(after.extras)) == (0.25, True, ["age"])
+    assert [word.name for word in after.language.taught] == ["lamp"]
+    assert not np.array_equal(after.language.confidence, before.language.confidence)
 
 
 def test_paper_profile_runs(room, tmp_path):

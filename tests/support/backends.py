@@ -72,9 +72,8 @@ class Backend:
     def promises(self, footprints: Footprints) -> bool:
         """Return whether `tolerance` holds: with gsplat only where float32 keeps enough of all covariances.
 
-        With k = xx yy / det >= 1, the terms of an exponent s add up to 4 k s at most, and the determinant is
-        a difference of k and k - 1 times itself: some 40 roundings of 2^-24 move an alpha by at most
-        40 k s exp(-s) 2^-24, which is 2e-5 for k = 23.
+        With k = xx yy / det >= 1, terms of an exponent s add up to 4 k s, and the determinant is a difference
+        of k and k - 1 times itself: 40 roundings move an alpha by 40 k s exp(-s) 2^-24, 2e-5 for k = 23.
         """
         xx, xy, yy = footprints.conics[footprints.opacities > 0].T
         return not self.gsplat or bool((xx * yy <= 23 * (xx * yy - xy * xy)).all())

@@ -416,10 +416,7 @@ def files_in_use() -> set[str]:
 
 
 def as_on_windows() -> None:
-    """Take away, for the rest of this process, what Windows lacks; what is imported already keeps it.
-
-    What is open or mapped is neither replaced nor removed, and some names are refused.
-    """
+    """Take away, for the rest of this process, what Windows lacks: replacing open files, and some names."""
     sys.modules.update(dict.fromkeys(("fcntl", "grp", "pwd", "resource", "termios")))  # type: ignore[arg-type]
     for name in LACKING.split():
         delattr(os, name)

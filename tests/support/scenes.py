@@ -35,10 +35,7 @@ def random_gaussians(
     radius: float = 1.0,
     scale_range: tuple[float, float] = (0.02, 0.25),
 ) -> Gaussians:
-    """`n` Gaussians in a ball of `radius` world units around the origin, anisotropy about 1 to 12.
-
-    Quaternions are left unnormalised, as trained files hold them; opacities span 0.05 to 0.99.
-    """
+    """`n` Gaussians in a ball of `radius` world units around the origin, of quaternions of any length."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(n, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

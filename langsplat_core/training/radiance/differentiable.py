@@ -150,14 +150,15 @@ def evaluate_views(
     small: Capture | None = None,
     near: float | None = None,
     progress: Progress = silent,
+    antialiased: bool = False,
 ) -> list[ViewScore]:
     """Return the scores of the views at `indices` against the photographs; colours are clamped to [0, 1].
 
-    small: the same views read at 320 px, with which shrunk images are compared, too: a photograph that was
-    shrunk twice differs from one that was read at this size by as much as good images do. near: the near
-    plane, world units; None: from what the cameras see.
+    small: the same views read at 320 px, with which shrunk images are compared, too, as photographs shrunk
+    twice differ. near: the near plane, world units; None: from what cameras see. antialiased: as of `Scene`.
     """
-    renderer = renderer_for(backend, replace(INRIA, near=near or near_plane(gaussians, capture.cameras)))
+    near = near or near_plane(gaussians, capture.cameras)
+    renderer = renderer_for(backend, replace(INRIA, near=near, antialiased=antialiased))
     parameters = parameters_of(gaussians, renderer.device)
     scores = []
     for number, index in enumerate(indices):
