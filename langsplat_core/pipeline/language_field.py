@@ -152,8 +152,7 @@ class Stages:
     def mask_weights(self) -> tuple[MaskWeights, MaskGroups]:
         """The mask weights, in files that are read where they are needed, and the groups of masks."""
         vectors, inputs = self.inputs
-        # Named as in older work folders.
-        folder = self.work / stage_key("memberships", 2, *inputs)  # codespell:ignore memberships
+        folder = self.work / stage_key("mask-weights", 2, *inputs)
         mask_weights = self.weights_in(folder, list(map(len, vectors)))
 
         def make() -> Arrays:
@@ -310,7 +309,7 @@ def agreed_features(
     facts = ((camera.position, len(seen.vectors), digest_of(seen)) for camera, seen in views)
     eyes, counts, digests = zip(*facts, strict=True)
     inputs = digest_of(gaussians), digests, formed
-    mask_weights = stages.weights_in(work / stage_key("rough-memberships", VERSION, *inputs), counts)
+    mask_weights = stages.weights_in(work / stage_key("rough-weights", VERSION, *inputs), counts)
 
     def make() -> Arrays:
         surface = build_surface(gaussians)

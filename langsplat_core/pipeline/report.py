@@ -151,7 +151,7 @@ def camera_groups(positions: Array) -> list[Array]:
 
 MOST_VIEWS = 48  # on the page, held-out ones first
 SIDE = 400  # px, longer side of an image
-PLOT = 640  # units of a drawing's side
+PLOT, WEDGE = 640, 17  # units of a drawing's side, and of the way that a camera looks
 SLIDE = 'oninput = ({ target }) => target.parentNode.style.setProperty("--at", target.value + "%");'
 
 
@@ -259,31 +259,17 @@ def _uri(pixels: Array) -> str:
 
 
 def _from_above(scene: Scene, held_out: Container[str]) -> str:
-    """Draw the cameras and the scene below them from above, with their longest extent across the page."""
-    up, eyes = scene.up(), np.array([camera.position for camera in scene.cameras])
-    flat = (eyes - eyes.mean(0)) - np.outer((eyes - eyes.mean(0)) @ up, up)
-    right = np.linalg.svd(flat)[2][0]
-    axes = np.stack([right - (right @ up) * up, np.cross(up, right)])  # right and, on the page, up
-    gaussians = scene.gaussians.take(np.flatnonzero(scene.gaussians.valid()))
-    points, places = gaussians.means.astype(np.float64) @ axes.T, eyes @ axes.T
-    most = np.quantile(points, (0.02, 0.98), axis=0) if len(points) else places
-    low, high = np.minimum(places.min(0), most[0]), np.maximum(places.max(0), most[-1])
-    margin = max(0.06 * float((high - low).max()), 1e-30)
-    low, high = low - margin, high + margin
-    scale = PLOT / float((high - low).max())
-    width, height = np.maximum((high - low) * scale, 1).round().astype(int).tolist()
-    rotation = np.stack([axes[0], -axes[1], -up])
-    corner = (low[0], high[1], (eyes @ up).max() + scene.near) @ np.vstack([axes, up])
-    pose = affine(rotation, -rotation @ corner)
-    plan = Camera(width, height, scale, scale, 0.0, 0.0, pose, orthographic=True)
+    """Draw the cameras, and the scene below them, from above."""
+    plan = _camera_above(scene)
     ground = render(scene, plan)
     shade = 1 - 0.75 * (ground.alpha[..., None] - ground.colours).clip(0, 1)  # faint, as a map's ground
-    drawn = [f"<image width='{width}' height='{height}' href='{_uri(to_bytes(255 * shade))}'/>"]
-    for camera, place in zip(scene.cameras, plan.project(eyes)[0], strict=True):
+    drawn = [f"<image width='{plan.width}' height='{plan.height}' href='{_uri(to_bytes(255 * shade))}'/>"]
+    for camera in scene.cameras:
+        place = plan.project(camera.position[None])[0][0]
         # A wedge for what a camera looks towards; one that looks straight down is its dot alone.
-        ahead = axes @ camera.rotation[2] * (1, -1)
+        ahead = plan.rotation[:2] @ camera.rotation[2]
         across = np.array([-ahead[1], ahead[0]]) * min(0.5 * camera.width / camera.fx, 1.0)
-        corners = (place, place + 17 * (ahead + across), place + 17 * (ahead - across))
+        corners = (place, place + WEDGE * (ahead + across), place + WEDGE * (ahead - across))
         drawn.append(
             f"<g fill='{'#e07b00' if camera.name in held_out else '#3b6fb6'}'>"
             f"<title>{_text(camera.name)}</title><circle cx='{place[0]:.1f}' cy='{place[1]:.1f}' r='3.4'/>"
@@ -293,4 +279,24 @@ def _from_above(scene: Scene, held_out: Container[str]) -> str:
         f"<span class='soft key'><i style='background:{colour}'></i>{name}</span>"
         for colour, name in (("#3b6fb6", "trained on"), ("#e07b00", "held out"), ("#b9c0ca", "Gaussians"))
     )
-    return f"<svg viewBox='0 0 {width} {height}' role=img>{''.join(drawn)}</svg>{key}"
+    return f"<svg viewBox='0 0 {plan.width} {plan.height}' role=img>{''.join(drawn)}</svg>{key}"
+
+
+def _camera_above(scene: Scene) -> Camera:
+    """Return an orthographic camera over all cameras, with their longest extent across its image."""
+    up = scene.up()
+    eyes = np.array([camera.position for camera in scene.cameras])
+    flat = (eyes - eyes.mean(0)) - np.outer((eyes - eyes.mean(0)) @ up, up)
+    right = np.linalg.svd(flat)[2][0]
+    rotation = np.stack([right - (right @ up) * up, -np.cross(up, right), -up])
+    places = eyes @ rotation[:2].T
+    points = scene.gaussians.means[scene.gaussians.valid()].astype(np.float64) @ rotation[:2].T
+    most = np.quantile(points, (0.02, 0.98), axis=0) if len(points) else places
+    low, high = np.minimum(places.min(0), most[0]), np.maximum(places.max(0), most[-1])
+    margin = max(0.06 * float((high - low).max()), 1e-30)
+    low, high = low - margin, high + margin
+    scale = PLOT / float((high - low).max())
+    width, height = np.maximum((high - low) * scale, 1).round().astype(int).tolist()
+    corner = (*low, (eyes @ rotation[2]).min() - scene.near) @ rotation
+    pose = affine(rotation, -rotation @ corner)
+    return Camera(width, height, scale, scale, 0.0, 0.0, pose, orthographic=True)

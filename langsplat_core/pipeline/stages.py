@@ -195,10 +195,9 @@ class ProcessGroup:
         try:
             torch.distributed.barrier()
         except RuntimeError as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(
-                f"another process of this training ended ({reason[:80]}); give the same command again: what "
-                "is finished is kept"
+                f"another process of this training ended ({printable_line(error, 80)}); give the same "
+                "command again: what is finished is kept"
             ) from None
 
     def once(self, make: Callable[[], T]) -> T:

@@ -8,7 +8,7 @@ transmittance (see `tiles.walk`), ``W^T onehot(labels)`` in one walk, memory, an
 import math
 from collections.abc import Callable
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import finalize
 
 import numpy as np
@@ -127,20 +127,16 @@ def median_tiles(first: int, last: int, tiles: Tiles, depths: Array, out: Array)
 # Gaussian's partial sums are added up over its tiles by a sparse matrix.
 
 
-class TileRegions(NamedTuple):
-    """The regions that each of T tiles meets."""
-
-    counts: Array  # (T,) int64
-    labels: Array  # (T, 256 L) int32 labels of L maps, the first counts[t] of row t; 0 behind them
-
-
 @kernel
-def _meet_regions(first: int, last: int, maps: Array, columns: int, out: TileRegions) -> None:
-    """Fill `out` with the labels >= 0 in tiles [first, last) of (L, H, W) maps."""
+def _meet_regions(first: int, last: int, maps: Array, columns: int, counts: Array, labels: Array) -> None:
+    """Find the labels >= 0 in tiles [first, last) of (L, H, W) maps, in columns of tiles.
+
+    counts: (T,) int64; labels: (T, 256 L) int32, the first counts[t] of row t, 0 behind them.
+    """
     levels, height, width = maps.shape
     for tile in range(first, last):
         x0, y0 = tile % columns * TILE, tile // columns * TILE
-        count, found = 0, out.labels[tile]
+        count, found = 0, labels[tile]
         for level in range(levels):
             for y in range(y0, min(y0 + TILE, height)):
                 for x in range(x0, min(x0 + TILE, width)):
@@ -153,7 +149,7 @@ def _meet_regions(first: int, last: int, maps: Array, columns: int, out: TileReg
                     if not known:
                         found[count] = label
                         count += 1
-        out.counts[tile] = count
+        counts[tile] = count
         found[count:] = 0
 
 
@@ -203,14 +199,14 @@ def label_weights(
     `order`: (M,) rows of the drawn Gaussians. Entries of at most `least` are left out.
     """
     number = len(tiles.starts) - 1
-    met = TileRegions(np.empty(number, np.int64), np.empty((number, len(maps) * PIXELS), np.int32))
-    workers.run(_meet_regions, number, maps, tiles.columns, met)
-    here, lines = np.diff(tiles.starts), (met.counts + 3) // 4 * 4  # multiples of 4, for `correlate`
+    counts, labels = np.empty(number, np.int64), np.empty((number, len(maps) * PIXELS), np.int32)
+    workers.run(_meet_regions, number, maps, tiles.columns, counts, labels)
+    here, lines = np.diff(tiles.starts), (counts + 3) // 4 * 4  # multiples of 4, for `correlate`
     offsets = np.concatenate([[0], np.cumsum(here * lines)])
     sums = np.empty(offsets[-1], np.float32)
-    workers.run(_gather_regions, number, tiles, maps, met.labels, lines, offsets, sums)
+    workers.run(_gather_regions, number, tiles, maps, labels, lines, offsets, sums)
     # Sums of each intersection by label, added up in float64 in the order of a Gaussian's intersections.
-    columns = [np.tile(met.labels[t, : lines[t]], here[t]) for t in range(number)]
+    columns = [np.tile(labels[t, : lines[t]], here[t]) for t in range(number)]
     entries = sums, np.concatenate(columns), np.concatenate([[0], np.cumsum(np.repeat(lines, here))])
     by_intersection = scipy.sparse.csr_matrix(entries, (len(tiles.met), shape[1]))
     by_intersection.eliminate_zeros()

@@ -210,10 +210,9 @@ class _Views:
         self.cameras = [capture.cameras[i] for i in indices]
         self.focals = [float(np.sqrt(camera.fx * camera.fy)) for camera in self.cameras]
         views = [(capture.cameras[i], capture.images[i], capture.mask(i)) for i in indices]
-        self._fine, self._coarse = (
-            [(camera, kept(image), kept(mask)) for camera, image, mask in sizes]
-            for sizes in (views, [_halved(*view) for view in views])
-        )
+        halved = [_halved(*view) for view in views]
+        self._fine = [(camera, kept(image), kept(mask)) for camera, image, mask in views]
+        self._coarse = [(camera, kept(image), kept(mask)) for camera, image, mask in halved]
 
     def __len__(self) -> int:
         return len(self._fine)
