@@ -115,9 +115,8 @@ class Canvas:
                 self._draw(state, request)
         elif self._changes(request):
             fewer = self._merged(request)
-            self._draw(
-                state, request, self._resolution.finest(PLAIN if fewer is None else WITH_MERGED), fewer
-            )
+            detail = self._resolution.finest(PLAIN if fewer is None else WITH_MERGED)
+            self._draw(state, request, detail, fewer)
 
     def _settle(self, state: ViewerState, request: RenderRequest) -> None:
         """Draw the full image of a camera that rests.

@@ -104,18 +104,12 @@ def _overlay(name: Overlay, title: str, *keys: str, finds: str = "") -> Command:
 
 def _step(step: editing.Step, act: editing.Action, *keys: str, finds: str = "") -> Command:
     now = partial(editing.named_step, step=step)
-    return Command(step, act, keys, "", "", finds, True, is_edit=True, apart=step == "undo", now=now)
+    return Command(step, act, keys, finds=finds, repeats=True, is_edit=True, apart=step == "undo", now=now)
 
 
 def _export_as(title: str) -> Command:
-    act, finds = partial(saving.ask_export, title=title), saving.EXPORTS[title].finds
-    now = f"{title} ..."
-    return Command(f"export: {now}", act, (), f"Export {now}", finds=finds, now=lambda viewer: now)
-
-
-def _side(side: Side, key: str) -> Command:
-    where = {"top": "above", "bottom": "below"}.get(side, f"the {side}")
-    return Command(f"look from {where}", lambda v: viewpoint.look_from(v, side), (key,))
+    act, now, row = partial(saving.ask_export, title=title), f"{title} ...", saving.EXPORTS[title]
+    return Command(f"export: {now}", act, button=f"Export {now}", finds=row.finds, now=lambda viewer: now)
 
 
 WHOLE = LEVELS.index("whole")
@@ -127,12 +121,17 @@ TOOL_ICONS: dict[Tool, str] = {
     "thing": "HAND_POINTER", "rectangle": "VECTOR_SQUARE", "lasso": "DRAW_POLYGON", "brush": "BRUSH",
     "sphere": "CIRCLE", "box": "CUBE",
 }  # fmt: skip
+SIDES: dict[Side, tuple[str, str]] = {  # words and key
+    "front": ("the front", "Keypad1"), "back": ("the back", "Ctrl+Keypad1"),
+    "right": ("the right", "Keypad3"), "left": ("the left", "Ctrl+Keypad3"),
+    "top": ("above", "Keypad7"), "bottom": ("below", "Ctrl+Keypad7"),
+}  # fmt: skip
 open_train = partial(settings.open_panel, title="Train")
 OTHER_THEME = {"dark": "light", "light": "dark"}
 
 BY_MENU: dict[str, tuple[Command, ...]] = {
     "File": (
-        Command("open a scene ...", opening.ask_for_file, ("Ctrl+O",), "Open a scene ...",
+        Command("open a scene ...", opening.ask_for_file, ("Ctrl+O",), button="Open a scene ...",
                 finds="load import file browse ply splat project"),
         Command("start page", settings.toggle_start, is_on=_is("show_start"),
                 finds="home welcome recent close demo example bundled"),
@@ -141,11 +140,11 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         Command("previous scene of the list", partial(opening.step_scene, by=-1), ("Ctrl+PageUp",)),
         Command("train a scene", open_train, button="Train from photographs ...", apart=True,
                 finds="photographs photos images video reconstruct create make new colmap"),
-        Command("save the project", saving.save, ("Ctrl+S",), "Save project", apart=True,
+        Command("save the project", saving.save, ("Ctrl+S",), button="Save project", apart=True,
                 now=lambda v: "save the project (changed)" if v.state.is_changed else ""),
         Command("save the project as ...", saving.save_as, ("Ctrl+Shift+S",)),
-        Command("save a picture", saving.save_picture, ("P",), "Save picture", "CAMERA", apart=True,
-                finds="screenshot image png export capture snapshot render photo"),
+        Command("save a picture", saving.save_picture, ("P",), button="Save picture", icon="CAMERA",
+                apart=True, finds="screenshot image png export capture snapshot render photo"),
         Command("save the view", saving.save_view, button="Save view"),
         Command("save a film of the path", saving.save_film, button="Save film",
                 finds="video movie mp4 animation export record render"),
@@ -165,9 +164,10 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
                 finds="transform translate turn resize handles crop box"),
     ),
     "Select": (
-        Command("select everything", editing.select_all, ("Ctrl+A",), "All", is_edit=True),
-        Command("select nothing", editing.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "None", is_edit=True),
-        Command("invert the selection", editing.invert_selection, ("Ctrl+I",), "Invert", is_edit=True),
+        Command("select everything", editing.select_all, ("Ctrl+A",), button="All", is_edit=True),
+        Command("select nothing", editing.select_none, ("Ctrl+D", "Ctrl+Shift+A"), button="None",
+                is_edit=True),
+        Command("invert the selection", editing.invert_selection, ("Ctrl+I",), button="Invert", is_edit=True),
         Command("select what the search found", editing.select_query, apart=True),
         Command("select everything like the selection", editing.select_alike, button="More like it"),
         Command("name the selection ...", editing.ask_for_name, ("F2",), finds="rename teach label call"),
@@ -177,10 +177,10 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
                 icon="HAND", is_on=_is("tools.tool", None), apart=True),
         *(Command(f"select: {tool}", partial(editing.use_tool, tool=tool), icon=TOOL_ICONS[tool],
                   is_on=_is("tools.tool", tool)) for tool in TOOLS),
-        Command("hide the selection", editing.hide_selected, ("H",), "Hide", apart=True),
-        Command("isolate the selection", editing.isolate_selected, ("Shift+H",), "Isolate"),
-        Command("show all that is hidden", editing.show_hidden, ("U", "Alt+H"), "Show all"),
-        Command("delete the selection", editing.delete_selected, ("Delete",), "Delete",
+        Command("hide the selection", editing.hide_selected, ("H",), button="Hide", apart=True),
+        Command("isolate the selection", editing.isolate_selected, ("Shift+H",), button="Isolate"),
+        Command("show all that is hidden", editing.show_hidden, ("U", "Alt+H"), button="Show all"),
+        Command("delete the selection", editing.delete_selected, ("Delete",), button="Delete",
                 finds="remove erase clean cut crop"),
         Command("export the selection ...", partial(saving.ask_export, title="scene", only_selected=True),
                 button="Export selection ...", apart=True, finds="save extract cut out ply"),
@@ -206,11 +206,12 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         Command("click the middle of the image", editing.click_middle, ("X",)),
     ),
     "Camera": (
-        Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Reset", "HOUSE",
-                finds="reset camera home start"),
-        Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Frame all", "EXPAND",
+        Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), button="Reset",
+                icon="HOUSE", finds="reset camera home start"),
+        Command("frame everything", viewpoint.frame_scene, ("Shift+F",), button="Frame all", icon="EXPAND",
                 finds="fit all zoom extents whole center centre"),
-        Command("focus on the latest result found", viewpoint.focus_result, ("F",), "Focus", "CROSSHAIRS"),
+        Command("focus on the latest result found", viewpoint.focus_result, ("F",), button="Focus",
+                icon="CROSSHAIRS"),
         Command("previous training camera", partial(viewpoint.step_camera, by=-1), (",",), repeats=True,
                 apart=True),
         Command("next training camera", partial(viewpoint.step_camera, by=1), (".",), repeats=True),
@@ -218,17 +219,13 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
                 finds="straighten roll upright"),
         Command("align the up axis with the view", partial(viewpoint.move, step=adopt_up),
                 button="Align up axis"),
-        _side("front", "Keypad1"),
-        _side("back", "Ctrl+Keypad1"),
-        _side("right", "Keypad3"),
-        _side("left", "Ctrl+Keypad3"),
-        _side("top", "Keypad7"),
-        _side("bottom", "Ctrl+Keypad7"),
+        *(Command(f"look from {where}", partial(viewpoint.look_from, side=side), (key,))
+          for side, (where, key) in SIDES.items()),
         Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True,
                 finds="perspective parallel projection 2d"),
         Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True,
                 finds="save camera remember favourite favorite"),
-        Command("add a keyframe here", viewpoint.add_keyframe, ("K",), "Add keyframe"),
+        Command("add a keyframe here", viewpoint.add_keyframe, ("K",), button="Add keyframe"),
         Command("make the path a turn around the view's centre", viewpoint.turn_around, button="Turntable",
                 finds="turntable orbit spin rotate 360 film"),
         Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",)),
@@ -248,7 +245,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
     ),
     "Help": (
         Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),
-        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "First steps",
+        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), button="First steps",
                 finds="help shortcuts keyboard manual tutorial documentation about"),
     ),
 }  # fmt: skip

@@ -369,7 +369,7 @@ def use_the_mouse_alone(s: Any) -> None:
     s.drag((x - 30, y - 60), (x + 30, y - 60))  # the first number of "Move"
     assert 0.01 < s.state.edit_form.move[0] / s.state.open.extent.radius < 0.1
     stops, out, done = Event(), s.folder / "trained.ply", {f"stage {n}": 1.0 for n in range(200)}
-    said, by = SimpleNamespace(stages=done, left="", curves={}, said=[]), stops.set
+    said, by = SimpleNamespace(stages=done, stage="", left="", curves={}, said=[]), stops.set
     training = SimpleNamespace(
         progress=said, out=out, exit_code=None, interrupt=by, end=by, interrupted=False
     )

@@ -18,6 +18,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer import viewer as training_process
 from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.disk import IN_TRAINING, write_preview
+from langsplat_viewer.panels.menus import figures
 from langsplat_viewer.panels.scene import waits_for
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.viewer import PREVIEW_EVERY, ProcessProgress, training_words
@@ -111,6 +112,8 @@ def test_training_is_stopped_and_runs_once(viewer, begin):
     assert "under way" in errors(viewer)[-1]
     opening.look_at_training(viewer)
     assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
+    (said, _), *_ = figures(viewer)  # whatever panel is open
+    assert said.startswith("training photos.ply: ")
     process = viewer.training.process
     viewer.training.interrupt()
     assert "kernels" in waits_for(viewer.training)

@@ -246,21 +246,21 @@ EXPORTS = {
     ),
     "cleaned copy": ExportRow(
         "clean {scene} {out}", "Without floaters: small regions that touch nothing, and veils in free space.",
-        SCENE_SIZES, ("--max-psnr-loss",), at_most=True, beside=True, finds="floaters remove tidy",
+        SCENE_SIZES, options=("--max-psnr-loss",), at_most=True, beside=True, finds="floaters remove tidy",
     ),
     "compacted copy": ExportRow(
         "compact {scene} --out {out}", "Without Gaussians and colours that the views do not need.",
-        SCENE_SIZES, ("--max-psnr-loss",), at_most=True, beside=True,
+        SCENE_SIZES, options=("--max-psnr-loss",), at_most=True, beside=True,
         finds="compress smaller prune shrink reduce",
     ),
     "mesh": ExportRow(
         "mesh {scene} {out}", "Triangles with colours: .glb in metres with y up, .ply in the scene's units.",
-        {".glb": (15e6, 0, 0), ".ply": (15e6, 0, 0)}, ("--watertight",), at_most=True,
+        {".glb": (15e6, 0, 0), ".ply": (15e6, 0, 0)}, options=("--watertight",), at_most=True,
         finds="triangles surface glb geometry print",
     ),
     "map for a robot": ExportRow(
         "map {scene} {out} {encoder}", "Occupancy grid, labelled voxels and a collider, into a folder.",
-        {"": (5e6, 0, 0)}, (CELL, UNIT), finds="occupancy ros navigation voxels collider",
+        {"": (5e6, 0, 0)}, options=(CELL, UNIT), finds="occupancy ros navigation voxels collider",
     ),
     "labels": ExportRow(
         "describe {scene} --labels {out} {encoder}", "The scene with instance, part and class of each "

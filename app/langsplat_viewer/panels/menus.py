@@ -124,7 +124,7 @@ def draw_status(viewer: Viewer, foot: Sequence[str]) -> None:
         if ui.stoppable(*work, BAR_EM):
             opening.cancel(viewer)
         imgui.same_line()
-    for text, about in _figures(viewer):
+    for text, about in figures(viewer):
         if imgui.get_cursor_pos_x() + ui.width_of(text) > right:
             break
         ui.coloured(text)
@@ -142,9 +142,13 @@ def draw_status(viewer: Viewer, foot: Sequence[str]) -> None:
     imgui.end()
 
 
-def _figures(viewer: Viewer) -> Iterator[tuple[str, str]]:
-    """Yield figures of the scene, the selection and the image: words and their tip."""
+def figures(viewer: Viewer) -> Iterator[tuple[str, str]]:
+    """Yield figures of a training, the scene, the selection and the image: words and their tip."""
     state, stats = viewer.state, viewer.state.stats
+    if viewer.training is not None:
+        progress = viewer.training.progress
+        name, done = viewer.training.out.name, 100 * progress.stages.get(progress.stage, 0)
+        yield f"training {name}: {progress.stage or 'starting'}, {done:.0f} %", "Stop is in the panel Train"
     if state.path is not None:
         yield f"{state.path.name}: {state.count:,} Gaussians", str(state.path)
     selected = np.count_nonzero(state.marks.selected)
