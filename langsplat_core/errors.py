@@ -39,8 +39,7 @@ def quoted(content: object, limit: int = 60) -> str:
 class LangSplatError(Exception):
     """Base of every error that the command line turns into one line and exit code 2.
 
-    Whatever a file brought into the message, `str()` of it is a `printable_line`. Who quotes a file or
-    another program's error shortens it, with `printable_line` too.
+    `str()` of it is a `printable_line`, whatever a file brought; who quotes a file or an error shortens it.
     """
 
     def __str__(self) -> str:

@@ -487,7 +487,7 @@ def test_numbers_outside_their_range_are_refused_by_name(name: str, option: str,
     [
         ("--radiance.sh-degree 4", "--radiance.sh-degree 4: must be 0 to 3"),
         ("--codec.kind linear --codec.latent-dim 0", "--codec.latent-dim 0: must be 1 to 4096"),
-        ("--codec.kind vq", "invalid choice 'vq' for argument '--codec.kind'"),
+        ("--codec.kind vq", "--codec.kind: expected one of 'codebook', 'autoencoder', 'linear', not 'vq'"),
         ("--codec.steps 7", "--codec.steps: is no setting of a codec of kind codebook"),
         ("--codec.kind=linear --max_relevancy-error 1", "--codec.max-relevancy-error: is no setting of"),
     ],

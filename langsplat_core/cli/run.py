@@ -41,6 +41,21 @@ ROLES = constructors.ConstructorRegistry()  # the rules for help and for names o
 _ASKED = object()  # the mark of what tyro itself is asked
 _ROOM = "make room, or choose another place; what was finished is kept"
 
+REWORDED = {  # what tyro says, with Python's types -> the same for people, in this order
+    r"Missing value for argument 'command\.(\w+)'.*":
+    r"\1 is missing; is there an unknown option, or a file '-NAME' in place of './-NAME'?",
+    r"Error parsing (\S+): no type matching (.*?) could be instantiated from (\[.*?\])\. Got.*":
+    r"\1: expected \2, got \3",
+    r"Error parsing (\S+): .*? (\[.*?\]) into tuple type tuple\[typing\.Literal\[(.*?)\], .*?float.*\]":
+    r"\1: expected one of \3 and a number, got \2",
+    r"Error parsing (\S+): .*? (\[.*?\]) into tuple type .*float.*": r"\1: expected numbers, got \2",
+    r"Error parsing (.*): Could not find valid parse for arguments: (.*)": r"\1: cannot be made of \2",
+    r"invalid choice (.*) for argument '(.*)'\. Expected one of \((.*)\).": r"\2: expected one of \3, not \1",
+    r", 'None'|'None', |Error parsing (?=[^ ]+:)": "",
+    r"expected \{FLOAT.*?\}": "expected numbers", "expected FLOAT": "expected a number",
+    r"invalid literal for int\(\) with base 10: |expected INT, got ": "expected a whole number, got ",
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Verbosity:
@@ -76,13 +91,8 @@ def one_line(box: str) -> str:
         elif said:
             break
     words = " ".join(" ".join(said).split()).replace(" (required)", "") or title.strip(" ╭╮─").lower()
-    hint = r"\1 is missing; is there an unknown option, or a file '-NAME' in place of './-NAME'?"
-    words = re.sub(r"Missing value for argument 'command\.(\w+)'.*", hint, words)
-    optional = r"Error parsing (\S+): no type matching (.*?) could be instantiated from (\[.*?\])\. Got.*"
-    words = re.sub(optional, r"\1: expected \2, got \3", words)
-    pair = r"Error parsing (\S+): .*? (\[.*?\]) into tuple type tuple\[typing\.Literal\[(.*?)\], .*?float.*\]"
-    words = re.sub(pair, r"\1: expected one of \3 and a number, got \2", words)
-    words = re.sub(r"invalid literal for int\(\) with base 10: ", "expected a whole number, got ", words)
+    for of_tyro, plain in REWORDED.items():
+        words = re.sub(of_tyro, plain, words)
     if "Perhaps you meant:" in body:
         near = dict.fromkeys(line.split()[0].strip(",") for line in body if re.match("--[a-z]", line))
         words += f"; did you mean {' or '.join(near)}?"

@@ -121,8 +121,7 @@ def _jacobian(distortion: Distortion, xy: Array) -> Array:
 def undistorted_points(distortion: Distortion, distorted: Array) -> Array:
     """Return (N, 2) normalised coordinates of distorted ones, by Newton's method from the radial inverse.
 
-    Points that the lens cannot have seen within the invertible radius come back on that radius.
-    Raises ValueError if the distortion is singular on the axis itself.
+    Points beyond the invertible radius come back on it. ValueError for a distortion singular on the axis.
     """
     radii, profile = _radial_profile(distortion)
     if len(radii) < 2:
@@ -145,9 +144,8 @@ def undistorted_points(distortion: Distortion, distorted: Array) -> Array:
 def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
     """Return the pinhole camera (identity pose) that a photograph is resampled to.
 
-    It shows the largest upright rectangle with no pixel from outside the photograph (OpenCV's
-    ``alpha = 0``), with the lens's own central magnification, then shrunk so that the longer side has at
-    most `max_side` pixels. InputError if the lens leaves no such rectangle.
+    It shows the largest upright rectangle inside the photograph (OpenCV's ``alpha = 0``), magnified as in
+    its centre, then shrunk to at most `max_side` pixels. InputError if the lens leaves no such rectangle.
     """
     if intrinsics.distortion is None:
         scale = min(1.0, max_side / max(intrinsics.width, intrinsics.height))

@@ -128,8 +128,7 @@ def _small_copies(
 ) -> list[workspaces.CameraGroup]:
     """Write copies of at most `side` pixels that COLMAP can read and finds the same way up as we do.
 
-    Photographs of one size and one set of optics (maker, camera, focal length) share a camera. Unreadable
-    files are left out, which is said of the small copies, the first that are made.
+    Photographs of one size and optics (maker, camera, focal length) share a camera; unreadable ones go.
     """
     members: dict[tuple[tuple[int, int], str], list[str]] = {}
     broken = []

@@ -217,8 +217,7 @@ def decode_spz(data: bytes, path: Path, room: Allowance, tell: Tell) -> Scene:
 def _floor_is_above(path: Path, scene: Scene) -> bool:
     """Return True if a height near the top has twice the horizontal surface of any near the bottom.
 
-    Up is that of the cameras beside the file, or beside a .ply of its name. In real scenes in the right
-    orientation the floor has 3 to 200 times the surface of any height near the top.
+    Up is that of cameras beside it or a .ply of its name. Upright, floors are 3 to 200 times a top's surface.
     """
     for beside in (path.with_suffix(SUFFIX), path.with_name(path.name + SUFFIX)):
         with suppress(InputError):  # reported when the scene's cameras are read

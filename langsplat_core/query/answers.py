@@ -109,8 +109,7 @@ SIDE = 5.0  # of that grid, in standard deviations of the points along the wides
 def smoothed(points: Array, values: Array) -> Array:
     """Return (K,) means of `values` around (K, 3) points, over about as many as a surface has neighbours.
 
-    Values are splatted to the corners of a grid's cells, which grow with the answer, and interpolated there
-    again, without a search for neighbours. The exported page does the same.
+    Values are splatted to corners of a grid that grows with the answer, and interpolated, also in pages.
     """
     if len(points) == 0:
         return values

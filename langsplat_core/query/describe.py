@@ -235,8 +235,7 @@ def look_at_pixel(
 ) -> Pointed | None:
     """Return the surface that `camera` sees at a pixel (column, row); None if the pixel is mostly empty.
 
-    Every Gaussian counts by its blending weight there; the depth is the median by these weights, as in the
-    rasterizers. `settings` of image formation: by default the scene's own.
+    Every Gaussian counts by its blending weight; the depth is the median. settings: by default the scene's.
     """
     scene = describer.engine.scene
     rows, weights = pixel_weights(scene, camera, pixel, settings)

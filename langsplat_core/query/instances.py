@@ -153,8 +153,7 @@ def find_instances(
 ) -> tuple[Instance, ...]:
     """Return the instances among `members` (N,) bool, best score first, of equal ones the larger first.
 
-    relevancy: (N,) in [0, 1], at the level of the answer. wholes, join: see `split_instances`. at_most: how
-    many. Crumbs are left out; if all are crumbs, the largest is kept.
+    relevancy: (N,) at the answer's level; wholes, join: see `split_instances`. Of crumbs alone one stays.
     """
     every = np.flatnonzero(members)
     numbers, labels = surface.anchors[every], np.full(len(every), -1)

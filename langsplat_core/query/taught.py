@@ -49,8 +49,7 @@ class WordSpace:
 def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> WordSpace:
     """Return the word space of a scene; without everyday phrases it is the whole space of vectors.
 
-    votes: (K,) of the tree's nodes. If masks voted, mean and rival are taken over regions with a vote: the
-    others are mostly fragments of walls and floors, many of one instance.
+    votes: (K,) of the tree's nodes. Mean and rival are over regions with a vote: most others are fragments.
     """
     basis = np.eye(field.codec.vector_dim, dtype=np.float32)
     if field.everyday is not None and len(field.everyday) > 1:

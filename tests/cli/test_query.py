@@ -358,6 +358,8 @@ def test_words_taught_at_once_are_all_kept(described, into):
         ("inspect --jsn", "scene is missing; is there an unknown option"),
         ("inspect a.ply --jsn", "--jsn; did you mean --json?"),
         ("query a.ply mug --instances 1e3", "--instances: expected a whole number, got '1e3'"),
+        ("query a.ply mug --scale x", "--scale: expected a number, got ['x']"),
+        *((f"transform a.ply b.ply --{one} x y z", "expected numbers, got") for one in ("move", "matrix")),
         ("transform a.ply b.ply --rotate q 3", "--rotate: expected one of 'x', 'y', 'z' and a number"),
         ("transform a.ply b.ply --rotate x nan", "--rotate x nan: must be -360 to 360"),
         ("train loop --out b.ply", "loop does not exist"),

@@ -1,5 +1,4 @@
-"""Formats other than PLY: .splat, .spz and SOG, each against an encoder of the tests' own, glTF with
-KHR_gaussian_splatting, and points and meshes for other programs."""
+"""Formats other than PLY: .splat, .spz and SOG against the tests' own encoders, glTF, points and meshes."""
 
 import gzip
 import json

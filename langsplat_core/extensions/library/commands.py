@@ -43,7 +43,7 @@ class Find:
     json: JsonOption = False
 
     def run(self) -> None:
-        if len(self.words) < 2:
+        if len(self.words) < 2 or not self.words[-1]:
             raise InputError("give phrases and a folder; for example: langsplat find 'blue gift' scans")
         phrases = [phrase for text in self.words[:-1] for phrase in split_phrases(text) or [text]]
         load = once(load_text_encoder, self.encoder)
