@@ -1,13 +1,12 @@
 """Camera files as the INRIA code writes them beside a scene: `scene.cameras.json`.
 
 A JSON list with one object per camera:
-
     id            number in the list
     img_name      file name of the photograph, without its suffix
     width, height pixels
     position      [x, y, z] of the camera in the world
     rotation      camera-to-world, three rows; OpenCV axes (x right, y down, z forward)
-    fx, fy        pixels
+    fx, fy        pixels; of a camera that is also "orthographic": true, pixels per world unit
     cx, cy        pixels, principal point from the top left corner; absent, as in INRIA's files: the centre
 """
 
@@ -44,6 +43,7 @@ class _Entry(Struct):
     img_name: str = ""
     cx: float | None = None
     cy: float | None = None
+    orthographic: bool = False
 
 
 def read_cameras(path: Path | str) -> tuple[Camera, ...]:
@@ -67,6 +67,7 @@ def write_cameras(path: Path | str, cameras: tuple[Camera, ...]) -> None:
             "id": index,
             "img_name": camera.name,
             **vars(camera.intrinsics),
+            **({"orthographic": True} if camera.orthographic else {}),
             "position": camera.position.tolist(),
             "rotation": camera.rotation.T.tolist(),
         }
@@ -81,12 +82,12 @@ def _camera(entry: _Entry, what: str) -> Camera:
     rotation = np.array(entry.rotation)
     pose = affine(rotation.T, -rotation.T @ np.array(entry.position))
     # Newer INRIA files have the photograph's suffix; the dot in a name such as "frame.01" is kept.
-    name = entry.img_name
-    ending = next((suffix for suffix in PHOTO_SUFFIXES if name.lower().endswith(suffix)), "")
+    stem, dot, suffix = entry.img_name.rpartition(".")
+    name = stem if dot + suffix.lower() in PHOTO_SUFFIXES else entry.img_name
     cx = entry.width / 2 if entry.cx is None else entry.cx
     cy = entry.height / 2 if entry.cy is None else entry.cy
     size = int(entry.width), int(entry.height)
     try:
-        return Camera(*size, entry.fx, entry.fy, cx, cy, pose, name[: len(name) - len(ending)])
+        return Camera(*size, entry.fx, entry.fy, cx, cy, pose, name, entry.orthographic)
     except ValueError as error:  # such as fx = 0
         raise malformed(what, f"{error}") from None

@@ -53,7 +53,8 @@ WRITTEN = [pytest.param(row, marks=MARKS * (row not in CORE_FORMATS)) for row in
 
 
 def full_scene(seed: int = 0) -> Scene:
-    cameras = tuple(replace(random_camera(i, width=70 + i), name=f"Tür {i}.a") for i in range(3))
+    cameras = [replace(random_camera(i, width=70 + i), name=f"Tür {i}.a") for i in range(3)]
+    cameras[1] = replace(cameras[1], orthographic=True)
     return Scene(random_gaussians(N, seed, sh_degree=1), random_field(N, seed=seed), cameras)
 
 

@@ -1,8 +1,7 @@
 """The field's own packages, open_clip, segment_anything and sam2, with random weights at full size.
 
-`make parity` puts them into a folder beside the environment, without what they depend on: torchvision as PyPI
-has it is compiled for CUDA, so that beside the CPU build of torch its compiled part does not load and its
-import fails. What these packages need of that part is the suppression of boxes, which is written here.
+`make parity` puts them into a folder beside the environment, without torchvision: PyPI's is made for CUDA,
+and its import fails beside the CPU build of torch. Of it they need the suppression of boxes, written here.
 """
 
 import importlib

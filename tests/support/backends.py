@@ -1,5 +1,4 @@
-"""Rasterizers that load here, how far each may be from the reference, and comparisons with it; OpenGL
-contexts; figures that accuracy tests measured. The fixtures are offered to all by `conftest.py`.
+"""Rasterizers that load here, comparisons with the reference, OpenGL contexts, and measured figures.
 
 Image formation has steps: an alpha of just 1/255 counts or does not, a transmittance of just 1e-4 stops a
 pixel or does not. Pixels where rounding may decide are the *band*: a counted allowance of them may differ.

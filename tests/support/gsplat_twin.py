@@ -2,7 +2,6 @@
 
 Arithmetic and its order are those of gsplat's CUDA code, in float32, without tiles: every pixel is asked of
 every Gaussian. One camera, no packing, no depth modes: what `raster.gsplat` asks for.
-
 It cannot show gsplat's Python code, compiling, `-use_fast_math`, the order of atomic sums, time and memory.
 """
 

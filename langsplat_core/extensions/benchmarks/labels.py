@@ -234,7 +234,7 @@ def _box(stored: Any, polygon: Array) -> Array:
 # 3D-OVS (Liu et al. 2023): one mask image per view and class.
 #
 # <scene>/segmentations/classes.txt           one class a line
-# <scene>/segmentations/<view>/<class>.png    bright inside, of any size
+# <scene>/segmentations/<view>/<class>.png    bright inside, of any size and kind
 # <scene>/images/<view>.jpg                   the photograph, whose grid is scored
 
 WANTED_PICTURES = "expected segmentations/classes.txt in it, or in folders of it, one per scene"
@@ -258,7 +258,8 @@ def _read_ovs3d_scene(folder: Path) -> LabelledScene:
     classes = _classes(folder / "segmentations" / "classes.txt")
     stray, frames = [], []
     for view in sorted(path for path in (folder / "segmentations").iterdir() if path.is_dir()):
-        files = {normalize("NFC", path.stem): path for path in sorted(view.glob("*.png"))}
+        masks = (path for path in sorted(view.iterdir()) if path.suffix.lower() in PHOTO_SUFFIXES)
+        files = {normalize("NFC", path.stem): path for path in masks}
         stray += [f"{view.name}: {name} (not in classes.txt)" for name in files if name not in classes]
         labels = tuple(
             LabelledPhrase(name, (MaskFile(files[name]),), None) for name in classes if name in files

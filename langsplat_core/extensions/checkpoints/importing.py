@@ -566,10 +566,9 @@ def import_scene(
     """Return the scene with its language field, and the errors of its codec on vectors not fitted to.
 
     Without features there is no field, and no errors are measured for the method's own codec. encoder_id: the
-    text encoder of the method's vectors, by default that of LangSplat; phrases: to encode and store. The
-    confidence of a Gaussian is 1 if it has a feature, else 0. Raises EncoderError if the encoder cannot be
-    loaded, InputError if its vectors have another length or no Gaussian has a feature, FormatError for
-    features that are not finite.
+    text encoder of the vectors, by default that of LangSplat; phrases: to encode and store. Confidences are 1
+    with a feature, else 0. EncoderError for an encoder that cannot be loaded, InputError if its vectors have
+    another length or no Gaussian has a feature, FormatError for features that are not finite.
     """
     config = config or CodecConfig()
     check_settings(config, "--codec.")

@@ -1,11 +1,10 @@
 """Compaction of scenes within an error budget: fewer Gaussians, a lower SH degree, no training.
 
 Some views of a scene rank its Gaussians, others measure the loss of images without some of them. For every SH
-degree that the budget allows by itself, from the scene's own downward, the smallest number of Gaussians
-within the budget is found by bisection; the degree with the fewest numbers wins. The contribution of the last
-Gaussian that is kept is then a threshold for the measuring views: Gaussians that contribute more to any of
-them are kept, too. Everything is measured as the target format stores it, and the written file is read back
-and measured before it is renamed to its final name.
+degree that the budget allows by itself, the smallest number of Gaussians within the budget is found by
+bisection; the degree with the fewest numbers wins. Gaussians that contribute more to any measuring view than
+the last one that is kept are kept, too. All is measured as the target format stores it, and the written
+file is read back and measured before it is renamed.
 
 **Contribution.** In a view with blending weights w (a row of W per pixel p), taking Gaussian i of colour c_i
 away changes pixel p by about w_pi (c_i - C_p): its weight times its distance from the image C. The adjoint

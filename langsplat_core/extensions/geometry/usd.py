@@ -171,7 +171,7 @@ def _read(
     if not prims:
         raise errors.malformed(path, f"holds no {TYPE}", "meshes are not read, nor files that it refers to")
     room = hostile.Allowance(path, size, hostile.SMALL_RATIO)
-    parts = [(_place(layer, prim), _gaussians(layer, prim, path, room, told)) for prim in prims]
+    parts = [(_place(layer, prim, told), _gaussians(layer, prim, path, room, told)) for prim in prims]
     kept = None
     with suppress(msgspec.MsgspecError, LookupError, TypeError):  # custom data may be anything
         kept = msgspec.json.decode(prims[0].customData[OWN], type=Kept)
@@ -217,7 +217,7 @@ def _gaussians(layer: Any, prim: Any, path: Path, room: hostile.Allowance, told:
     return Gaussians(positions, log_scales, orientations[:, [3, 0, 1, 2]], logits, sh)
 
 
-def _place(layer: Any, prim: Any) -> Array:
+def _place(layer: Any, prim: Any, told: list[str]) -> Array:
     """Return the (4, 4) matrix from a prim's axes to the world's, with y up, as usd-core computes it.
 
     Only the transform operations of the prims are copied into a new stage.
@@ -229,6 +229,8 @@ def _place(layer: Any, prim: Any) -> Array:
         own = UsdGeom.Xform.Define(alone, above)
         for attribute in layer.GetPrimAtPath(above).attributes:
             if attribute.name.startswith("xformOp"):
+                if len(times := layer.ListTimeSamplesForPath(attribute.path)) > 1:
+                    told.append(f"the first of {len(times)} moments of {attribute.name} is taken")
                 Sdf.CopySpec(layer, attribute.path, alone.GetRootLayer(), attribute.path)
     matrix = np.array(own.ComputeLocalToWorldTransform(Usd.TimeCode.EarliestTime())).T
     return Z_TO_Y @ matrix if layer.pseudoRoot.GetInfo("upAxis") == "Z" else matrix

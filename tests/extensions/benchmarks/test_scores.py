@@ -96,6 +96,7 @@ def test_3d_ovs(tmp_path):
     scene = tmp_path / "bench"
     ovs_view(scene, "00", {"red cup": block(1, 1, 8, 8), "wall": block(0, 20, 39, 29)})
     ovs_view(scene, "1.5", {"wall": block(0, 0, 3, 3)})
+    (scene / "segmentations/1.5/wall.png").rename(scene / "segmentations/1.5/wall.JPG")
     found = only_scene(read_3d_ovs(tmp_path))
     frames = [(f.name, f.size, [x.phrase for x in f.labels]) for f in found.frames]
     assert frames == [("00", SIZE, ["red cup", "wall"]), ("1.5", SIZE, ["wall"])]

@@ -706,7 +706,7 @@ def test_a_stage_of_another_program_is_placed_by_its_transforms(tmp_path, caplog
     long = np.array([1 - 2 * 0.8**2, 2 * 0.6 * 0.8, 0]) * 0.3  # x, turned about z
     np.testing.assert_allclose(np.abs(axes[:, 0]), np.abs(long @ matrix[:3, :3] @ to_ours), atol=1e-3)
     np.testing.assert_allclose(1 / (1 + np.exp(-got.gaussians.opacity_logits)), [0.9, 0.5, 0.25], atol=1e-6)
-    for said in ("2 moments of opacities", "'Mesh'", "/World/Splats", "refers to, 'table.usd'"):
+    for said in ("2 moments of opacities", "of xformOp:scale", "'Mesh'", "/World/Splats", "to, 'table.usd'"):
         assert said in caplog.text
     broken = {"scales its axes unlike": ("(2, 2, 2)", "(2, 1, 1)"), "do not fit degree": ("= 0\n", "= 1\n")}
     broken |= {"holds no Particle": ("3DGaussianSplat", ""), "has no scales": ("[] scales", "[] s")}
