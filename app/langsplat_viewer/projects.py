@@ -389,9 +389,8 @@ def save_preferences(folder: Path, preferences: Preferences, before: Preferences
                 there = load_preferences(folder, preferences)
                 if "recent" in changed:
                     new = [path for path in preferences.recent if path not in before.recent]
-                    recent = dict.fromkeys(
-                        (*(new or preferences.recent[:1]), *there.recent, *preferences.recent)
-                    )
+                    latest = new or preferences.recent[:1]
+                    recent = dict.fromkeys((*latest, *there.recent, *preferences.recent))
                     changed["recent"] = tuple(recent)[:MOST_RECENT]
                 preferences = replace(there, **changed)
         write_whole(folder / FILE_NAME, msgspec.json.format(msgspec.json.encode(preferences), indent=1))

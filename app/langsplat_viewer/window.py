@@ -288,9 +288,8 @@ class Window:
         if (span := options.orthographic) is not None:
             viewpoint.move(viewer, lambda view: spanning(view, span))
         wanted = options.picture
-        settings.set_picture(
-            viewer, replace(state.session.picture, heat=wanted.heat, heat_scale=wanted.heat_scale)
-        )
+        picture = replace(state.session.picture, heat=wanted.heat, heat_scale=wanted.heat_scale)
+        settings.set_picture(viewer, picture)
         if options.path is not None:
             viewpoint.load_path(viewer, options.path)
         queries.set_level(viewer, options.level)

@@ -263,8 +263,7 @@ def test_a_played_path_goes_through_its_keyframes(opened):
         viewpoint.tick(opened, 100.0 + seconds)
         assert_allclose(opened.state.open.view.eye, view.eye, atol=1e-9)
         assert_allclose(opened.state.open.view.rotation, view.rotation, atol=1e-9)
-    assert opened.state.record.began is None  # it has ended
-    assert opened.state.record.at == 4
+    assert (opened.state.record.began, opened.state.record.at) == (None, 4)  # it has ended
 
 
 def test_playing_resumes_loops_and_ends_with_a_drag(opened):
@@ -380,6 +379,11 @@ def test_films_are_made_beside_the_window(opened, tmp_path, frames, monkeypatch)
     monkeypatch.setenv("USERPROFILE", str(tmp_path))
     opened.state.record.film_file = "~/typed"
     saving.save_film(opened, tmp_path)
+    settings.compare(opened, "scenes")
+    saving.save_sized_picture(opened, tmp_path)
+    saving.save_film(opened, tmp_path)
+    said = [message.text for message in opened.state.messages[-2:]]
+    assert all("without the compared scene" in text for text in said)
     recorded(opened)
     assert [len(list((tmp_path / name).glob("*.png"))) for name in ("blobs-film-002", "typed")] == [5, 5]
     assert "blobs-film-001/: 32x24, 5 pictures" in " ".join(m.text for m in opened.state.messages)

@@ -45,8 +45,7 @@ def test_scene_without_field_says_what_makes_one(viewer):
     assert errors(viewer) == []
     queries.ask(viewer, "mug")
     settings.set_display(viewer, "latent")
-    assert viewer.state.session.queries == ()
-    assert viewer.state.session.picture.display == "rgb"
+    assert (viewer.state.session.queries, viewer.state.session.picture.display) == ((), "rgb")
     assert "langsplat train" in errors(viewer)[-1]
 
 
@@ -62,8 +61,7 @@ def test_cancelled_opening_shows_nothing(viewer):
     queries.focus_search(viewer)
     assert errors(viewer) == ["blobs.ply is being opened: wait for it, then search it"]
     opening.cancel(viewer)
-    assert viewer.worker.current is None
-    assert viewer.state.opening is None
+    assert (viewer.worker.current, viewer.state.opening) == (None, None)
     release.set()
     viewer.worker.submit("after it", lambda progress: None, lambda nothing: None, pytest.fail)
     settle(viewer)

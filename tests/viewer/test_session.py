@@ -70,8 +70,7 @@ def test_undo_and_redo_restore_queries(opened):
     act(editing.redo, opened)
     assert phrases(opened) == ["mug", "book"]
     assert [query.slot for query in opened.state.session.queries] == [0, 1]
-    assert opened.state.session.picture.display == "relevancy"
-    assert len(opened.state.shown_results()) == 2
+    assert (opened.state.session.picture.display, len(opened.state.shown_results())) == ("relevancy", 2)
     editing.redo(opened)
     assert "nothing to redo" in opened.state.messages[-1].text
 

@@ -98,6 +98,8 @@ def save_sized_picture(viewer: Viewer, seen: OpenScene, folder: Path = Path()) -
             output.save_png(path, output.draw_something(request, renderer))
         return path, f"saved {path}"
 
+    if state.session.split.mode == "scenes":
+        state.say(f"the picture is of {seen.path.name} alone, without the compared scene")
     _record(viewer, f"picture of {width} x {height}", work)
 
 
@@ -153,6 +155,8 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
         out = named()  # a free name may have been taken by an earlier film meanwhile
         return out, "; ".join(output.make_film(request, seen_by, fps, out, "cpu", progress))
 
+    if state.session.split.mode == "scenes":
+        state.say(f"the film is of {state.open.path.name} alone, without the compared scene")
     _record(viewer, "film", work)
 
 

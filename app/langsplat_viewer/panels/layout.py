@@ -261,9 +261,8 @@ def draw_over(
         select.draw_hint(viewer, free)
         select.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
-    toasts.draw(
-        viewer, area, search.why(viewer) if search.TITLE in opened(state) and state.show_panel else ""
-    )
+    read = search.why(viewer) if search.TITLE in opened(state) and state.show_panel else ""
+    toasts.draw(viewer, area, read)
     dialogs.draw_changed(viewer, free)
     dialogs.draw_unsaved(viewer)
     dialogs.draw_export(viewer)

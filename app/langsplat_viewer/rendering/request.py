@@ -139,10 +139,9 @@ def edited_scene(source: Scene, marks: Marks | None = None, before: EditedScene 
     else:  # images need neither the language field nor what else a file holds
         rows = np.flatnonzero(marks.shown)
         scene = replace(source, gaussians=source.gaussians.take(rows), language=None, extras={})
-    selected = marks.selected if rows is None else marks.selected[rows]
-    return EditedScene(
-        source, marks, scene, rows, selected[:, None].astype(np.float32) if selected.any() else None
-    )
+    chosen = marks.selected if rows is None else marks.selected[rows]
+    selected = chosen[:, None].astype(np.float32) if chosen.any() else None
+    return EditedScene(source, marks, scene, rows, selected)
 
 
 # The request.
