@@ -51,6 +51,7 @@ REWORDED = {  # what tyro says, with Python's types -> the same for people, in t
     r"Error parsing (\S+): .*? (\[.*?\]) into tuple type .*float.*": r"\1: expected numbers, got \2",
     r"Error parsing (.*): Could not find valid parse for arguments: (.*)": r"\1: cannot be made of \2",
     r"invalid choice (.*) for argument '(.*)'\. Expected one of \((.*)\).": r"\2: expected one of \3, not \1",
+    r"(expected PATH, got|cannot be made of) \[''\]": "an empty name; is a variable of the shell not set?",
     r", 'None'|'None', |Error parsing (?=[^ ]+:)": "",
     r"expected \{FLOAT.*?\}": "expected numbers", "expected FLOAT": "expected a number",
     r"invalid literal for int\(\) with base 10: |expected INT, got ": "expected a whole number, got ",
