@@ -42,9 +42,13 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
 
 
 def check_dataset(path: Path) -> None:
-    """Raise InputError unless a file, or a folder with something in it, lies at `path`."""
+    """Raise InputError unless what may be a dataset, by names alone, lies at `path`."""
     if not os.path.exists(path) or (path.is_dir() and not os.listdir(path)):  # Path.exists may raise
         raise InputError(f"{shown(path)} does not exist or is empty; expected {ACCEPTED}")
+    marks = *TRANSFORMS, "sparse", "colmap", "cameras.bin", "cameras.txt"
+    signs = any((path / name).exists() for name in marks)
+    if not (signs or path.suffix.lower() == ".json" or is_video(path) or photo_folder(path)[1]):
+        raise InputError(f"{shown(path)} is no dataset; expected {ACCEPTED}")
 
 
 def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
@@ -62,8 +66,6 @@ def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Pr
         if is_video(path):
             path = kept_frames(path, config.frames, work, progress)
         folder, photos = photo_folder(path)
-        if not photos:
-            raise InputError(f"{path} is no dataset; expected {ACCEPTED}")
         say_unread(path, folder, photos)
         return load_photos(folder, photos, config, work, progress)
     except PermissionError as error:

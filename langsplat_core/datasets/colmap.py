@@ -352,8 +352,7 @@ def located_photos(model: SparseModel, folder: Path) -> list[Photo]:
 def good_points(model: SparseModel, source: str = "") -> tuple[Array, Array]:
     """Return (M, 3) points and (M, 3) colours without those that are plainly wrong, reported by their source.
 
-    These are not finite, seen by a single image, or reprojected more than 4 pixels off, as COLMAP's mapper
-    would not leave them. Unknown errors and tracks count as good.
+    These are not finite, of one image, or over 4 px off: COLMAP leaves none. Unknown errors count as good.
     """
     points = model.points
     good = np.isfinite(points["position"]).all(1) & ~(points["error"] > 4) & (points["track"] != 1)

@@ -370,8 +370,7 @@ def write_gltf(path: Path | str, scene: Scene) -> None:
     """Write a .glb, or a .gltf with its buffer inside, atomically; rows keep their order.
 
     Positions and colours are exact; scales, quaternions (normalised) and opacities are rounded to float32.
-    COLOR_0 is the linear base colour of points, for programs without the extension. A row that cannot be
-    drawn is written with opacity 0. Raises InputError beyond the 4 GiB of a .glb.
+    COLOR_0 is the linear base colour, for programs without the extension. What cannot be drawn has opacity 0.
     """
     file, gaussians = GltfWriter(EXTENSION), scene.gaussians
     if len(gaussians):

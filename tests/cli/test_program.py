@@ -81,7 +81,7 @@ def test_unknown_commands_and_shells_are_named(words, said):
 
 def test_empty_names_are_refused(capsys):
     """As of a shell's variables that are not set: `Path` takes them for "."."""
-    for line in ("inspect ", "train  -o a.ply", "select a.ply x -o ", "export a.ply ", "query a.ply x --work "):
+    for line in ("inspect ", "train  -o a", "select a.ply x -o ", "export a.ply ", "query a.ply x --work "):
         assert "an empty name; is a variable" in refusal(capsys, *line.split(" "))
 
 

@@ -363,6 +363,7 @@ def test_words_taught_at_once_are_all_kept(described, into):
         ("transform a.ply b.ply --rotate q 3", "--rotate: expected one of 'x', 'y', 'z' and a number"),
         ("transform a.ply b.ply --rotate x nan", "--rotate x nan: must be -360 to 360"),
         ("train loop --out b.ply", "loop does not exist"),
+        ("train a.ply --out b.ply", "a.ply is no dataset; expected"),  # before weights are asked for
         ("convert b.ply", "name what to read"),
         ("convert a.ply out --to nothing", "choose one of scene"),
         *((f"{one} a.ply a.ply", "would replace") for one in REPLACING.split(",")),

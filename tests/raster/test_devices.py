@@ -1,7 +1,6 @@
 """The rasterizers of graphics devices.
 
-OpenGL against the reference, and what it does to its context; the CUDA backend's own code, over the twin of
-gsplat. The slow tier runs the twin on all tests of rasterizers.
+OpenGL against the reference; the CUDA backend over the twin of gsplat, which the slow tier runs on all tests.
 """
 
 import os
