@@ -27,7 +27,7 @@ from langsplat_core.query.instances import Instance, find_instances, find_wholes
 from langsplat_core.query.lookup import Lookup, Relevancy, through_cells
 from langsplat_core.query.rule import Bars, bars_of, decide, on_things, scaling_of, with_pieces
 from langsplat_core.query.texts import LoadEncoder, TextVectors
-from langsplat_core.scene import LEVELS, Calibration, LanguageField, Scene, TaughtWord, Tree
+from langsplat_core.scene import LEVELS, NO_NODE, Calibration, LanguageField, Scene, TaughtWord, Tree
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
 from langsplat_core.scene.surface import Surface, build_surface, build_tree, surface_weights
 from langsplat_core.semantics.encoders import kept_calibration, same_vectors
@@ -241,10 +241,10 @@ class QueryEngine:
     @cached_property
     def tree(self) -> Tree:
         """The scene's own tree, else one that is built from its surface."""
-        field = self.field
-        if field.tree is not None:
-            return field.tree
-        return build_tree(self.surface, field.codec, field.latents, field.known)
+        field, tree, drawn = self.field, self.field.tree, self.scene.gaussians.valid()
+        if tree is not None and not drawn.all():  # rows that cannot be drawn are nowhere
+            tree = replace(tree, leaves=np.where(drawn, tree.leaves, np.int32(NO_NODE)))
+        return tree or build_tree(self.surface, field.codec, field.latents, field.known)
 
     @cached_property
     def regions(self) -> Regions:

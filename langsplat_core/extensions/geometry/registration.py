@@ -240,15 +240,15 @@ def _losses(first: Scene, second: Scene, shared: Sequence[str]) -> Iterator[str]
 def once(both: Scene, first: Scene) -> tuple[Scene, int]:
     """Return a merged scene with instances of both scenes kept once, and the number of those with votes.
 
-    first: whose Gaussians come first. Two wholes are equal if `SAME` of the surface of each is within
-    `SAME_SPOT` of the other. The one that more photographs show is kept, else that of more Gaussians;
-    Gaussians of the other one farther from it become a part of it.
+    first: whose Gaussians come first. Wholes are equal if `SAME` of the surface of each is within `SAME_SPOT`
+    of the other. That of more photographs, else of more Gaussians, is kept, with what lies farther from it.
     """
     count, near = len(first.gaussians), SAME_SPOT * first.bounds()[1]
     tree = None if both.language is None else both.language.tree
     if both.language is None or tree is None:
         return both, 0
-    nodes, means, areas = tree.at(len(LEVELS) - 1), both.gaussians.means, surface_areas(both.gaussians)
+    nodes = np.where(both.gaussians.valid(), tree.at(len(LEVELS) - 1), NO_NODE)
+    means, areas = both.gaussians.means, surface_areas(both.gaussians)
     solid = (nodes != NO_NODE) & (areas > 0)
     sides = [np.flatnonzero(solid[:count]), count + np.flatnonzero(solid[count:])]
     shares = []  # of each node's surface that is near one of the other scene, by pairs of nodes

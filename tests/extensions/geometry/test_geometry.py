@@ -298,6 +298,7 @@ def test_merge_keeps_what_both_scenes_show_once(tmp_path, capsys):
     first = replace(made, language=replace(made.language, tree=tree))
     means, votes = made.gaussians.means.copy(), tree.votes + np.array([[2], [0], [0]], np.uint16)
     means[2 * PER_BLOB :] += (0, 0, 2)
+    made.gaussians.means[0] = np.nan  # which lies on nothing
     language = replace(made.language, tree=replace(tree, votes=votes))
     second = replace(made, gaussians=replace(made.gaussians, means=means), language=language)
     second = second.take(np.arange(0, 3 * PER_BLOB, 2))
@@ -312,7 +313,7 @@ def test_merge_keeps_what_both_scenes_show_once(tmp_path, capsys):
             assert len(engine.instances(engine.run(word))) == count
     sizes = np.bincount(engine.scene.language.tree.at(2), minlength=6).tolist()
     # the first's mug is part of the second's where it has what that has not
-    assert sizes == [0, PER_BLOB, PER_BLOB, PER_BLOB, 0, PER_BLOB / 2]
+    assert sizes == [1, PER_BLOB, PER_BLOB, PER_BLOB, 0, PER_BLOB / 2]
     assert once(merge(first, Scene(random_gaussians(0))), first)[1] == 0
 
 

@@ -71,11 +71,7 @@ def test_small_budgets_leave_time_to_recover(steps: int) -> None:
 
 
 def test_gradients_are_those_of_the_reference_picture() -> None:
-    """A random direction in every parameter, against central differences of the float64 picture.
-
-    Without the cut-offs: a difference quotient also sees the jumps of 1/255 where pixels enter an extent,
-    which no rasterizer's gradient contains. The step is short enough to swap no two depths.
-    """
+    """By a random direction in all parameters; without cut-offs, whose jumps no gradient contains."""
     smooth = replace(INRIA, alpha_min=1e-7, transmittance_min=1e-12, alpha_max=0.9999)
     rng = np.random.default_rng(0)
     base = truth()
