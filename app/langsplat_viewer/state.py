@@ -342,6 +342,7 @@ class ViewerState(SceneState):
     focus_input: bool = False  # the query box takes the keyboard at the next frame
     focus_name: bool = False  # that for a name of what is selected does
     awaits_keyboard: bool = False  # keys wait until a box has it
+    has_escape: bool = False  # a menu, a dialog or a text box does, which Esc leaves before the tool
     letters_muted: bool = False  # letters are no keys: they were meant for a box that is not there
 
     training_form: TrainingForm = field(default_factory=TrainingForm)

@@ -859,10 +859,13 @@ def find_settings(s: Any) -> None:
 
 def travel_by_keys(s: Any) -> None:
     """Esc closes a menu; Tab goes from field to field, and the panels stay; the palette knows everything."""
+    editing.use_tool(s.viewer, "lasso")
     s.ctx.item_click("//**/##MenuBar/View")
     assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
     s.key("escape", frames=2)
     assert not imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    s.key("Ctrl+F", frames=4)
+    s.key("escape", frames=3)
     s.key("Ctrl+F", frames=4)
     seen = set()
     for _ in range(12):
@@ -887,7 +890,6 @@ def travel_by_keys(s: Any) -> None:
     assert s.state.session.picture.display == "depth"
     for begin in (lambda: s.click_at((650, 500)), lambda: s.open_panel("Display", frames=3)):
         begin()  # in the view, or in a panel
-        editing.use_tool(s.viewer, "lasso")
         focused = imgui.internal.get_focus_id()
         for key in ("Ctrl+Shift+P", "f1"):
             s.key(key, frames=3)

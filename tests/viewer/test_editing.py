@@ -273,8 +273,7 @@ def test_escape_closes_help_then_stroke_then_tool(front):
     assert (front.state.tools.stroke, front.state.tools.tool) == (None, "lasso")
     editing.end_stroke(front)  # of nothing
     settings.escape(front)
-    assert front.state.tools.tool is None
-    assert marked(front) == ("", "", "")
+    assert (front.state.tools.tool, marked(front)) == (None, ("", "", ""))
 
 
 # Saving what is selected, the rest and the scene; and what is asked before deletions are lost.
@@ -451,8 +450,7 @@ def test_failed_saving_stays_in_the_scene(pruned, tmp_path):
     (tmp_path / "file").write_text("")
     act(saving.save_and_leave, pruned, tmp_path / "file")
     assert "not saved" in errors(pruned)[-1]
-    assert not pruned.state.may_close
-    assert pruned.state.is_unsaved
+    assert (pruned.state.may_close, pruned.state.is_unsaved) == (False, True)
 
 
 def test_nothing_is_written_once_all_is_deleted(opened, tmp_path):

@@ -123,9 +123,8 @@ def in_view(viewer: Viewer) -> list[Outline]:
     state = viewer.state
     if state.outline is None or state.open is None:
         return []
-    rows = [
-        row for row in state.outline.roots if row.word is not None or row.node in state.session.things.names
-    ]
+    names = state.session.things.names
+    rows = [row for row in state.outline.roots if row.word is not None or row.node in names]
     if not rows:
         return []
     camera = state.open.view.camera(*state.size)

@@ -223,17 +223,18 @@ def escape(viewer: Viewer) -> None:
     """
     state, tools = viewer.state, viewer.state.tools
     forms = state.choice or state.export_form or state.leaving
-    lay_over = state.show_help or state.show_palette or forms or state.show_start
+    lay_over = state.show_help or state.show_palette or forms or state.show_start or state.has_escape
     state.show_start &= state.open is None
-    state.show_help = state.show_palette = state.pins_notes = state.letters_muted = False
+    state.show_help = state.show_palette = state.letters_muted = False
     state.choice = state.export_form = state.leaving = None
-    if state.session.ruler.measures:
-        toggle_measuring(viewer)
     failed = {query.phrase for query in state.session.queries if state.answer(query).problem}
     if failed:
         left = state.session.without(failed)
         viewer.change(queries=left.queries, chosen=left.chosen)
     if not lay_over:
+        state.pins_notes = False
+        if state.session.ruler.measures:
+            toggle_measuring(viewer)
         state.tools = replace(tools, stroke=None, tool=tools.tool if tools.stroke else None)
 
 

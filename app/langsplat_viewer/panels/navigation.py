@@ -40,6 +40,8 @@ class Keyboard:
     def feed(self) -> None:
         """Give imgui the keys that belong to the next frame; before it begins."""
         queue, typing = imgui.get_current_context().input_events_queue, imgui.get_io().want_text_input
+        any_popup = imgui.PopupFlags_.any_popup_id | imgui.PopupFlags_.any_popup_level
+        self._state.has_escape = typing or imgui.is_popup_open("", any_popup)
         self._is_lost = not imgui.get_current_context().nav_id_is_alive
         waits = self._state.awaits_keyboard and self._waited < FOCUS_FRAMES[not typing]
         self._state.awaits_keyboard, self._waited = waits, self._waited + 1 if waits else 0

@@ -453,8 +453,5 @@ def fallbacks() -> list[Path]:
     found = [Path(spec.origin).parent / file for spec, file in specs if spec is not None and spec.origin]
     folders = (Path(folder).expanduser() for folder in FOLDERS.get(sys.platform, ()))
     installed = {path.name: path for folder in folders for path in folder.rglob("*.[to]t[fc]")}
-    return [
-        path
-        for path in (*found, *[installed[name] for name in WIDE if name in installed][:1])
-        if path.is_file()
-    ]
+    paths = (*found, *[installed[name] for name in WIDE if name in installed][:1])
+    return [path for path in paths if path.is_file()]
