@@ -86,7 +86,7 @@ def test_images_are_of_what_was_asked_for(folder):
 def test_a_client_asks_over_standard_input_and_output(folder):
     pytest.importorskip("mcp")
     from mcp.client import Client
-    from mcp.client.stdio import StdioServerParameters
+    from mcp.client.stdio import StdioServerParameters, stdio_client
 
     words = ["-m", "langsplat_core", "serve", "--mcp", str(folder / "a.ply")]
     server = StdioServerParameters(command=sys.executable, args=words, env=dict(os.environ))
@@ -94,20 +94,20 @@ def test_a_client_asks_over_standard_input_and_output(folder):
 
     news: list[float] = []
 
-    async def note(done: float, _total: float | None, _said: str | None) -> None:
+    async def note(done: float, *_: object) -> None:
         news.append(done)
 
-    async def talk() -> tuple[list[str], list[object]]:
-        async with Client(server, read_timeout_seconds=120) as client:
+    async def talk() -> tuple[list[object], list[object]]:
+        transport = stdio_client(server, sys.__stderr__)  # by default another test's sys.stderr
+        async with Client(transport, read_timeout_seconds=120) as client:
             assert client.server_info.version == __version__
             tools = (await client.list_tools()).tools
-            assert all(tool.annotations is not None and tool.annotations.read_only_hint for tool in tools)
+            assert all(tool.annotations and tool.annotations.read_only_hint for tool in tools)
             asked = [("find", {"phrase": "mug"}), ("look", {"phrase": "mug"}), ("find", {"phrase": "the"})]
-            answers = [await client.call_tool(*one, progress_callback=note) for one in asked]
-            return [tool.name for tool in tools], answers
+            return tools, [await client.call_tool(*one, progress_callback=note) for one in asked]
 
-    names, (found, seen, refused) = asyncio.run(talk())
-    assert set(names) == {"scenes", "find", "count", "distance", "describe", "look"}
+    tools, (found, seen, refused) = asyncio.run(talk())
+    assert {tool.name for tool in tools} == {"scenes", "find", "count", "distance", "describe", "look"}
     assert json.loads(found.content[0].text)["verdict"] == "found"
     image = Image.open(io.BytesIO(base64.b64decode(seen.content[0].data)))
     assert image.size == (SCENE.cameras[0].width, SCENE.cameras[0].height)
