@@ -175,7 +175,7 @@ def centred(capture: Capture) -> Capture:
 def shrunk_view(camera: Camera, image: Array, mask: Array | None, size: tuple[int, int]) -> View:
     """Return a view at a smaller (width, height), shrunk as photographs are when they are read.
 
-    Area averages differ by 31 to 42 dB PSNR, which would change scores. A pixel counts if its own do.
+    Area averages would differ (PSNR 31 to 42 dB) and change scores. A pixel counts if all within it do.
     """
     shrunk = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS))
     if mask is not None:

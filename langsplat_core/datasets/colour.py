@@ -103,7 +103,7 @@ def _cicp(stored: Any) -> tuple[int, int] | None:
 def to_srgb(coded: Array, transfer: float, primaries: Any, tell: Tell) -> Array:
     """Return (H, W, 3) uint8 for a display, of uint8 or uint16 by a transfer function and primaries.
 
-    transfer: a number of H.273, or a gamma below 0; primaries: a number, or x and y; tell: of unknown ones.
+    transfer: a number of H.273, or a gamma below 0; primaries: a number, or x and y; tell: reports others.
     """
     gamut = primaries if isinstance(primaries, tuple) else PRIMARIES.get(primaries)
     known = transfer < 0 or transfer in (*AS_DISPLAYED, *GAMMAS, LINEAR, PQ, HLG)

@@ -132,7 +132,7 @@ def _parse(file: BinaryIO, size: int, name: str, whole: bytes | None = None) -> 
 def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
     """Return an ordinary file opened in binary mode, and its size in bytes.
 
-    Raises InputError where nothing is, or a folder, a device or a pipe (which might never end), or no right.
+    Raises InputError for a path that does not exist, is a folder, a device or a pipe, or may not be read.
     """
     try:
         status = path.stat()

@@ -276,7 +276,7 @@ def write_table(
 ) -> None:
     """Write a binary little-endian PLY, atomically.
 
-    columns: of `vertex`, name -> (N,) of a type in `TYPE_NAMES`; faces: (F, 3) vertices; comments: lines.
+    columns: of `vertex`, name -> (N,) of a type in `TYPE_NAMES`; faces: (F, 3) rows of these.
     """
     count = len(next(iter(columns.values())))
     kinds = {name: column.dtype.str[1:] for name, column in columns.items()}

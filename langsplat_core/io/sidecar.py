@@ -8,7 +8,7 @@ executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and 
     latents          float    (3, N, d)  instead, of another codec; zero where never observed
     confidence       float    (3, N)     total blending weight of the observations, >= 0; 0 for no feature
     tree.leaves      uint16   (N,)       smallest node of a Gaussian, 65535 for none; uint32 and 4294967295
-                                         if there are more nodes. All of a tree are absent without one
+                                         if there are more nodes. Without a tree none is there
     tree.parents     uint32   (K,)       node that each is part of, a later one; 4294967295 for none
     tree.levels      uint8    (K,)       0, 1, 2: subpart, part, whole
     tree.votes       uint16   (K, 2)     photographs with a mask of exactly this node; those without one

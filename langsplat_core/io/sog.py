@@ -306,7 +306,7 @@ def _coded(values: Array, counts: Array) -> tuple[Array, Array]:
 def _palette(values: Array, counts: Array) -> tuple[Array, Array]:
     """Return the (N,) palette entry of each row, and the (P, D) entries.
 
-    Up to 65536 rows of `counts` have one each; else entries are means by median cut of the widest axis.
+    Up to 65536 rows of `counts` have an entry each; else groups by median cut of the widest axis do.
     """
     rows = values[counts]
     squares, own = rows**2, np.zeros(len(rows), np.int64)

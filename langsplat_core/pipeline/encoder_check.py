@@ -306,7 +306,7 @@ REJECTED = 0.95  # of what is absent, among the phrases that a calibration is fi
 def fit_scaling(present: Array, absent: Array) -> PlattScaling:
     """Fit to (P, 3) fits of present phrases and (A, 3) of absent ones; both sets have the same weight.
 
-    A fourth column, mean fits, counts too. InputError for fewer than ten of either, or fits that are alike.
+    A fourth column, mean fits, counts too. InputError for fewer than ten of either, or fits not apart.
     """
     if min(len(present), len(absent)) < FEWEST:
         raise InputError("a calibration needs ten phrases for what is there and ten for what is not")

@@ -72,7 +72,7 @@ class TextVectors:
     def of(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
         """Return (Q, D) vectors of phrases; those that are not yet known are encoded together.
 
-        InputError for stop words alone, UnknownWordError for words it was not taught; else as `encoder`.
+        InputError for an empty phrase or stop words alone, UnknownWordError for words never taught.
         """
         keys = list(map(phrase_key, phrases))
         fresh = [key for key in dict.fromkeys(keys) if key not in self._vectors]

@@ -34,7 +34,7 @@ def view_of(
 ) -> protocol.LiftingView:
     """Project `scene` into `camera`, once for any number of images.
 
-    rasterizer: by default that of the CPU; settings: of image formation, by default those of its training.
+    rasterizer: by default the CPU's; settings: of image formation, by default as the scene was trained.
     """
     expect(scene, Scene, "load_scene(path) returns one")
     expect(camera, Camera, "scene.cameras has those of a scene, look_at makes one")

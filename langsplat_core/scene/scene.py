@@ -61,7 +61,7 @@ FARTHEST = 1e9  # largest coordinate of cameras in files, world units: float32 s
 class Camera(Intrinsics):
     """A pinhole camera without distortion, or an orthographic one, whose rays are parallel to its z axis.
 
-    The centre of the top left pixel is (0.5, 0.5). An orthographic camera's focal lengths are px per unit.
+    The top left pixel's centre is (0.5, 0.5). Focal lengths of orthographic cameras are pixels per unit.
     """
 
     width: int  # pixels, >= 1

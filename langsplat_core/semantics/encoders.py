@@ -446,7 +446,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.
 def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
     """Load the text half of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
 
-    A phrase takes milliseconds of a CPU. EncoderError for weights that are missing or of no known family.
+    By default on the CPU: milliseconds a phrase. EncoderError for weights missing or of no known family.
     """
     weights = models.open_weights(model, model_path(model, "--encoder"), device)
     return PhraseEncoder(weights, models.family_of(weights, FAMILIES, "encoders").text(weights))
