@@ -352,7 +352,7 @@ def located_photos(model: SparseModel, folder: Path) -> list[Photo]:
 def good_points(model: SparseModel, source: str = "") -> tuple[Array, Array]:
     """Return (M, 3) points and (M, 3) colours without those that are plainly wrong, reported by their source.
 
-    These are not finite, of one image, or over 4 px off: COLMAP leaves none. Unknown errors count as good.
+    Those are not finite, seen in one image alone, or over 4 px off, as COLMAP drops; unknown errors pass.
     """
     points = model.points
     good = np.isfinite(points["position"]).all(1) & ~(points["error"] > 4) & (points["track"] != 1)

@@ -128,7 +128,7 @@ def _small_copies(
 ) -> list[workspaces.CameraGroup]:
     """Write copies of at most `side` pixels that COLMAP can read and finds the same way up as we do.
 
-    Photographs of one size and optics (maker, camera, focal length) share a camera; unreadable ones go.
+    Photographs of one size and optics (maker, model, focal length) share a camera. Damaged ones are left out.
     """
     members: dict[tuple[tuple[int, int], str], list[str]] = {}
     broken = []

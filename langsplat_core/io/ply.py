@@ -308,7 +308,7 @@ def read_cloud(path: Path) -> tuple[Array, Array]:
     """Return (M, 3) float64 positions and (M, 3) uint8 colours of the element `vertex`.
 
     A position may be infinite or NaN. Colours are whole numbers from 0 to 255, or floats from 0 to 1; others
-    are clipped, points without colours are grey, and both is reported. FormatError if it breaks a rule.
+    are clipped, points without colours are grey; both are reported. FormatError if it breaks a rule.
     """
     with open_ply(path) as ply:
         vertex = ply.vertex

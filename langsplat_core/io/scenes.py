@@ -177,7 +177,7 @@ def _read(path: Path, read: Reader | None = None) -> Scene:
 
 
 def _about_origin(path: Path, scene: Scene) -> Scene:
-    """Return the scene with its companion's origin, else one near it; reports positions rounded far off."""
+    """Return the scene about the origin beside it, or one near it; rounded positions are reported."""
     try:
         named = read_origin(path)
     except InputError as error:

@@ -217,7 +217,7 @@ def decode_spz(data: bytes, path: Path, room: Allowance, tell: Tell) -> Scene:
 def _floor_is_above(path: Path, scene: Scene) -> bool:
     """Return True if a height near the top has twice the horizontal surface of any near the bottom.
 
-    Up is that of cameras beside it or a .ply of its name. Upright, floors are 3 to 200 times a top's surface.
+    Up is that of its cameras, or of a .ply's of its name. In upright scenes floors have 3 to 200 times more.
     """
     for beside in (path.with_suffix(SUFFIX), path.with_name(path.name + SUFFIX)):
         with suppress(InputError):  # reported when the scene's cameras are read
@@ -258,7 +258,7 @@ def write_spz(path: Path | str, scene: Scene, version: int = 3, axes: str = "rub
 
     Positions are rounded to 1/4096 world unit, or finer for smaller Gaussians; scales to 1/16 in the
     logarithm, within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1; colours and opacities to 1/255.
-    What is beyond is cut and reported, a row that cannot be drawn has opacity 0. InputError for a scene too
+    Values beyond are cut and reported; a row that cannot be drawn gets opacity 0. InputError for a scene too
     large for 24 bits per coordinate, or if most sizes are beyond the range.
     """
     gaussians, valid = scene.gaussians, scene.gaussians.valid()

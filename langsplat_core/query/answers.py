@@ -109,7 +109,7 @@ SIDE = 5.0  # of that grid, in standard deviations of the points along the wides
 def smoothed(points: Array, values: Array) -> Array:
     """Return (K,) means of `values` around (K, 3) points, over about as many as a surface has neighbours.
 
-    Values are splatted to corners of a grid that grows with the answer, and interpolated, also in pages.
+    Values go to the corners of a grid, whose cells grow with the answer, and back; pages do the same.
     """
     if len(points) == 0:
         return values

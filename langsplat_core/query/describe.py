@@ -235,7 +235,7 @@ def look_at_pixel(
 ) -> Pointed | None:
     """Return the surface that `camera` sees at a pixel (column, row); None if the pixel is mostly empty.
 
-    Every Gaussian counts by its blending weight; the depth is the median. settings: by default the scene's.
+    Gaussians count by their blending weights; the depth is their median. settings: the scene's by default.
     """
     scene = describer.engine.scene
     rows, weights = pixel_weights(scene, camera, pixel, settings)
