@@ -49,6 +49,7 @@ from langsplat_core.training.language.lift import MaskGroups, MaskWeights
 from langsplat_core.training.language.merge_tree import MergeTree, draw_patches, find_tree, nested_maps
 
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
+Photographs = Sequence[tuple[Array, Array | None]]  # (H, W, 3) uint8, (H, W) bool of what counts or None
 Latents = tuple[Array, Array]  # (3, N, d) of the codec's type, (3, N) float32
 FITTED, JUDGED = 12_000, 2_000  # Gaussians whose lifted vectors a codec is fitted to, and evaluated on
 LATENT_LIFTS = frozenset({"one-pass", "gradient"})  # modes that average latents, of a codec fitted to masks
@@ -297,49 +298,58 @@ AGREED = "what masks agree on"  # in the names of stages
 VERSION = 3
 
 
-def agreed_features(
-    stages: Stages, photographs: Sequence[tuple[Array, Array | None]]
-) -> OnDemand[ImageFeatures]:
-    """Describe masks by the consensus of the masks of all `stages.views`, whose vectors are not read.
-
-    photographs: (H, W, 3) uint8 of each view, and its (H, W) bool mask of pixels that count (None: all do).
-    """
-    gaussians, views, encoder, work = stages.gaussians, stages.views, stages.encoder, stages.work
-    rasterizer, formed = stages.rasterizer(), stages.formation
-    facts = ((camera.position, len(seen.vectors), digest_of(seen)) for camera, seen in views)
-    eyes, counts, digests = zip(*facts, strict=True)
-    inputs = digest_of(gaussians), digests, formed
-    mask_weights = stages.weights_in(work / stage_key("rough-weights", VERSION, *inputs), counts)
-
-    def make() -> Arrays:
-        surface = build_surface(gaussians)
-        return vars(find_tree(gaussians, surface, mask_weights, np.stack(eyes), stages.progress))
-
-    key = stage_key("tree", VERSION, *inputs)
-    tree = MergeTree(**stages.processes.once(lambda: kept(work / f"{key}.npz", make)))
-    drawn = [work / key / f"{index:05d}.npy" for index in range(len(views))]
-    for index in stages.each(len(views), f"drawing {AGREED}"):
-        if not drawn[index].exists():
-            view, mask = rasterizer.view(gaussians, views[index][0], formed), photographs[index][1]
-            patches = draw_patches(view, gaussians, tree.patches, formed)
-            write_array(drawn[index], patches if mask is None else np.where(mask, patches, -1))
+def agreed_features(stages: Stages, photographs: Photographs) -> OnDemand[ImageFeatures]:
+    """Describe masks by the consensus of the masks of all `stages.views`, whose vectors are not read."""
+    encoder, work = stages.encoder, stages.work
+    key, tree, eyes = _agreed_tree(stages)
+    drawn = _drawn_patches(stages, tree, photographs, work / key)
     described = stage_key("described", VERSION, key, CUTS, NAMED, VIEWS, LEAST, fingerprint(encoder))
     finer = [tree.cut(cost) for cost in CUTS[:2]]
     whole = isinstance(encoder, RegionEncoder)  # one look at a photograph describes all its regions
-    used = np.isin(np.arange(len(tree.highest)), [] if whole else finer)
-    nodes = np.flatnonzero(tree.between(*NAMED) | used)
-    vectors = _node_vectors(stages, tree, nodes, np.stack(eyes), drawn, photographs, work / described)
-    names = name_scores(tree, surface_areas(gaussians), vectors, encoder)
+    seen = tree.between(*NAMED)
+    seen[[] if whole else finer] = True
+    vectors = _node_vectors(stages, tree, np.flatnonzero(seen), eyes, drawn, photographs, work / described)
+    names = name_scores(tree, surface_areas(stages.gaussians), vectors, encoder)
     cuts = [*finer, tree.cut(CUTS[2]) if names is None else tree.cut(*NAMED, names)]
     store = FeatureStore(work / "features")
     made_by = stage_key(described, VERSION, UNNAMED, AREA)
-    for index in stages.each(len(views), f"outlining {AGREED}"):
-        name = views[index][0].name
+    for index in stages.each(len(drawn), f"outlining {AGREED}"):
+        name = stages.views[index][0].name
         if not store.has(name, made_by):
-            maps, shown = nested_maps(open_array(drawn[index]), cuts, LEAST)
-            own = embed_regions(photographs[index][0], maps, encoder) if whole else vectors[shown]
+            maps, nodes = nested_maps(open_array(drawn[index]), cuts, LEAST)
+            own = embed_regions(photographs[index][0], maps, encoder) if whole else vectors[nodes]
             store.save(name, ImageFeatures(maps, own), made_by)
-    return store.of([camera.name for camera, _ in views])
+    return store.of([camera.name for camera, _ in stages.views])
+
+
+def _agreed_tree(stages: Stages) -> tuple[str, MergeTree, Array]:
+    """Return the key and the tree of the masks of all views, and the (V, 3) positions of their cameras."""
+    facts = [(camera.position, len(seen.vectors), digest_of(seen)) for camera, seen in stages.views]
+    eyes, counts, digests = zip(*facts, strict=True)
+    inputs = digest_of(stages.gaussians), digests, stages.formation
+    folder = stages.work / stage_key("rough-weights", VERSION, *inputs)
+    mask_weights = stages.weights_in(folder, counts)
+
+    def make() -> Arrays:
+        surface = build_surface(stages.gaussians)
+        return vars(find_tree(stages.gaussians, surface, mask_weights, np.stack(eyes), stages.progress))
+
+    key = stage_key("tree", VERSION, *inputs)
+    made = stages.processes.once(lambda: kept(stages.work / f"{key}.npz", make))
+    return key, MergeTree(**made), np.stack(eyes)
+
+
+def _drawn_patches(stages: Stages, tree: MergeTree, photographs: Photographs, folder: Path) -> list[Path]:
+    """Return files in `folder` of the (H, W) patches of each view, -1 where a pixel does not count."""
+    files = [folder / f"{index:05d}.npy" for index in range(len(stages.views))]
+    rasterizer = stages.rasterizer()
+    for index in stages.each(len(files), f"drawing {AGREED}"):
+        if not files[index].exists():
+            view = rasterizer.view(stages.gaussians, stages.views[index][0], stages.formation)
+            patches = draw_patches(view, stages.gaussians, tree.patches, stages.formation)
+            _, mask = photographs[index]
+            write_array(files[index], patches if mask is None else np.where(mask, patches, -1))
+    return files
 
 
 def _node_vectors(
@@ -348,7 +358,7 @@ def _node_vectors(
     nodes: Array,
     eyes: Array,
     drawn: Sequence[Path],
-    photographs: Sequence[tuple[Array, Array | None]],
+    photographs: Photographs,
     folder: Path,
 ) -> Array:
     """Return (P + K, D) unit vectors of `nodes`, seen alone in their `best_views`; 0 for other nodes.

@@ -19,15 +19,10 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError, printable_line
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import atomic_path, fcntl
 from langsplat_core.io.hostile import write_npy
 from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.features import ImageFeatures
-
-try:
-    import fcntl
-except ImportError:  # Windows; there two trainings in one folder are the user's to avoid
-    fcntl = None  # type: ignore[assignment]
 
 log = logging.getLogger("langsplat")
 LOCK = "in-use.lock"  # in the work folder, where it stays: only the system's lock on it counts
@@ -129,7 +124,7 @@ def sole_use(folder: Path) -> Iterator[None]:
     It is made if missing, and removed if nothing came into it. The lock is the operating system's and ends
     with its process; file systems without locks hold nothing. InputError where another training holds it.
     """
-    if fcntl is None:
+    if fcntl is None:  # Windows; there two trainings in one folder are the user's to avoid
         folder.mkdir(parents=True, exist_ok=True)
         yield
         return

@@ -112,7 +112,7 @@ def backward(
                 hidden = ln.load(behind, row * TILE)
                 ln.store(behind, row * TILE, hidden + weight * slope)
                 q = weight * slope - hidden * alpha / (1.0 - alpha)
-                q = ln.where_at_least(alpha, tiles.cutoffs.alpha_max, 0.0, q)
+                q = ln.where_at_least(alpha, tiles.alpha_max, 0.0, q)
                 moved, lifted = q * w, q * v
                 q0, qw, qv = q0 + q, qw + moved, qv + lifted
                 qww, qwv, qvv = qww + moved * w, qwv + moved * v, qvv + lifted * v

@@ -33,14 +33,6 @@ _PIECES = 16  # pieces of the depth order that are binned in parallel; the resul
 Size = tuple[int, int]  # width and height of an image, px
 
 
-class Cutoffs(NamedTuple):
-    """The constants of steps 3 and 4 of `reference.py`."""
-
-    log2_alpha_min: float  # at least -100
-    alpha_max: float
-    transmittance_min: float
-
-
 class Tiles(NamedTuple):
     """I intersections of M drawn Gaussians (numbered front to back) with T tiles (row by row)."""
 
@@ -54,7 +46,9 @@ class Tiles(NamedTuple):
     stride: int
     width: int  # of the image, px
     height: int
-    cutoffs: Cutoffs
+    log2_alpha_min: float  # at least -100; with the next two the constants of steps 3 and 4 of `reference.py`
+    alpha_max: float
+    transmittance_min: float
 
 
 @helper
@@ -262,7 +256,6 @@ def bin_tiles(
     counts = np.stack([counts[:number] for _, _, counts in found], 1)
     ends = np.cumsum(counts).reshape(counts.shape)
     places = np.ascontiguousarray((ends - counts).T)
-    least = math.log2(max(settings.alpha_min, 2.0**-100))
     golden = max(int(number * 0.6180339887), 1)  # every stretch of tiles then samples the whole image evenly
     tiles = Tiles(
         geometry=geometry,
@@ -274,7 +267,9 @@ def bin_tiles(
         stride=next(stride for stride in count(golden) if math.gcd(stride, number) == 1),
         width=size[0],
         height=size[1],
-        cutoffs=Cutoffs(least, float(settings.alpha_max), float(settings.transmittance_min)),
+        log2_alpha_min=math.log2(max(settings.alpha_min, 2.0**-100)),
+        alpha_max=float(settings.alpha_max),
+        transmittance_min=float(settings.transmittance_min),
     )
     of_each = zip(pieces, found, places, starts, strict=False)  # behind the last start is the total
     workers.each(_place, [(*piece, done[:2], to, int(at), tiles) for piece, done, to, at in of_each])
@@ -450,18 +445,17 @@ def begin_rows(g: Array, x: float, y: float, rows: Array) -> Lanes:
 
 
 @helper
-def blend_row(
-    transmittance: Array, at: int, w: Lanes, log2_height: float, cutoffs: Cutoffs
-) -> tuple[Lanes, Lanes]:
+def blend_row(transmittance: Array, at: int, w: Lanes, peak: float, tiles: Tiles) -> tuple[Lanes, Lanes]:
     """Step 3 and 4 for one row: returns alpha (0 where the Gaussian is not added) and T before it.
 
+    peak: log2 of the row's peak alpha.
     All sixteen lanes are stored: a masked store would stall the next Gaussian's load of the same row.
     """
-    before, power = ln.load(transmittance, at), log2_height - w * w
-    alpha = ln.where_at_least(power, cutoffs.log2_alpha_min, min(ln.exp2(power), cutoffs.alpha_max), 0.0)
+    before, power = ln.load(transmittance, at), peak - w * w
+    alpha = ln.where_at_least(power, tiles.log2_alpha_min, min(ln.exp2(power), tiles.alpha_max), 0.0)
     after = before - alpha * before
-    ln.store(transmittance, at, ln.where_at_least(cutoffs.transmittance_min, after, -abs(before), after))
-    return ln.where_at_least(cutoffs.transmittance_min, after, 0.0, alpha), before
+    ln.store(transmittance, at, ln.where_at_least(tiles.transmittance_min, after, -abs(before), after))
+    return ln.where_at_least(tiles.transmittance_min, after, 0.0, alpha), before
 
 
 @helper
@@ -489,7 +483,7 @@ def walk(
         steps = begin_rows(tiles.geometry[rank], x, y + low, rows)
         for n in range(high - low):
             row, w, peak = low + n, steps + rows[n], rows[TILE + n]
-            alpha, before = blend_row(transmittance, row * TILE, w, peak, tiles.cutoffs)
+            alpha, before = blend_row(transmittance, row * TILE, w, peak, tiles)
             row_(work, mine, s, row, low, alpha, before)
         close_(work, mine, s, low, high)
     return transmittance, last
