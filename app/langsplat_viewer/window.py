@@ -341,7 +341,7 @@ class Window:
         idling = hello_imgui.get_runner_params().fps_idling
         news = (viewer.worker.delivered, viewer.recorder.delivered)
         seen = (state.open, state.nothing, state.hover, state.leaving, state.may_close, state.messages)
-        now = (news, seen, self.unfinished, viewer.watch.changed)
+        now = (news, seen, self.unfinished, viewer.watch.changed, len(self.toasts.shown))
         heard = len(imgui.get_current_context().input_events_trail) > 0  # in this frame, however slow it is
         self._frames = AWAKE_FRAMES if heard or now != self._last else max(self._frames - 1, 0)
         self._last = now

@@ -31,8 +31,7 @@ def test_broken_file_leaves_the_open_scene(opened):
     before = opened.state.open.view
     open_scene(opened, "broken.ply")
     assert opened.state.open.scene is SCENES["blobs.ply"]
-    assert opened.state.open.view is before
-    assert opened.state.opening is None
+    assert (opened.state.open.view, opened.state.opening) == (before, None)
     assert errors(opened) == ["broken.ply: broken; export it again"]
 
 

@@ -120,7 +120,7 @@ class Toasts:
 
     def __init__(self) -> None:
         self.seconds = 6.0
-        self._shown: list[tuple[Message, float]] = []  # and since when
+        self.shown: list[tuple[Message, float]] = []  # and since when
         self._said: list[Message] = []  # as they were in the last frame
 
     def draw(self, viewer: Viewer, area: ui.Area, read: str) -> None:
@@ -128,10 +128,11 @@ class Toasts:
         now, said = imgui.get_time(), viewer.state.messages
         new = [message for message in said if all(message is not known for known in self._said)]
         self._said = said
-        since = (*self._shown, *((message, now) for message in new if message.text != read))
-        self._shown = [(message, at) for message, at in since if now - at < self.seconds][-MOST_TOASTS:]
+        earlier = (one for one in self.shown if one[0] not in new)  # the same is not said twice
+        since = (*earlier, *((message, now) for message in new if message.text != read))
+        self.shown = [(message, at) for message, at in since if now - at < self.seconds][-MOST_TOASTS:]
         writes = viewer.recorder.current
-        if not self._shown and writes is None:
+        if not self.shown and writes is None:
             return
         foot = ImVec2(area.left + area.width / 2, area.top + area.height - hello_imgui.em_size(2))
         widest = min(hello_imgui.em_size(TOAST_EM), 0.8 * area.width)
@@ -141,7 +142,7 @@ class Toasts:
         flags = ui.FLOATS & ~imgui.WindowFlags_.no_bring_to_front_on_focus | imgui.WindowFlags_.no_nav
         with ui.floating("toasts", foot, ImVec2(0.5, 1), flags):
             with imgui_ctx.push_text_wrap_pos(widest):
-                for number, (message, _) in enumerate(self._shown):
+                for number, (message, _) in enumerate(self.shown):
                     with imgui_ctx.push_id(str(number)):
                         self._toast(viewer, message)
             wide = min(BAR_EM, widest / hello_imgui.em_size(1) - 5)  # beside Cancel
@@ -149,9 +150,9 @@ class Toasts:
                 viewer.recorder.cancel(waiting=False)
                 viewer.state.say("stopped: no file was written, a folder keeps those written so far")
             if imgui.is_window_hovered():
-                self._shown = [(message, now) for message, _ in self._shown]
+                self.shown = [(message, now) for message, _ in self.shown]
                 if imgui.is_mouse_clicked(0) and not imgui.is_any_item_hovered():
-                    self._shown = []
+                    self.shown = []
 
     def _toast(self, viewer: Viewer, message: Message) -> None:
         ui.coloured(message.text, "bad" if message.is_error else "ink")
@@ -160,7 +161,7 @@ class Toasts:
         is_last = message.undoes is not None and [message.undoes] == viewer.history.past[-1:]
         if is_last and imgui.small_button("Undo"):
             editing.undo(viewer)
-            self._shown = []
+            self.shown = []
 
 
 # Dialogs.

@@ -433,10 +433,9 @@ def _bar(text: str, colours: Array, ends: tuple[float, float], tick: float | Non
     draw_bar(start, width, height, colours)
     if tick is not None:
         x = start.x + width * min(max((tick - low) / (high - low), 0.0), 1.0)
+        line = ImVec2(x, start.y - 2), ImVec2(x, start.y + height)
         for colour, thick in ((SHADE, 4.0), (WHITE, 2.0)):
-            imgui.get_window_draw_list().add_line(
-                ImVec2(x, start.y - 2), ImVec2(x, start.y + height), colour, thick
-            )
+            imgui.get_window_draw_list().add_line(*line, colour, thick)
     imgui.dummy(ImVec2(width, height))
     x, values = imgui.get_cursor_pos_x(), (low, (low + high) / 2, high)
     for place, text in zip((0.0, 0.5, 1.0), length_text(values, least=2).split(), strict=True):
