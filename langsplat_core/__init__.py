@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from langsplat_core.errors import optional_imports
 
 # Threads of torch wait by spinning, which takes the cores from whatever else runs: beside six busy processes
-# masks took five times as long to describe. Read when torch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# masks took five times as long to describe. Read when torch is imported; Turkish locales know no capital I.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 if TYPE_CHECKING:
     from langsplat_core.config import TrainConfig

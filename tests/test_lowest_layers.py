@@ -594,4 +594,4 @@ def test_threads_of_torch_do_not_spin_unless_asked_to(said):
     rest = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     own = {} if said is None else {"OMP_WAIT_POLICY": said}
     text = subprocess.check_output([sys.executable, "-c", code], env=rest | own, text=True)
-    assert text.strip() == (said or "PASSIVE")
+    assert text.strip() == (said or "passive")

@@ -66,7 +66,7 @@ def refusal(check: Check, path: Path) -> str:
     return message
 
 
-LONG = ["a" * 256, "é" * 128, "there/" + "b" * 256 + "/c", "d" * 300 + "/e.ply", "/".join(["x" * 200] * 30)]
+LONG = ["a" * 256, "é" * 256, "there/" + "b" * 256 + "/c", "d" * 300 + "/e.ply", "/".join(["x" * 200] * 30)]
 NO_TEXT = ["caf\udce9.ply", "a\0b"]
 SYSTEM = ["/proc/x.ply", "/proc/self/fd/x", "/dev/x.ply", "/dev/a/b/x", "/sys/x.ply"]
 

@@ -760,7 +760,7 @@ def test_notebooks_show_a_page_that_was_asked(browser, demo, engine, tmp_path, p
     """In a frame without rights, as a cell has it: bounded, answered over all Gaussians, searchable."""
     if phrases is None:
         path = Path(__file__).parents[2] / "docs" / "examples" / "06_in_a_notebook.ipynb"  # `make notebook`
-        shown = "".join(json.loads(path.read_text())["cells"][-1]["outputs"][0]["data"]["text/html"])
+        shown = "".join(json.loads(path.read_bytes())["cells"][-1]["outputs"][0]["data"]["text/html"])
         asked, other = "duck", "penguin"
         engine = QueryEngine(load_scene(DEMO), load_text_encoder)
     elif phrases == "an answer":
@@ -775,7 +775,7 @@ def test_notebooks_show_a_page_that_was_asked(browser, demo, engine, tmp_path, p
         assert page.report.bytes < (1.3e6 if phrases else 3.2e6)
         small = demo.cameras[0].within(320)
         assert covered(demo, [small]).sum() == pytest.approx(render(demo, small).alpha.sum(), rel=1e-4)
-    (tmp_path / "cell.html").write_text(f"<!doctype html><p>Out [1]</p>{shown}")
+    (tmp_path / "cell.html").write_text(f"<!doctype html><p>Out [1]</p>{shown}", encoding="utf-8")
     tab = browser.new_page(offline=True)
     tab.goto((tmp_path / "cell.html").as_uri())
     frame = tab.frames[1]
