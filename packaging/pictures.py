@@ -57,6 +57,8 @@ QUERIES = ("teddy bear", "blue gift", "hamburger")
 
 def _found(ctx: Any, window: Window) -> None:
     settings.toggle_overlay(window.viewer, "things")
+    ctx.yield_(60)
+    viewpoint.zoom_by(window.viewer, 1.0001)  # the first image took long: kernels were loaded
 
 
 def _under_the_cursor(ctx: Any, window: Window) -> None:
