@@ -153,7 +153,7 @@ class Stages:
     def mask_weights(self) -> tuple[MaskWeights, MaskGroups]:
         """The mask weights, in files that are read where they are needed, and the groups of masks."""
         vectors, inputs = self.inputs
-        folder = self.work / stage_key("mask-weights", 2, *inputs)
+        folder = self.work / stage_key("memberships", 2, *inputs)  # codespell:ignore memberships
         mask_weights = self.weights_in(folder, list(map(len, vectors)))
 
         def make() -> Arrays:
@@ -327,7 +327,7 @@ def _agreed_tree(stages: Stages) -> tuple[str, MergeTree, Array]:
     facts = [(camera.position, len(seen.vectors), digest_of(seen)) for camera, seen in stages.views]
     eyes, counts, digests = zip(*facts, strict=True)
     inputs = digest_of(stages.gaussians), digests, stages.formation
-    folder = stages.work / stage_key("rough-weights", VERSION, *inputs)
+    folder = stages.work / stage_key("rough-memberships", VERSION, *inputs)  # codespell:ignore memberships
     mask_weights = stages.weights_in(folder, counts)
 
     def make() -> Arrays:
