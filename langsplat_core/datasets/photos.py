@@ -103,7 +103,8 @@ def say_unread(dataset: Path, folder: Path, photos: Sequence[Path]) -> None:
     videos = sorted(path.name for path in beside if hostile.is_video(path) and path not in live)
     if lost := sorted(path.name for path in beside if path.name[0] != "." and not os.path.exists(path)):
         report_loss("%d links beside the photographs lead nowhere: %s", len(lost), shortened(lost))
-    if given := [path.relative_to(dataset).as_posix() for path in find_photos(dataset, DEEP, CAMERA_FILES)]:
+    files = (file for file in find_photos(dataset, DEEP, CAMERA_FILES) if not file.match("*.*.json"))  # ours
+    if given := [file.relative_to(dataset).as_posix() for file in files]:
         what = "may hold cameras and are not read; cameras are found anew, in a world of their own"
         log.warning("%d files %s: %s", len(given), what, shortened(given))
     if live:

@@ -114,7 +114,7 @@ def test_photographs_are_counted_where_they_lie(tmp_path: Path) -> None:
 
 
 def test_unread_files_beside_photographs_are_named(tmp_path: Path, caplog) -> None:
-    for name in ("1.HEIC", "1.MOV", "2.heic", "2.mov", "walk.mp4", "edited/1.jpg", "poses.csv"):
+    for name in ("1.HEIC", "1.MOV", "2.heic", "2.mov", "w.mp4", "old/1.jpg", "p.csv", "s.cameras.json"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "IMG_3.jpg").symlink_to("not fetched.jpg")
