@@ -12,7 +12,7 @@ LINE_LIMIT = 1000  # characters of a message: room for two long paths, not for a
 def printable_line(text: object, limit: int = LINE_LIMIT) -> str:
     """Return `text` as one line that a terminal may show, at most `limit` characters long.
 
-    Runs of blanks and line ends become one blank, what cannot be printed is escaped, and length cut inside.
+    Runs of blanks become one blank, what cannot be printed is escaped, and a long text loses its middle.
     """
     line = " ".join(
         "".join(c if c.isprintable() or c.isspace() else repr(c)[1:-1] for c in str(text)).split()

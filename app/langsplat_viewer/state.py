@@ -298,7 +298,7 @@ class SceneState:
 
     @property
     def marks(self) -> Marks:
-        """What the session marks, as masks: the same objects for the same marks."""
+        """Return the session's marks as masks, the same objects for the same marks."""
         return self.masks_of(self.session.marks, self.count)
 
     @property

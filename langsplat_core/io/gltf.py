@@ -370,7 +370,7 @@ def write_gltf(path: Path | str, scene: Scene) -> None:
     """Write a .glb, or a .gltf with its buffer inside, atomically; rows keep their order.
 
     Positions and colours are exact; scales, quaternions (normalised) and opacities are rounded to float32.
-    COLOR_0 is the linear base colour, for programs without the extension. What cannot be drawn has opacity 0.
+    COLOR_0 is the linear base colour. What cannot be drawn gets opacity 0. InputError beyond 4 GiB.
     """
     file, gaussians = GltfWriter(EXTENSION), scene.gaussians
     if len(gaussians):

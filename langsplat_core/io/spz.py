@@ -189,7 +189,7 @@ FRACTIONAL_BITS = 12  # as in other writers: steps of 1/4096, up to 2048
 def read_spz_scene(path: Path | str, axes: str = "", note: Tell = lambda line: None) -> Scene:
     """Return the scene of a .spz file; InputError if it cannot be opened, else FormatError.
 
-    axes: in `AXES`, of a file that names none; "": RUB, with a warning if that is upside down. note: of that.
+    axes: in `AXES`, of a file that names none; "": RUB, with a warning if upside down. note: is told of it.
     """
     path = Path(path)
     file, size = open_for_reading(path)
@@ -217,7 +217,7 @@ def decode_spz(data: bytes, path: Path, room: Allowance, tell: Tell) -> Scene:
 def _floor_is_above(path: Path, scene: Scene) -> bool:
     """Return True if a height near the top has twice the horizontal surface of any near the bottom.
 
-    Up is that of its cameras, or of a .ply's of its name. In upright scenes floors have 3 to 200 times more.
+    Up is that of its cameras, or of a .ply's of its name. Upright, a floor has 3 to 200 times the top's.
     """
     for beside in (path.with_suffix(SUFFIX), path.with_name(path.name + SUFFIX)):
         with suppress(InputError):  # reported when the scene's cameras are read

@@ -166,7 +166,7 @@ class Describer:
     def __init__(
         self, engine: QueryEngine, vocabulary: Sequence[str] | None = None, progress: Progress = silent
     ) -> None:
-        """Encode a vocabulary.
+        """Encode the words that may name what is in the scene.
 
         vocabulary: phrases for all levels, by default the bundled ones: everyday things, and below the level
         "whole" parts of things too. Phrases with words that the encoder was never taught are left out. Raises

@@ -307,7 +307,7 @@ _LEADING = rf"(?i)^(?:(?:{'|'.join(sorted(ARTICLES))}) )+"
 def parse(text: str, names: Collection[str] = ()) -> Phrase:
     """Return the tree of one query; names: keys of phrases that are not divided, such as taught words.
 
-    InputError if nothing is named or only excluded ("not the cup"), beyond `MAX_CHARACTERS` or `MAX_ATOMS`.
+    InputError if nothing is named or only excluded ("not the cup"), or beyond `MAX_CHARACTERS`, `MAX_ATOMS`.
     """
     if not isinstance(text, str):
         raise InputError("a phrase is text, such as 'blue gift'; ask several one after the other")

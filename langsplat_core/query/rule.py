@@ -2,7 +2,7 @@
 
 A fit (`semantics.relevancy.Scale`) is the number of spreads by which a region is nearer to a phrase than
 everyday phrases are by chance, so one rule serves all encoders. The exported page has the table as JSON and
-`decide` in JavaScript (`web/rule.js`); the index over scans calls these. Choice: docs/answers.md.
+`decide` in JavaScript (`web/rule.js`); the index over scans calls these. Tuning: docs/answers.md.
 """
 
 from collections.abc import Mapping, Sequence

@@ -54,7 +54,7 @@ def load_lifting_rasterizer(backend: str = "auto") -> LiftingRasterizer:
     """Return a rasterizer whose views can gather.
 
     backend: "cpu", "cuda", "reference", or "auto", the CPU: it gathers the labels of masks several times as
-    fast as gsplat on an H200 does (docs/benchmarks/gpu). InputError for one that cannot gather; BackendError.
+    fast as gsplat on an H200 (docs/benchmarks/gpu). InputError if it cannot gather, BackendError if not run.
     """
     backend = "cpu" if backend == "auto" else backend
     if backend in BACKENDS and not BACKENDS[backend].lifts:

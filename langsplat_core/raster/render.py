@@ -113,7 +113,7 @@ def pixel_weights(
 ) -> tuple[Array, Array]:
     """Return (M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and (M,) float32 weights.
 
-    The weights, alpha_i T_i > 0, add up to the alpha of the pixel. settings: as of `view_of`.
+    The weights, alpha_i T_i > 0, add up to the alpha of a pixel in the image. settings: see `view_of`.
     """
     from langsplat_core.compiled import shared_workers  # numba takes a second to import
     from langsplat_core.raster.cpu import projection

@@ -116,7 +116,7 @@ def frame_scene(viewer: Viewer, seen: OpenScene) -> None:
 
 @needs_scene()
 def look_from(viewer: Viewer, seen: OpenScene, side: Side) -> None:
-    """Look along one of the world's axes, at the same target from the same distance."""
+    """Turn the view to look along a world axis, at the same target from the same distance."""
     glide_to(viewer, controls.from_side(seen.view, side))
 
 

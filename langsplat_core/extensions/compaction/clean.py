@@ -208,7 +208,7 @@ def _by_photographs(
     Groups of `order` are removed one after the other. The cost of a group, its addition to the mean loss plus
     the standard error of that, is taken from the budget. A group that costs more than is left is halved, and
     its halves are tried. Gains are not added to the budget, else true floaters would pay for other Gaussians.
-    Last, as others may hide a cost, spatial groups of removed ones are measured again, others removed, and
+    Last, as they may hide each other's cost, groups of removed ones are measured again, without others, and
     the most costly are put back until the rest is within the budget.
     """
     losses, spent, done = np.zeros(1), 0.0, 0  # nothing is lost in any view

@@ -1,7 +1,7 @@
 """Radiance training: Gaussians fitted to photographs as in 3D Gaussian Splatting (Kerbl et al. 2023).
 
 One step renders a photograph's view, compares, and moves every parameter by Adam; density control and opacity
-resets follow the `Schedule`. On the CPU a run is determined by its seed, checkpoints included.
+resets follow the `Schedule`. On the CPU its seed determines a run, also a resumed one.
 """
 
 import math
